@@ -1,0 +1,84 @@
+/* Path aggregation of semi-global matching (Hirschmueller 2008, eq. 13), 8 paths in two sweeps:
+ *
+ *     L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + P1, L(q, d + 1) + P1, min_k L(q, k) + P2) - min_k L(q, k)
+ *
+ * q is the pixel before p on the path. d is a column offset into the target, so slot i of p meets slot
+ * i + base(p) - base(q) of q; slots that q does not have count as 255. 8 bits are enough: min_k L <= 62, so
+ * L <= 62 + P2 <= 255. */
+#include <stdlib.h>
+#include <string.h>
+
+#include "kernels.h"
+
+static uint8_t slot_or_max(const uint8_t *slots, ptrdiff_t depth, ptrdiff_t i) {
+    return i >= 0 && i < depth ? slots[i] : 255;
+}
+
+static uint8_t min_u8(int a, int b) { return (uint8_t)(a < b ? a : b); }
+
+/* One step of one path: from `before` (NULL at the image's edge, where L = C) to `path`. */
+static void path_step(const uint8_t *cost, const uint8_t *before, ptrdiff_t depth, int64_t shift, uint8_t p1,
+                      uint8_t p2, uint8_t *path) {
+    if (!before) {
+        memcpy(path, cost, (size_t)depth);
+        return;
+    }
+    uint8_t least = 255;
+    for (ptrdiff_t i = 0; i < depth; i++) {
+        least = min_u8(least, before[i]);
+    }
+    for (ptrdiff_t i = 0; i < depth; i++) {
+        const ptrdiff_t same = i + shift;
+        const int one_step =
+            min_u8(slot_or_max(before, depth, same - 1), slot_or_max(before, depth, same + 1)) + p1;
+        const uint8_t best = min_u8(min_u8(slot_or_max(before, depth, same), one_step), least + p2);
+        path[i] = (uint8_t)(cost[i] + best - least);
+    }
+}
+
+/* One sweep: the four paths that come from pixels already visited, top-left to bottom-right or back. */
+static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
+                  const uint8_t *p2, int backward, uint8_t *scratch, uint16_t *aggregated) {
+    const ptrdiff_t step = backward ? -1 : 1;
+    const ptrdiff_t row_size = size.width * size.depth;
+    uint8_t *rows[2][4]; /* [current or previous row][path] */
+    for (int k = 0; k < 8; k++) {
+        rows[k / 4][k % 4] = scratch + k * row_size;
+    }
+    for (ptrdiff_t n = 0; n < size.height; n++) {
+        const ptrdiff_t y = backward ? size.height - 1 - n : n;
+        const int now = n & 1;
+        for (ptrdiff_t m = 0; m < size.width; m++) {
+            const ptrdiff_t x = backward ? size.width - 1 - m : m;
+            const ptrdiff_t p = y * size.width + x;
+            uint16_t *sums = aggregated + p * size.depth;
+            for (int path = 0; path < 4; path++) {
+                /* Path 0 comes along the row, 1 to 3 from the three neighbours in the row before. */
+                const ptrdiff_t before_x = path == 0 ? x - step : x + (path - 2) * step;
+                const int inside = before_x >= 0 && before_x < size.width && (path == 0 || n > 0);
+                const ptrdiff_t q = (path == 0 ? y : y - step) * size.width + before_x;
+                const uint8_t *before = rows[path == 0 ? now : !now][path] + before_x * size.depth;
+                const int contrast = inside ? abs(image[p] - image[q]) : 0;
+                uint8_t *current = rows[now][path] + x * size.depth;
+                path_step(cost + p * size.depth, inside ? before : NULL, size.depth,
+                          inside ? (int64_t)base[p] - base[q] : 0, p1, p2[contrast], current);
+                for (ptrdiff_t i = 0; i < size.depth; i++) {
+                    const int first = path == 0 && !backward;
+                    sums[i] = (uint16_t)((first ? 0 : sums[i]) + current[i]);
+                }
+            }
+        }
+    }
+}
+
+int aggregation_scalar(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
+                       const uint8_t *p2, uint16_t *aggregated) {
+    uint8_t *scratch = malloc((size_t)(8 * size.width * size.depth));
+    if (!scratch) {
+        return -1;
+    }
+    sweep(cost, base, image, size, p1, p2, 0, scratch, aggregated);
+    sweep(cost, base, image, size, p1, p2, 1, scratch, aggregated);
+    free(scratch);
+    return 0;
+}

@@ -1,0 +1,79 @@
+#include <math.h>
+
+#include "kernels.h"
+
+typedef struct {
+    double x, y, z;
+} vector;
+
+static inline vector transform(const double *m, const double *t, double x, double y, double z) {
+    return (vector){(m[0] * x + m[1] * y + m[2]) * z + t[0], (m[3] * x + m[4] * y + m[5]) * z + t[1],
+                    (m[6] * x + m[7] * y + m[8]) * z + t[2]};
+}
+
+/* Depth map value at (u, v): bilinear in inverse depth where the four neighbours are one surface, else nearest.
+ * 0 = none. */
+static float sample_depth(const float *depth, ptrdiff_t height, ptrdiff_t width, double u, double v,
+                          float max_relative_step) {
+    if (!(u >= 0 && v >= 0 && u <= (double)(width - 1) && v <= (double)(height - 1))) {
+        return 0;
+    }
+    const float nearest = depth[(ptrdiff_t)(v + 0.5) * width + (ptrdiff_t)(u + 0.5)];
+    const ptrdiff_t x = (ptrdiff_t)u, y = (ptrdiff_t)v;
+    if (x + 1 >= width || y + 1 >= height || !(nearest > 0)) {
+        return nearest;
+    }
+    const float *corner = depth + y * width + x;
+    const float values[4] = {corner[0], corner[1], corner[width], corner[width + 1]};
+    for (int k = 0; k < 4; k++) {
+        if (!(fabsf(values[k] - nearest) <= max_relative_step * nearest)) {
+            return nearest;
+        }
+    }
+    const float fx = (float)(u - (double)x), fy = (float)(v - (double)y);
+    const float upper = (1 - fx) / values[0] + fx / values[1], lower = (1 - fx) / values[2] + fx / values[3];
+    return 1 / ((1 - fy) * upper + fy * lower);
+}
+
+void check_consistency(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
+                       const float *partner_depth, const float *partner_sigma, ptrdiff_t partner_height,
+                       ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
+                       float tolerance, uint8_t *agreeing, uint8_t *contradicting, float *weighted_depth,
+                       float *weight) {
+    const double max_error_squared = (double)max_reprojection_error * max_reprojection_error;
+    for (ptrdiff_t row = 0; row < height; row++) {
+        for (ptrdiff_t column = 0; column < width; column++) {
+            const ptrdiff_t p = row * width + column;
+            if (!(depth[p] > 0)) {
+                continue;
+            }
+            const vector seen = transform(transfer->pixel_from_reference, transfer->translation, (double)column,
+                                          (double)row, depth[p]);
+            if (!(seen.z > 0)) {
+                continue;
+            }
+            const double u = seen.x / seen.z, v = seen.y / seen.z;
+            const float partner = sample_depth(partner_depth, partner_height, partner_width, u, v, 0.02f);
+            if (!(partner > 0)) {
+                continue;
+            }
+            const float partner_spread =
+                partner_sigma[(ptrdiff_t)(v + 0.5) * partner_width + (ptrdiff_t)(u + 0.5)];
+            const vector back =
+                transform(transfer->reference_from_pixel, transfer->back_translation, u, v, partner);
+            const double du = back.x / back.z - (double)column, dv = back.y / back.z - (double)row;
+            const float difference = partner - (float)seen.z;
+            const float gate =
+                tolerance * __builtin_sqrtf(partner_spread * partner_spread + sigma[p] * sigma[p]);
+            if (back.z > 0 && du * du + dv * dv <= max_error_squared && fabsf(difference) <= gate) {
+                const float w = 1 / (partner_spread * partner_spread);
+                weighted_depth[p] += w * ((float)back.z - depth[p]);
+                weight[p] += w;
+                agreeing[p] += agreeing[p] < UINT8_MAX;
+            } else if (difference > 2 * gate) {
+                /* The partner looks through this point at something behind it. */
+                contradicting[p] += contradicting[p] < UINT8_MAX;
+            }
+        }
+    }
+}

@@ -1,0 +1,119 @@
+/* The kernels of colmap_sph: plain C on plain arrays, no Python, no global state, re-entrant.
+ *
+ * All images are row-major and contiguous. Matching kernels compare a reference image with a target image of the
+ * same height: slot `i` of reference pixel (y, x) stands for the target pixel (y, x + base[y, x] + i),
+ * 0 <= i < depth. `depth` is a multiple of 32. Sizes are checked by the caller (module.c).
+ * A kernel that returns int gives 0, or -1 when it cannot allocate its scratch memory. */
+#ifndef COLMAP_SPH_KERNELS_H
+#define COLMAP_SPH_KERNELS_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+enum {
+    CENSUS_RADIUS_X = 4, /* 9 x 7 window, 62 comparisons */
+    CENSUS_RADIUS_Y = 3,
+    CENSUS_BITS = 62,
+    COST_UNSEEN = 32, /* target pixel outside its image: as bad as a random match (62 / 2), no worse */
+    MAX_P2 = 255 - CENSUS_BITS,
+    DEPTH_STEP = 32,
+    MAX_DEPTH = 1024,
+    MAX_FIT_RADIUS = 16
+};
+
+/* Bit 63 of a census word marks a pixel without image content. */
+#define CENSUS_INVALID (UINT64_C(1) << 63)
+#define OFFSET_INVALID INT32_MIN
+
+typedef struct {
+    ptrdiff_t height, width, target_width, depth;
+} match_size;
+
+/* ---- kernels with a scalar and an AVX2 version, equal to the bit ------------------------------------------- */
+
+/* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}; bit set where the neighbour is darker. */
+typedef void census_fn(const uint8_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
+                       uint64_t *census);
+
+typedef int cost_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
+                    uint8_t *cost);
+
+/* Sum over 8 paths. `p2` holds P2 by absolute intensity difference, p1 <= p2 <= MAX_P2. */
+typedef int aggregation_fn(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
+                           uint8_t p1, const uint8_t *p2, uint16_t *aggregated);
+
+/* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. */
+typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference,
+                         const uint64_t *target, match_size size, int32_t max_left_right_difference,
+                         int32_t *offset);
+
+typedef struct {
+    const char *name;
+    census_fn *census;
+    cost_fn *cost;
+    aggregation_fn *aggregation;
+    selection_fn *selection;
+} kernel_table;
+
+census_fn census_scalar, census_avx2;
+cost_fn cost_scalar, cost_avx2;
+aggregation_fn aggregation_scalar, aggregation_avx2;
+selection_fn selection_scalar, selection_avx2;
+
+/* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
+int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
+
+/* The table of this name, NULL when the processor or the build has no such version. */
+const kernel_table *kernels_by_name(const char *name);
+/* The fastest table this processor can run. */
+const kernel_table *kernels_best(void);
+
+/* ---- floating-point kernels: one version, so that the result never depends on the processor ------------------ */
+
+/* Carry a disparity map from the left image's columns to the right image's, row by row (NaN = none). */
+void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
+                        float max_step, float *right);
+
+/* How to read a rectified pair's disparity along the rays of one of its images. */
+typedef struct {
+    double rectified_from_pixel[9]; /* ray in the rectified frame of pixel (col, row, 1); its z row gives depth 1 */
+    double columns_per_radian, rows_per_radian; /* sphere; focal length in pixels for the planar model */
+    double column_origin, row_origin;           /* angle (or tangent) times scale, at array coordinate 0 */
+    double disparity_origin;                    /* added to a disparity before it is turned into a parallax */
+    double baseline;
+    double disparity_sigma; /* standard deviation of a disparity, pixels */
+    double max_disparity_step;
+    int spherical; /* 1: sphere, 0: plane */
+    int is_left;   /* the rays belong to the left image */
+} pair_geometry;
+
+/* z-depth and its standard deviation for rows [first_row, first_row + rows) of a depth map; 0 = none. */
+void depth_candidates(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width,
+                     const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows, ptrdiff_t columns,
+                     float *depth, float *sigma);
+
+/* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. */
+void vote_depth(const float *depths, const float *sigmas, ptrdiff_t count, ptrdiff_t pixels, float tolerance,
+                float *depth, float *sigma, uint8_t *support);
+
+typedef struct {
+    double pixel_from_reference[9]; /* partner's K R K_ref^-1 */
+    double translation[3];          /* partner's K t */
+    double reference_from_pixel[9]; /* and back */
+    double back_translation[3];
+} view_transfer;
+
+/* Adds to `agreeing` (and `contradicting`) the partner's verdict on every pixel of a depth map, and the
+ * partner's depth, carried to the reference ray, to the running weighted sums. */
+void check_consistency(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
+                       const float *partner_depth, const float *partner_sigma, ptrdiff_t partner_height,
+                       ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
+                       float tolerance, uint8_t *agreeing, uint8_t *contradicting, float *weighted_depth,
+                       float *weight);
+
+/* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
+ * depth, and the depth of each plane at its centre; zeros where no plane fits. */
+void fit_planes(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height, ptrdiff_t width, const double *K,
+                int radius, float tolerance, float *normals, float *fitted_depth);
+
+#endif

@@ -1,0 +1,344 @@
+/* The Python face of the kernels. Python allocates every array; here sizes and bounds are checked and the GIL is
+ * released around the work. */
+#include "arrays.h"
+
+#include "kernels.h"
+
+#define F32 'f', (Py_ssize_t)sizeof(float)
+#define F64 'f', (Py_ssize_t)sizeof(double)
+#define U8 'u', (Py_ssize_t)1
+#define U16 'u', (Py_ssize_t)2
+#define U64 'u', (Py_ssize_t)8
+#define I32 'i', (Py_ssize_t)4
+
+enum { READ = 0, WRITE = 1 };
+
+/* Ends a function: releases the arrays; None, or NULL with MemoryError (status -1) or the error already set. */
+static PyObject *finish(array_set *arrays, int status) {
+    arrays_release(arrays);
+    if (PyErr_Occurred()) {
+        return NULL;
+    }
+    if (status) {
+        return PyErr_NoMemory();
+    }
+    Py_RETURN_NONE;
+}
+
+static const kernel_table *table_or_error(const char *name) {
+    const kernel_table *table = kernels_by_name(name);
+    if (!table) {
+        PyErr_Format(PyExc_ValueError, "no kernels named '%s' on this processor", name);
+    }
+    return table;
+}
+
+static int check(int condition, const char *message) {
+    if (!condition) {
+        PyErr_SetString(PyExc_ValueError, message);
+    }
+    return condition;
+}
+
+static int check_depth(Py_ssize_t depth) {
+    return check(depth > 0 && depth <= MAX_DEPTH && depth % DEPTH_STEP == 0,
+                 "the number of disparities must be a multiple of 32, at most 1024");
+}
+
+static int check_width(Py_ssize_t width) { return check(width <= 65535, "rows are limited to 65535 columns"); }
+
+static PyObject *py_backends(PyObject *self, PyObject *args) {
+    (void)self;
+    (void)args;
+    PyObject *names = PyList_New(0);
+    const char *known[] = {"avx2", "scalar"};
+    for (size_t k = 0; names && k < sizeof known / sizeof *known; k++) {
+        PyObject *name = kernels_by_name(known[k]) ? PyUnicode_FromString(known[k]) : NULL;
+        if (name && PyList_Append(names, name)) {
+            Py_CLEAR(names);
+        }
+        Py_XDECREF(name);
+    }
+    return names;
+}
+
+static PyObject *py_census(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[3];
+    if (!PyArg_ParseTuple(args, "sOOO", &backend, &o[0], &o[1], &o[2])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[2] = {-1, -1};
+    const uint8_t *valid = table ? array_get(&arrays, o[1], "valid", U8, 2, READ, shape) : NULL;
+    Py_ssize_t padded_shape[2] = {shape[0] + 2 * CENSUS_RADIUS_Y, shape[1] + 2 * CENSUS_RADIUS_X};
+    const uint8_t *padded = valid ? array_get(&arrays, o[0], "padded", U8, 2, READ, padded_shape) : NULL;
+    uint64_t *census = padded ? array_get(&arrays, o[2], "census", U64, 2, WRITE, shape) : NULL;
+    if (census && arrays_disjoint(&arrays)) {
+        Py_BEGIN_ALLOW_THREADS;
+        table->census(padded, valid, shape[0], shape[1], census);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static PyObject *py_matching_cost(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[4];
+    if (!PyArg_ParseTuple(args, "sOOOO", &backend, &o[0], &o[1], &o[2], &o[3])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    int status = 0;
+    Py_ssize_t shape[3] = {-1, -1, -1};
+    const uint64_t *reference = table ? array_get(&arrays, o[0], "reference", U64, 2, READ, shape) : NULL;
+    Py_ssize_t target_shape[2] = {shape[0], -1};
+    const uint64_t *target = reference ? array_get(&arrays, o[1], "target", U64, 2, READ, target_shape) : NULL;
+    const int32_t *base = target ? array_get(&arrays, o[2], "base", I32, 2, READ, shape) : NULL;
+    uint8_t *cost = base ? array_get(&arrays, o[3], "cost", U8, 3, WRITE, shape) : NULL;
+    if (cost && check_depth(shape[2]) && arrays_disjoint(&arrays)) {
+        const match_size size = {shape[0], shape[1], target_shape[1], shape[2]};
+        Py_BEGIN_ALLOW_THREADS;
+        status = table->cost(reference, target, base, size, cost);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, status);
+}
+
+static int check_penalties(int p1, const uint8_t *p2) {
+    for (int k = 0; k < 256; k++) {
+        if (!check(p1 >= 0 && p1 <= p2[k] && p2[k] <= MAX_P2, "penalties must keep 0 <= P1 <= P2 <= 193")) {
+            return 0;
+        }
+    }
+    return 1;
+}
+
+static PyObject *py_aggregation(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[5];
+    int p1;
+    if (!PyArg_ParseTuple(args, "sOOOiOO", &backend, &o[0], &o[1], &o[2], &p1, &o[3], &o[4])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    int status = 0;
+    Py_ssize_t shape[3] = {-1, -1, -1}, lut_shape[1] = {256};
+    const uint8_t *cost = table ? array_get(&arrays, o[0], "cost", U8, 3, READ, shape) : NULL;
+    const int32_t *base = cost ? array_get(&arrays, o[1], "base", I32, 2, READ, shape) : NULL;
+    const uint8_t *image = base ? array_get(&arrays, o[2], "image", U8, 2, READ, shape) : NULL;
+    const uint8_t *p2 = image ? array_get(&arrays, o[3], "p2", U8, 1, READ, lut_shape) : NULL;
+    uint16_t *aggregated = p2 ? array_get(&arrays, o[4], "aggregated", U16, 3, WRITE, shape) : NULL;
+    if (aggregated && check_depth(shape[2]) && check_penalties(p1, p2) && arrays_disjoint(&arrays)) {
+        const match_size size = {shape[0], shape[1], 0, shape[2]};
+        Py_BEGIN_ALLOW_THREADS;
+        status = table->aggregation(cost, base, image, size, (uint8_t)p1, p2, aggregated);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, status);
+}
+
+static PyObject *py_selection(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[5];
+    int max_difference;
+    if (!PyArg_ParseTuple(args, "sOOOOiO", &backend, &o[0], &o[1], &o[2], &o[3], &max_difference, &o[4])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    int status = 0;
+    Py_ssize_t shape[3] = {-1, -1, -1};
+    const uint16_t *aggregated = table ? array_get(&arrays, o[0], "aggregated", U16, 3, READ, shape) : NULL;
+    const int32_t *base = aggregated ? array_get(&arrays, o[1], "base", I32, 2, READ, shape) : NULL;
+    const uint64_t *reference = base ? array_get(&arrays, o[2], "reference", U64, 2, READ, shape) : NULL;
+    Py_ssize_t target_shape[2] = {shape[0], -1};
+    const uint64_t *target = reference ? array_get(&arrays, o[3], "target", U64, 2, READ, target_shape) : NULL;
+    int32_t *offset = target ? array_get(&arrays, o[4], "offset", I32, 2, WRITE, shape) : NULL;
+    if (offset && check_depth(shape[2]) && check_width(shape[1]) && check_width(target_shape[1]) &&
+        check(max_difference >= 0, "the left-right difference must not be negative") && arrays_disjoint(&arrays)) {
+        const match_size size = {shape[0], shape[1], target_shape[1], shape[2]};
+        Py_BEGIN_ALLOW_THREADS;
+        status = table->selection(aggregated, base, reference, target, size, max_difference, offset);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, status);
+}
+
+static PyObject *py_transfer_disparity(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[2];
+    float max_step;
+    if (!PyArg_ParseTuple(args, "OfO", &o[0], &max_step, &o[1])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[2] = {-1, -1};
+    const float *left = array_get(&arrays, o[0], "left", F32, 2, READ, shape);
+    Py_ssize_t right_shape[2] = {shape[0], -1};
+    float *right = left ? array_get(&arrays, o[1], "right", F32, 2, WRITE, right_shape) : NULL;
+    if (right && arrays_disjoint(&arrays)) {
+        Py_BEGIN_ALLOW_THREADS;
+        transfer_disparity(left, shape[0], shape[1], right_shape[1], max_step, right);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static PyObject *py_depth_candidates(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[4];
+    pair_geometry g;
+    Py_ssize_t first_row;
+    if (!PyArg_ParseTuple(args, "OO(dd)(dd)ddddppnOO", &o[0], &o[1], &g.columns_per_radian, &g.rows_per_radian,
+                          &g.column_origin, &g.row_origin, &g.disparity_origin, &g.baseline, &g.disparity_sigma,
+                          &g.max_disparity_step, &g.spherical, &g.is_left, &first_row, &o[2], &o[3])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    Py_ssize_t map_shape[2] = {-1, -1}, matrix_shape[2] = {3, 3}, shape[2] = {-1, -1};
+    const float *disparity = array_get(&arrays, o[0], "disparity", F32, 2, READ, map_shape);
+    const double *m =
+        disparity ? array_get(&arrays, o[1], "rectified_from_pixel", F64, 2, READ, matrix_shape) : NULL;
+    float *depth = m ? array_get(&arrays, o[2], "depth", F32, 2, WRITE, shape) : NULL;
+    float *sigma = depth ? array_get(&arrays, o[3], "sigma", F32, 2, WRITE, shape) : NULL;
+    if (sigma && arrays_disjoint(&arrays)) {
+        for (int k = 0; k < 9; k++) {
+            g.rectified_from_pixel[k] = m[k];
+        }
+        Py_BEGIN_ALLOW_THREADS;
+        depth_candidates(disparity, map_shape[0], map_shape[1], &g, first_row, shape[0], shape[1], depth, sigma);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static PyObject *py_vote_depth(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[5];
+    float tolerance;
+    if (!PyArg_ParseTuple(args, "OOfOOO", &o[0], &o[1], &tolerance, &o[2], &o[3], &o[4])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[3] = {-1, -1, -1};
+    const float *depths = array_get(&arrays, o[0], "depths", F32, 3, READ, shape);
+    const float *sigmas = depths ? array_get(&arrays, o[1], "sigmas", F32, 3, READ, shape) : NULL;
+    float *depth = sigmas ? array_get(&arrays, o[2], "depth", F32, 2, WRITE, shape + 1) : NULL;
+    float *sigma = depth ? array_get(&arrays, o[3], "sigma", F32, 2, WRITE, shape + 1) : NULL;
+    uint8_t *support = sigma ? array_get(&arrays, o[4], "support", U8, 2, WRITE, shape + 1) : NULL;
+    if (support && arrays_disjoint(&arrays)) {
+        Py_BEGIN_ALLOW_THREADS;
+        vote_depth(depths, sigmas, shape[0], shape[1] * shape[2], tolerance, depth, sigma, support);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static int copy_transfer(array_set *arrays, PyObject *forward, PyObject *back, view_transfer *transfer) {
+    Py_ssize_t shape[2] = {3, 4};
+    const double *f = array_get(arrays, forward, "partner_from_reference", F64, 2, READ, shape);
+    const double *b = f ? array_get(arrays, back, "reference_from_partner", F64, 2, READ, shape) : NULL;
+    if (!b) {
+        return 0;
+    }
+    for (int r = 0; r < 3; r++) {
+        for (int c = 0; c < 3; c++) {
+            transfer->pixel_from_reference[3 * r + c] = f[4 * r + c];
+            transfer->reference_from_pixel[3 * r + c] = b[4 * r + c];
+        }
+        transfer->translation[r] = f[4 * r + 3];
+        transfer->back_translation[r] = b[4 * r + 3];
+    }
+    return 1;
+}
+
+static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[10];
+    float max_error, tolerance;
+    if (!PyArg_ParseTuple(args, "OOOOOOffOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &max_error, &tolerance,
+                          &o[6], &o[7], &o[8], &o[9])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    view_transfer transfer;
+    Py_ssize_t shape[2] = {-1, -1}, partner_shape[2] = {-1, -1};
+    const float *depth = array_get(&arrays, o[0], "depth", F32, 2, READ, shape);
+    const float *sigma = depth ? array_get(&arrays, o[1], "sigma", F32, 2, READ, shape) : NULL;
+    const float *partner = sigma ? array_get(&arrays, o[2], "partner_depth", F32, 2, READ, partner_shape) : NULL;
+    const float *partner_sigma =
+        partner ? array_get(&arrays, o[3], "partner_sigma", F32, 2, READ, partner_shape) : NULL;
+    const int ready = partner_sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
+    uint8_t *agreeing = ready ? array_get(&arrays, o[6], "agreeing", U8, 2, WRITE, shape) : NULL;
+    uint8_t *contradicting = agreeing ? array_get(&arrays, o[7], "contradicting", U8, 2, WRITE, shape) : NULL;
+    float *weighted = contradicting ? array_get(&arrays, o[8], "weighted_depth", F32, 2, WRITE, shape) : NULL;
+    float *weight = weighted ? array_get(&arrays, o[9], "weight", F32, 2, WRITE, shape) : NULL;
+    if (weight && arrays_disjoint(&arrays)) {
+        Py_BEGIN_ALLOW_THREADS;
+        check_consistency(depth, sigma, shape[0], shape[1], partner, partner_sigma, partner_shape[0],
+                          partner_shape[1], &transfer, max_error, tolerance, agreeing, contradicting, weighted,
+                          weight);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[5];
+    int radius;
+    float tolerance;
+    if (!PyArg_ParseTuple(args, "OOOifOO", &o[0], &o[1], &o[2], &radius, &tolerance, &o[3], &o[4])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[3] = {-1, -1, 3}, matrix_shape[2] = {3, 3};
+    const float *inverse = array_get(&arrays, o[0], "inverse_depth", F32, 2, READ, shape);
+    const float *sigma = inverse ? array_get(&arrays, o[1], "inverse_sigma", F32, 2, READ, shape) : NULL;
+    const double *K = sigma ? array_get(&arrays, o[2], "K", F64, 2, READ, matrix_shape) : NULL;
+    float *normals = K ? array_get(&arrays, o[3], "normals", F32, 3, WRITE, shape) : NULL;
+    float *fitted = normals ? array_get(&arrays, o[4], "fitted_depth", F32, 2, WRITE, shape) : NULL;
+    if (fitted && check(radius >= 1 && radius <= MAX_FIT_RADIUS, "the window radius must lie in 1..16") &&
+        arrays_disjoint(&arrays)) {
+        Py_BEGIN_ALLOW_THREADS;
+        fit_planes(inverse, sigma, shape[0], shape[1], K, radius, tolerance, normals, fitted);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static PyMethodDef methods[] = {
+    {"backends", py_backends, METH_NOARGS, "Names of the kernel versions this processor runs, fastest first."},
+    {"census", py_census, METH_VARARGS, "census(backend, padded, valid, census)"},
+    {"matching_cost", py_matching_cost, METH_VARARGS, "matching_cost(backend, reference, target, base, cost)"},
+    {"aggregation", py_aggregation, METH_VARARGS, "aggregation(backend, cost, base, image, p1, p2, aggregated)"},
+    {"selection", py_selection, METH_VARARGS,
+     "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
+    {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},
+    {"depth_candidates", py_depth_candidates, METH_VARARGS,
+     "depth_candidates(disparity, rectified_from_pixel, (columns_per_radian, rows_per_radian), "
+     "(column_origin, row_origin), disparity_origin, baseline, disparity_sigma, max_disparity_step, spherical, "
+     "is_left, first_row, depth, sigma)"},
+    {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
+    {"check_consistency", py_check_consistency, METH_VARARGS,
+     "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
+     "reference_from_partner, max_reprojection_error, tolerance, agreeing, contradicting, weighted_depth, weight)"},
+    {"fit_planes", py_fit_planes, METH_VARARGS,
+     "fit_planes(inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
+    {NULL, NULL, 0, NULL}};
+
+static PyModuleDef_Slot slots[] = {{0, NULL}};
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, .m_name = "_native", .m_doc = "Kernels of colmap_sph.", .m_methods = methods,
+    .m_slots = slots};
+
+PyMODINIT_FUNC PyInit__native(void) { return PyModuleDef_Init(&definition); }

@@ -1,0 +1,240 @@
+"""The command line: subcommands, progress, messages; nothing else."""
+
+import logging
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+import rich.logging
+import rich.progress
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+import colmap_sph
+from colmap_sph.depth import DepthOptions
+from colmap_sph.errors import ColmapSphError, OutputError
+from colmap_sph.fusion import FusionOptions
+from colmap_sph.matching import MatchingOptions
+from colmap_sph.normals import NormalOptions
+from colmap_sph.options import RunOptions
+from colmap_sph.pairs import PairOptions
+from colmap_sph.pipeline import run, workspace_root
+from colmap_sph.rectification import RectificationOptions
+from colmap_sph.report import RunReport
+from colmap_sph.undistortion import UndistortionOptions
+from colmap_sph.workspace import MapKind, Workspace, make_dir
+
+logger = logging.getLogger(__name__)
+
+PARTIAL_EXIT_CODE = 5
+"""The run finished, but some images of the model have no depth map."""
+
+_MAX_LISTED_IMAGES = 60
+
+
+@dataclass(frozen=True)
+class RunCommand:
+    """From a COLMAP sparse model to depth maps, normal maps and a fused cloud, without a GPU.
+
+    Give --model after standard structure from motion, or --workspace for a dense workspace that COLMAP's
+    image_undistorter made. The result is an ordinary COLMAP dense workspace with fused.ply in it.
+    """
+
+    model: Path | None = None
+    """Sparse model (binary or text), such as sparse/0. Its images are undistorted into --output."""
+    images: Path | None = None
+    """Original images. Default: the folder `images` beside or above the model."""
+    output: Path | None = None
+    """Dense workspace to create. Default: the folder `dense` beside the model's `sparse`."""
+    workspace: Path | None = None
+    """Existing dense workspace, instead of --model, --images and --output."""
+    threads: int = 0
+    """Worker threads; 0: all cores."""
+    fusion_input: MapKind = "geometric"
+    """Maps to fuse: those confirmed by other views, or the unchecked ones."""
+    undistortion: Annotated[UndistortionOptions, tyro.conf.arg(name="")] = field(
+        default_factory=UndistortionOptions
+    )
+    pairs: Annotated[PairOptions, tyro.conf.arg(name="")] = field(default_factory=PairOptions)
+    rectification: Annotated[RectificationOptions, tyro.conf.arg(name="")] = field(
+        default_factory=RectificationOptions
+    )
+    matching: MatchingOptions = field(default_factory=MatchingOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+    normals: NormalOptions = field(default_factory=NormalOptions)
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+
+    def options(self) -> RunOptions:
+        """The options of all stages."""
+        return RunOptions(**{name: getattr(self, name) for name in RunOptions.__dataclass_fields__})
+
+
+@dataclass(frozen=True)
+class DemoCommand:
+    """Render a small aerial block, reconstruct it, and compare the result with its exact depth."""
+
+    output: Path = Path("demo")
+    """Folder for the block and its dense workspace."""
+    threads: int = 0
+    """Worker threads; 0: all cores."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry point of the `colmap_sph` command; returns the exit code."""
+    console = Console(stderr=True)
+    commands: dict[str, tuple[type, Callable[..., int]]] = {
+        "run": (RunCommand, run_command),
+        "demo": (DemoCommand, demo_command),
+    }
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if arguments and arguments[0] in ("--version", "-V"):
+        print(f"colmap_sph {colmap_sph.__version__}")
+        return 0
+    command = tyro.extras.subcommand_cli_from_dict(
+        {name: cls for name, (cls, _) in commands.items()},
+        prog="colmap_sph",
+        description="Dense reconstruction for COLMAP without a GPU.",
+        args=arguments,
+        config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff),
+    )
+    handler = next(function for cls, function in commands.values() if isinstance(command, cls))
+    with _console_logging(console):
+        try:
+            return handler(command, console)
+        except ColmapSphError as error:
+            logger.debug("stopped", exc_info=True)
+            console.print(f"[bold red]error:[/] {_escaped(error)}", highlight=False, soft_wrap=True)
+            return error.exit_code
+        except KeyboardInterrupt:
+            console.print("interrupted", style="bold red")
+            return 130
+
+
+def run_command(command: RunCommand, console: Console) -> int:
+    """`colmap_sph run`."""
+    root = workspace_root(
+        command.model, images=command.images, output=command.output, workspace=command.workspace
+    )
+    options = command.options()
+    options.check()
+    with _log_file(root, creates=command.model is not None), _Display(console) as display:
+        report = run(
+            command.model,
+            images=command.images,
+            output=command.output,
+            workspace=command.workspace,
+            options=options,
+            progress=display,
+        )
+    print_summary(report, Workspace(root), console)
+    return PARTIAL_EXIT_CODE if report.skipped_images else 0
+
+
+def print_summary(report: RunReport, workspace: Workspace, console: Console) -> None:
+    """The closing summary of a run."""
+    listed = sorted(report.coverage.items(), key=lambda item: item[1])
+    table = Table("image", "coverage", title="Depth maps", title_justify="left")
+    for name, share in sorted(listed[:_MAX_LISTED_IMAGES]):
+        table.add_row(_escaped(name), f"{share:.1%}")
+    if len(listed) > _MAX_LISTED_IMAGES:
+        table.caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images"
+    console.print(table)
+    mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
+    facts = Table.grid(padding=(0, 2))
+    facts.add_row("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")
+    facts.add_row("pairs", f"{report.pairs} matched ({report.pair_source})")
+    facts.add_row("cloud", f"{report.points:,} points in {_escaped(workspace.fused_path)}")
+    times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
+    facts.add_row("seconds", f"{sum(report.seconds.values()):.1f} ({times})")
+    facts.add_row("peak memory", f"{report.peak_memory / 2**30:.2f} GiB")
+    console.print(facts, highlight=False)
+    for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
+        for name, reason in skipped.items():
+            console.print(f"[yellow]{what} skipped:[/] {_escaped(name)}: {_escaped(reason)}", soft_wrap=True)
+    if report.advice:
+        console.print(f"[yellow]few points:[/] {_escaped(report.advice)}", soft_wrap=True)
+
+
+def demo_command(command: DemoCommand, console: Console) -> int:
+    """`colmap_sph demo`."""
+    raise NotImplementedError
+
+
+class _Display:
+    """Progress bars with time left, one per stage."""
+
+    def __init__(self, console: Console) -> None:
+        self._bars = rich.progress.Progress(
+            rich.progress.TextColumn("{task.description:<18}"),
+            rich.progress.BarColumn(),
+            rich.progress.MofNCompleteColumn(),
+            rich.progress.TimeElapsedColumn(),
+            rich.progress.TextColumn("left"),
+            rich.progress.TimeRemainingColumn(),
+            console=console,
+        )
+        self._task: rich.progress.TaskID | None = None
+
+    def __enter__(self) -> "_Display":
+        self._bars.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bars.stop()
+
+    def start(self, stage: str, total: int) -> None:
+        self._task = self._bars.add_task(stage, total=total)
+
+    def advance(self) -> None:
+        if self._task is not None:
+            self._bars.advance(self._task)
+
+
+def _escaped(text: object) -> str:
+    return str(text).replace("[", r"\[")
+
+
+@contextmanager
+def _console_logging(console: Console) -> Iterator[None]:
+    """Warnings of the package on the console."""
+    package = logging.getLogger("colmap_sph")
+    handler = rich.logging.RichHandler(
+        logging.WARNING, console, show_time=False, show_path=False, markup=False
+    )
+    package.setLevel(logging.INFO)
+    package.addHandler(handler)
+    try:
+        yield
+    finally:
+        package.removeHandler(handler)
+
+
+@contextmanager
+def _log_file(root: Path, *, creates: bool) -> Iterator[None]:
+    """Everything the package logs, appended to ``colmap_sph/log.txt`` in the workspace."""
+    if not creates and not root.is_dir():
+        yield  # a workspace that does not exist: the run says so
+        return
+    folder = Workspace(root).state_dir
+    make_dir(folder)
+    try:
+        handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
+    except OSError as error:
+        raise OutputError(f"{folder / 'log.txt'} cannot be written ({error.strerror}).") from error
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    package = logging.getLogger("colmap_sph")
+    package.addHandler(handler)
+    logger.info("colmap_sph %s, arguments %s", colmap_sph.__version__, sys.argv[1:])
+    try:
+        yield
+    finally:
+        package.removeHandler(handler)
+        handler.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

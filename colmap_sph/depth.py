@@ -1,0 +1,245 @@
+"""Disparities of a view's pairs → its depth map.
+
+Each pair gives one depth candidate per pixel, read along the pixel's ray from the pair's disparity map, with a
+standard deviation from its geometry. The candidates vote: the largest mutually consistent cluster wins, and its
+weighted mean is the *photometric* depth. Depth maps of neighbouring views then check each other: what enough of
+them confirm and none sees through is the *geometric* depth.
+
+Depth is z in the camera frame along the ray K⁻¹ (col, row, 1): COLMAP's fusion reads depth maps so.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.errors import OptionError
+from colmap_sph.rectification import RectifiedPair, Side, rectified_ray_from_pixel
+from colmap_sph.scene import View
+
+
+@dataclass(frozen=True)
+class DepthOptions:
+    """How a view's pairs become its depth map."""
+
+    disparity_sigma: float = 0.35
+    """Standard deviation of a matched disparity, pixels: the scale of every tolerance below."""
+    max_disparity_step: float = 2.0
+    """Neighbouring disparities that differ by more than this (pixels) belong to different surfaces."""
+    vote_tolerance: float = 3.0
+    """Two candidates agree when they differ by less than this many standard deviations."""
+    min_support: int = 1
+    """Pairs that must agree on a photometric depth."""
+    max_reprojection_error: float = 1.0
+    """Two views' depths agree when the point, seen by the other view, projects back within this many pixels."""
+    consistency_tolerance: float = 4.0
+    """… and when they differ by less than this many standard deviations."""
+    min_consistent: int = 2
+    """Views, of those that share a pair with the image, that must confirm a geometric depth."""
+    max_contradiction: float = 0.5
+    """A depth is dropped when more views look through it than this share of those that confirm it."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds."""
+        for name in (
+            "disparity_sigma",
+            "max_disparity_step",
+            "vote_tolerance",
+            "max_reprojection_error",
+            "consistency_tolerance",
+        ):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
+        if not 1 <= self.min_support <= 255:
+            raise OptionError(f"min_support must lie in 1..255, not {self.min_support}.")
+        if not 0 <= self.min_consistent <= 255:
+            raise OptionError(f"min_consistent must lie in 0..255, not {self.min_consistent}.")
+        if self.max_contradiction < 0:
+            raise OptionError(f"max_contradiction must not be negative, not {self.max_contradiction}.")
+
+
+@dataclass(frozen=True, eq=False)
+class PairDisparity:
+    """What matching found for a rectified pair.
+
+    Attributes
+    ----------
+    left, right : str
+        Image names.
+    geometry : RectifiedPair
+    disparity : (H, W_left) float32 ndarray
+        Disparity of the left image's pixels; NaN = none.
+    """
+
+    left: str
+    right: str
+    geometry: RectifiedPair
+    disparity: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthEstimate:
+    """A view's depth map with its uncertainty.
+
+    Attributes
+    ----------
+    depth : (H, W) float32 ndarray
+        z-depth, model units; 0 = none.
+    sigma : (H, W) float32 ndarray
+        Its standard deviation, model units.
+    support : (H, W) uint8 ndarray
+        Number of pairs (photometric) or views (geometric) behind it.
+    """
+
+    depth: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    support: NDArray[np.uint8]
+
+
+def right_disparity(pair: PairDisparity, max_step: float) -> NDArray[np.float32]:
+    """The disparity map carried to the right image's pixels, (H, W_right) float32, NaN = none."""
+    right = np.empty((pair.geometry.height, pair.geometry.right_width), dtype=np.float32)
+    _native.transfer_disparity(pair.disparity, max_step, right)
+    return right
+
+
+def depth_candidates(
+    view: View, disparity: NDArray[np.float32], geometry: RectifiedPair, side: Side, options: DepthOptions
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Triangulate a pair's disparities along the rays of one of its images.
+
+    On the sphere the distance along the ray is ρ = b cos θ_r / sin δ (left image), on the plane Z = b f / d
+    (Elhashash & Qin, §3.4).
+
+    Parameters
+    ----------
+    view : View
+        The image whose depth is wanted.
+    disparity : (H, W) float32 ndarray
+        Disparity map in the rectified image of that side; NaN = none.
+    geometry : RectifiedPair
+    side : {"left", "right"}
+    options : DepthOptions
+
+    Returns
+    -------
+    depth, sigma : (view.height, view.width) float32 ndarray
+        z-depth and its standard deviation, model units; 0 = none.
+    """
+    depth = np.empty((view.height, view.width), dtype=np.float32)
+    sigma = np.empty_like(depth)
+    _native.depth_candidates(
+        disparity,
+        np.ascontiguousarray(rectified_ray_from_pixel(view, geometry)),
+        (geometry.columns_per_radian, geometry.rows_per_radian),
+        (geometry.column_origin(side), geometry.row_origin),
+        geometry.disparity_origin,
+        geometry.baseline,
+        options.disparity_sigma,
+        options.max_disparity_step,
+        geometry.model == "spherical",
+        side == "left",
+        0,
+        depth,
+        sigma,
+    )
+    return depth, sigma
+
+
+def estimate_depth(view: View, pairs: Iterable[PairDisparity], options: DepthOptions) -> DepthEstimate:
+    """Photometric depth of a view: the vote of all its pairs.
+
+    Parameters
+    ----------
+    view : View
+    pairs : iterable of PairDisparity
+        Pairs in which the view is the left or the right image.
+    options : DepthOptions
+
+    Returns
+    -------
+    DepthEstimate
+    """
+    depths, sigmas = [], []
+    for pair in pairs:
+        side: Side = "left" if pair.left == view.name else "right"
+        disparity = (
+            pair.disparity if side == "left" else right_disparity(pair, options.max_disparity_step)
+        )
+        depth, sigma = depth_candidates(view, disparity, pair.geometry, side, options)
+        depths.append(depth)
+        sigmas.append(sigma)
+    shape = (view.height, view.width)
+    voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
+    if depths:
+        _native.vote_depth(
+            np.stack(depths), np.stack(sigmas), options.vote_tolerance, voted.depth, voted.sigma, voted.support
+        )
+    voted.depth[voted.support < options.min_support] = 0
+    return voted
+
+
+def check_depth(
+    view: View,
+    estimate: DepthEstimate,
+    partners: Iterable[tuple[View, DepthEstimate]],
+    options: DepthOptions,
+) -> DepthEstimate:
+    """Geometric depth of a view: what the depth maps of its partners confirm, averaged with theirs.
+
+    Parameters
+    ----------
+    view : View
+    estimate : DepthEstimate
+        Its photometric depth.
+    partners : iterable of (View, DepthEstimate)
+        Neighbouring views and their photometric depths.
+    options : DepthOptions
+
+    Returns
+    -------
+    DepthEstimate
+        `support` is the number of confirming partners.
+    """
+    shape = estimate.depth.shape
+    agreeing, contradicting = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    weighted, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    for partner, partner_estimate in partners:
+        _native.check_consistency(
+            estimate.depth,
+            estimate.sigma,
+            partner_estimate.depth,
+            partner_estimate.sigma,
+            *_pixel_transfers(view, partner),
+            options.max_reprojection_error,
+            options.consistency_tolerance,
+            agreeing,
+            contradicting,
+            weighted,
+            weight,
+        )
+    found = estimate.depth > 0
+    kept = found & (agreeing >= options.min_consistent)
+    kept &= contradicting <= options.max_contradiction * agreeing
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = 1 / np.square(estimate.sigma)
+        depth = np.where(kept, estimate.depth + weighted / (weight + own), 0).astype(np.float32)
+        sigma = np.where(kept, 1 / np.sqrt(weight + own), 0).astype(np.float32)
+    return DepthEstimate(depth, sigma, np.where(kept, agreeing, 0).astype(np.uint8))
+
+
+def _pixel_transfers(reference: View, partner: View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(3, 4) matrices [A | a]: partner pixel ~ A (col, row, 1) depth + a, and the way back."""
+
+    def transfer(source: View, target: View) -> NDArray[np.float64]:
+        rotation = target.R @ source.R.T
+        return np.hstack(
+            [
+                target.K @ rotation @ np.linalg.inv(source.K),
+                (target.K @ (target.t - rotation @ source.t))[:, None],
+            ]
+        )
+
+    return transfer(reference, partner), transfer(partner, reference)

@@ -1,0 +1,39 @@
+"""Errors a user can cause and mend: one base class, a few named causes.
+
+The command line prints the message as one sentence and exits with `exit_code`; it never shows a traceback
+for these. A message names the file or option and says what to do.
+"""
+
+
+class ColmapSphError(Exception):
+    """Base of every error this package raises on purpose."""
+
+    exit_code = 1
+
+
+class InputError(ColmapSphError):
+    """A model, image, workspace or configuration file that is missing, damaged or does not fit the rest."""
+
+    exit_code = 2
+
+
+class OptionError(ColmapSphError, ValueError):
+    """An option out of its bounds, or options that contradict each other."""
+
+    exit_code = 2
+
+
+class OutputError(ColmapSphError):
+    """An output that cannot be written: permissions, a full disk, a path in the way."""
+
+    exit_code = 3
+
+
+class NoResultError(ColmapSphError):
+    """Valid input from which nothing can be computed: no overlapping pair, no point that survives."""
+
+    exit_code = 4
+
+
+class RectificationError(ColmapSphError):
+    """A pair that the chosen rectification model cannot handle; the pair is skipped and reported."""

@@ -1,0 +1,119 @@
+"""Nearest neighbours and voxels for millions of points in bounded memory."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from colmap_sph.errors import OptionError
+
+Points = npt.NDArray[np.float64]
+_QUERY_CHUNK = 1 << 20
+_ORDERING_CELLS = 512
+
+
+class PointIndex:
+    """Nearest-neighbour search in a cloud of (N, 3) points."""
+
+    def __init__(self, points: Points) -> None:
+        # Neighbours in space next to each other in memory make building and searching three times faster;
+        # for such points the balanced tree is slower to build and no faster to search.
+        self._order = spatial_order(points)
+        self._tree = cKDTree(points[self._order], balanced_tree=False, compact_nodes=False)
+
+    def distances(
+        self, queries: Points, *, threads: int = 1, bound: float = np.inf
+    ) -> npt.NDArray[np.float64]:
+        """Distance from each of (Q, 3) queries to the nearest point; infinite beyond `bound`."""
+        result = np.empty(len(queries))
+        order = spatial_order(queries)
+        for start in range(0, len(queries), _QUERY_CHUNK):
+            chunk = order[start : start + _QUERY_CHUNK]
+            result[chunk], _ = self._tree.query(queries[chunk], workers=threads, distance_upper_bound=bound)
+        return result
+
+    def nearest(self, queries: Points, count: int, *, threads: int = 1) -> npt.NDArray[np.int64]:
+        """Indices (Q, count) of the nearest points of each query; there must be as many points."""
+        _, rows = self._tree.query(queries, k=np.arange(1, count + 1), workers=threads)
+        return np.asarray(self._order[rows])
+
+
+def spatial_order(points: Points) -> npt.NDArray[np.int64]:
+    """Order of (N, 3) points by cells of a regular grid, so that neighbours come close to each other."""
+    extent = float(np.max(np.ptp(points, axis=0), initial=0.0)) if len(points) else 0.0
+    if extent == 0.0:
+        return np.arange(len(points))
+    return np.argsort(voxel_keys(points, extent / _ORDERING_CELLS), kind="stable")
+
+
+def voxel_keys(points: Points, size: float, *, offset: float = 0.0) -> npt.NDArray[np.int64]:
+    """One integer per point that is equal for the points of one voxel and orders voxels by x, y, z.
+
+    Parameters
+    ----------
+    points : (N, 3) float64
+        At least one point.
+    size : float
+        Edge of a voxel.
+    offset : float
+        The grid starts this many voxels before the smallest coordinates.
+
+    Raises
+    ------
+    OptionError
+        More voxels than 64 bits can number.
+    """
+    low = points.min(axis=0)
+    counts = [int(span / size + offset) + 1 for span in np.ptp(points, axis=0)]
+    if counts[0] * counts[1] * counts[2] >= 2**63:
+        raise OptionError(
+            f"voxels of {size:g} m are too small for points spread over {np.ptp(points, axis=0).max():g} m: "
+            "use a larger tau, or remove far outliers from the cloud"
+        )
+    keys = np.zeros(len(points), np.int64)
+    for axis in range(3):
+        keys *= counts[axis]
+        keys += np.floor((points[:, axis] - low[axis]) / size + offset).astype(np.int64)
+    return keys
+
+
+def thin(points: Points, size: float) -> npt.NDArray[np.int64]:
+    """Indices of the points that remain when each voxel of edge `size` keeps its first point."""
+    order, starts = _by_voxel(points, size, offset=0.0)
+    return np.asarray(np.minimum.reduceat(order, starts))
+
+
+def voxel_centroids(points: Points, size: float) -> Points:
+    """Mean of the points of each voxel of edge `size`, on the grid Open3D's voxel_down_sample uses."""
+    order, starts = _by_voxel(points, size, offset=0.5)
+    low = points.min(axis=0)
+    # Sums of coordinates relative to the corner keep all digits of map coordinates.
+    sums = np.add.reduceat(points[order] - low, starts, axis=0)
+    return np.asarray(sums / np.diff(starts, append=len(points))[:, None] + low)
+
+
+def mean_voxel_shares(points: Points, hits: npt.NDArray[np.bool_], size: float) -> npt.NDArray[np.float64]:
+    """Per column of (N, T) hits: the share of hits among the points of a voxel, averaged over voxels.
+
+    The voxels are those of two grids, the second shifted by half a voxel, so that it matters less where the
+    grid happens to lie.
+    """
+    total, voxel_count = np.zeros(hits.shape[1]), 0
+    for offset in (0.0, 0.5):
+        order, starts = _by_voxel(points, size, offset=offset)
+        counts = np.diff(starts, append=len(points))
+        for column in range(hits.shape[1]):
+            total[column] += np.sum(np.add.reduceat(hits[order, column], starts, dtype=np.int64) / counts)
+        voxel_count += len(starts)
+    return total / voxel_count
+
+
+def _by_voxel(
+    points: Points, size: float, *, offset: float
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """An order of the points voxel by voxel, and where in it each voxel starts."""
+    keys = voxel_keys(points, size, offset=offset)
+    order = np.argsort(keys)
+    starts = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    return order, starts

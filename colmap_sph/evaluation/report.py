@@ -1,0 +1,148 @@
+"""Scores as text for people and as JSON for programs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from math import nan
+from pathlib import Path
+
+import numpy as np
+
+from colmap_sph.errors import NoResultError, OutputError
+from colmap_sph.evaluation.cloud_scores import CloudScores
+from colmap_sph.evaluation.depth_maps import DepthMapScores
+
+
+def format_clouds(scores: Sequence[CloudScores]) -> str:
+    """A plain-text report of clouds against one reference: a table, and the registrations below it."""
+    if not scores:
+        return ""
+    header = ["cloud", "points", "judged", "mean [m]", "std [m]"]
+    for threshold in scores[0].thresholds:
+        label = _tau_label(threshold.tau, scores[0].gsd)
+        header += [f"acc {label}", f"comp {label}", f"F {label}"]
+    rows = [header, *(_cloud_row(cloud) for cloud in scores)]
+    first = scores[0]
+    lines = [
+        f"reference: {first.reference}, {first.reference_count:,} samples; "
+        f"shares counted as {first.definition}"
+    ]
+    if first.cloud_to_reference.cap is not None:
+        lines.append(f"distances above {first.cloud_to_reference.cap:g} m count as that")
+    return "\n".join([*lines, "", _aligned(rows), "", *(_registration_line(cloud) for cloud in scores)])
+
+
+def format_depth_maps(scores: Mapping[str, DepthMapScores]) -> str:
+    """A plain-text table of depth maps, one row per image and their mean."""
+    if not scores:
+        return ""
+    first = next(iter(scores.values()))
+    header = ["image", "coverage", *(f"<= {bound:g} GSD" for bound in first.thresholds), "median [GSD]"]
+    with_normals = first.median_normal_angle is not None
+    rows = [header + (["normals [deg]"] if with_normals else [])]
+    means = mean_of_depth_maps(scores)
+    for name, one in [*scores.items(), ("mean", means)]:
+        row = [
+            name,
+            _percent(one.coverage),
+            *(_percent(share) for share in one.within),
+            f"{one.median_error:.3f}",
+        ]
+        if with_normals:
+            angle = one.median_normal_angle
+            row.append("-" if angle is None else f"{angle:.2f}")
+        rows.append(row)
+    return _aligned(rows)
+
+
+def mean_of_depth_maps(scores: Mapping[str, DepthMapScores]) -> DepthMapScores:
+    """Mean over images of every score; pixel counts are summed.
+
+    Raises
+    ------
+    NoResultError
+        No image.
+    """
+    if not scores:
+        raise NoResultError("no depth map was compared")
+    every = list(scores.values())
+    median = _mean_of_known([one.median_error for one in every])
+    return DepthMapScores(
+        truth_pixels=sum(one.truth_pixels for one in every),
+        compared_pixels=sum(one.compared_pixels for one in every),
+        coverage=float(np.mean([one.coverage for one in every])),
+        thresholds=every[0].thresholds,
+        within=tuple(float(value) for value in np.mean([one.within for one in every], axis=0)),
+        median_error=nan if median is None else median,
+        median_normal_angle=_mean_of_known([one.median_normal_angle for one in every]),
+        normal_coverage=_mean_of_known([one.normal_coverage for one in every]),
+    )
+
+
+def write_json(path: Path, content: object) -> None:
+    """Write plain values as JSON, through a temporary name in the same folder.
+
+    Raises
+    ------
+    OutputError
+    """
+    temporary = path.with_name(path.name + ".part")
+    try:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _mean_of_known(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None and np.isfinite(value)]
+    return float(np.mean(known)) if known else None
+
+
+def _cloud_row(scores: CloudScores) -> list[str]:
+    distance = scores.cloud_to_reference
+    row = [
+        Path(scores.cloud).name,
+        f"{scores.point_count:,}",
+        f"{scores.judged_count:,}",
+        f"{distance.mean:.4f}",
+        f"{distance.standard_deviation:.4f}",
+    ]
+    for threshold in scores.thresholds:
+        row += [_percent(threshold.accuracy), _percent(threshold.completeness), _percent(threshold.f_score)]
+    return row
+
+
+def _registration_line(scores: CloudScores) -> str:
+    registration, name = scores.registration, Path(scores.cloud).name
+    if registration is None:
+        return f"{name}: not registered"
+    shift = ", ".join(f"{value:.3f}" for value in registration.shift)
+    return (
+        f"{name}: {'registered' if registration.applied else 'registration NOT applied'}, "
+        f"rotation {registration.rotation_degrees:.4f} deg, shift ({shift}) m, "
+        f"rms {registration.rms_before:.4f} -> {registration.rms_after:.4f} m, "
+        f"{_percent(registration.inlier_share)} of the points paired"
+    )
+
+
+def _tau_label(tau: float, gsd: float | None) -> str:
+    return f"{tau:g} m" if gsd is None else f"{tau / gsd:g} GSD"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2f} %"
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Columns to the right, the first to the left."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [
+            row[0].ljust(widths[0]),
+            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return "\n".join(lines)

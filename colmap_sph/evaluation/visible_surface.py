@@ -1,0 +1,142 @@
+"""The surface that images with exact depth see: a truth that knows what is hidden."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.evaluation.neighbours import Points, thin
+
+_CHUNK = 1 << 20
+_SAME_DEPTH = 0.005
+"""Relative depth difference up to which a view is taken to see a point."""
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """An image with exact depth: x_cam = R x + t, the first pixel's centre is at (0.5, 0.5) in the image."""
+
+    name: str
+    K: npt.NDArray[np.float64]
+    R: npt.NDArray[np.float64]
+    t: npt.NDArray[np.float64]
+    read_depth: Callable[[], npt.NDArray[np.float32]]
+    """Gives the (H, W) z-depth at pixel CENTRES, in the unit of t, 0 = none. Called when needed, never kept,
+    so that a large block fits in memory."""
+
+
+@dataclass(frozen=True)
+class VisibleSurface:
+    """Samples of all surface that the views see."""
+
+    points: Points
+    """(N, 3), at most one per voxel of the spacing."""
+    view_counts: npt.NDArray[np.int32]
+    """(N,) how many views see each."""
+
+
+def visible_surface(views: Sequence[DepthView], spacing: float) -> VisibleSurface:
+    """Back-project exact depth maps, thin the union, and count the views that see each point.
+
+    A view sees a point when it projects into the image and the exact depth at one of the four pixel centres
+    around it is within 0.5 % of the point's own.
+
+    Parameters
+    ----------
+    views : sequence of DepthView
+    spacing : float
+        Edge of the voxels that keep one point each, in the unit of the views.
+
+    Raises
+    ------
+    NoResultError
+        No view has any depth.
+    """
+    points = np.empty((0, 3))
+    limit = 0
+    for view in views:
+        seen = back_project(view, _depth_of(view))
+        if len(seen):
+            points = np.concatenate([points, seen[thin(seen, spacing)]])
+        if len(points) > limit:
+            points = points[thin(points, spacing)]
+            limit = 2 * len(points) + 5_000_000
+    if not len(points):
+        raise NoResultError("none of the exact depth maps has a pixel with a depth: there is no truth")
+    points = points[thin(points, spacing)]
+    counts = np.zeros(len(points), np.int32)
+    for view in views:
+        depth = _depth_of(view)
+        for start in range(0, len(points), _CHUNK):
+            rows, z, around = _look_up(view, depth, points[start : start + _CHUNK])
+            agrees = np.zeros(len(rows), bool)
+            for exact in around:
+                agrees |= (exact > 0) & (np.abs(exact - z) <= _SAME_DEPTH * z)
+            counts[start + rows[agrees]] += 1
+    return VisibleSurface(points, counts)
+
+
+def observed(points: Points, views: Sequence[DepthView]) -> npt.NDArray[np.bool_]:
+    """Which of (N, 3) points can be judged: those that project to a pixel with exact depth in some view.
+
+    What the exact surface hides is judged too: it was reconstructed from images that see something in front.
+    """
+    result = np.zeros(len(points), bool)
+    for view in views:
+        left = np.nonzero(~result)[0]
+        if not len(left):
+            break
+        depth = _depth_of(view)
+        for start in range(0, len(left), _CHUNK):
+            chunk = left[start : start + _CHUNK]
+            rows, _, around = _look_up(view, depth, points[chunk])
+            has_depth = np.zeros(len(rows), bool)
+            for exact in around:
+                has_depth |= exact > 0
+            result[chunk[rows[has_depth]]] = True
+    return result
+
+
+def back_project(view: DepthView, depth: npt.NDArray[np.float32]) -> Points:
+    """World points (N, 3) of the pixels of one exact depth map, sampled at pixel centres."""
+    row, column = np.nonzero(depth > 0)
+    z = depth[row, column].astype(np.float64)
+    image = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
+    camera = image @ np.linalg.inv(view.K).T * z[:, None]
+    return np.asarray((camera - view.t) @ view.R)
+
+
+def _depth_of(view: DepthView) -> npt.NDArray[np.float32]:
+    depth = view.read_depth()
+    if depth.ndim != 2:
+        raise InputError(f"the exact depth of {view.name} has shape {depth.shape}, not (rows, columns)")
+    return np.where(np.isfinite(depth), depth, 0).astype(np.float32, copy=False)
+
+
+def _look_up(
+    view: DepthView, depth: npt.NDArray[np.float32], points: Points
+) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64], Iterator[npt.NDArray[np.float32]]]:
+    """The rows of `points` that project into the image, their depths, and the exact depth of the four pixels
+    whose centres surround each."""
+    height, width = depth.shape
+    camera = points @ view.R.T + view.t
+    z = camera[:, 2]
+    safe = np.where(z > 0, z, 1.0)
+    image = camera @ view.K.T / safe[:, None]
+    x, y = image[:, 0], image[:, 1]
+    rows = np.nonzero((z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))[0]
+    x, y = x[rows], y[rows]
+
+    def around() -> Iterator[npt.NDArray[np.float32]]:
+        # A pixel's centre is at +0.5: the centres around (x, y) belong to floor(x ± 0.5), floor(y ± 0.5).
+        for dy in (-0.5, 0.5):
+            for dx in (-0.5, 0.5):
+                column = np.clip(np.floor(x + dx), 0, width - 1).astype(np.int64)
+                row = np.clip(np.floor(y + dy), 0, height - 1).astype(np.int64)
+                yield depth[row, column]
+
+    return rows, z[rows], around()

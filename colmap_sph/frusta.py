@@ -1,0 +1,104 @@
+"""What views would see: sample points stand in for a model's tracks where it has none.
+
+Where the model has points (without tracks), these are projected into the views. Where it has none, the depth of
+the scene is unknown, and all that poses tell is how far views that look the same way are apart. Photographers
+choose that distance so that images overlap: for overlaps of 60 to 90 % the scene lies 2 to 10 of these
+distances away. So every view's frustum is sampled at a few multiples of its distance to its neighbours, and
+whoever sees most of each other's samples overlaps most. Occlusion is not considered.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from colmap_sph.scene import Scene, View
+
+# Depths of the samples in units of the distance to the neighbours, and samples per side of an image.
+_DEPTHS = (2.0, 4.0, 8.0)
+_SAMPLES_PER_SIDE = 6
+# A neighbour looks less than 45° away; the distance is the median over the nearest few.
+_COS_SAME_WAY = 0.707
+_NUM_NEIGHBOURS = 4
+_NUM_NEAREST = 64
+# Samples that a view is tested against come from so many views that look nearest to where it looks.
+_NUM_TESTED = 256
+_MAX_POINTS = 20_000
+
+
+def observe_points(scene: Scene, points: NDArray[np.float64]) -> list[NDArray[np.int64]]:
+    """Return for every view the rows of (N, 3) `points` which project into it.
+
+    Of many points every n-th is used, in such a way that all views use the same.
+    """
+    rows = np.arange(0, len(points), -(-len(points) // _MAX_POINTS), dtype=np.int64)
+    return [rows[_sees(view, points[rows])] for view in scene.views]
+
+
+def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """Sample the viewing frusta.
+
+    Returns
+    -------
+    points : (N, 3) float64 ndarray
+        Samples of all frusta in the world frame.
+    observed : list of (n,) int64 ndarray
+        For every view the ascending rows of `points` inside its frustum; empty for a pose that is not finite.
+    """
+    count = _SAMPLES_PER_SIDE**2
+    posed = [i for i, view in enumerate(scene.views) if np.isfinite(view.cam_from_world).all()]
+    observed: list[list[NDArray[np.int64]]] = [[] for _ in scene.views]
+    if len(posed) < 2:
+        return np.empty((0, 3)), [np.empty(0, np.int64) for _ in scene.views]
+    views = [scene.views[i] for i in posed]
+    centers = np.array([view.center for view in views])
+    directions = np.array([view.viewing_direction for view in views])
+    distances = _neighbour_distances(centers, directions)
+    points: list[NDArray[np.float64]] = []
+    for depth in _DEPTHS:
+        first = len(points) * count
+        samples = [_sample(view, depth * d) for view, d in zip(views, distances, strict=True)]
+        block, points = np.array(samples), points + samples
+        targets = centers + depth * distances[:, None] * directions
+        nearest = cKDTree(targets).query(targets, k=min(_NUM_TESTED, len(views)))[1]
+        for k, i in enumerate(posed):
+            tested = np.sort(nearest[k])
+            rows = (tested[:, None] * count + np.arange(count)).ravel()
+            observed[i].append(first + rows[_sees(views[k], block[tested].reshape(-1, 3))])
+    return np.concatenate(points), [np.concatenate([*rows, np.empty(0, np.int64)]) for rows in observed]
+
+
+def _neighbour_distances(
+    centers: NDArray[np.float64], directions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return every view's typical distance to its neighbours that look the same way, as a (V,) array."""
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
+    distances, nearest = cKDTree(centers).query(centers, k=min(_NUM_NEAREST, len(centers)))
+    same_way = np.einsum("ij,ikj->ik", directions, directions[nearest]) > _COS_SAME_WAY
+    # Cameras of one rig, or images of one tripod, have no distance that tells anything.
+    apart = distances > 1e-3 * extent
+    typical = np.full(len(centers), np.nan)
+    for i in range(len(centers)):
+        for usable in (apart[i] & same_way[i], apart[i]):
+            if usable.any():
+                typical[i] = np.median(distances[i][usable][:_NUM_NEIGHBOURS])
+                break
+    return np.nan_to_num(typical, nan=max(extent, 1.0))
+
+
+def _sample(view: View, depth: float) -> NDArray[np.float64]:
+    """Return an even grid of the view's pixels at one depth as (n, 3) points in the world frame."""
+    steps = (np.arange(_SAMPLES_PER_SIDE) + 0.5) / _SAMPLES_PER_SIDE
+    u, v = np.meshgrid(steps * view.width, steps * view.height)
+    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
+    rays = pixels @ np.linalg.inv(view.K).T
+    return np.asarray((depth * rays - view.t) @ view.R)
+
+
+def _sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of (N, 3) points lie before the camera and inside its image."""
+    camera = points @ view.R.T + view.t
+    pixels = camera @ view.K.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
+        inside = (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
+    return np.asarray(inside & (camera[:, 2] > 0))

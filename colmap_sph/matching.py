@@ -1,0 +1,251 @@
+"""Rectified pair → disparity map: hierarchical semi-global matching.
+
+Census (9 × 7), Hamming cost, aggregation along 8 paths (Hirschmüller 2008), left-right check, sub-pixel fit and
+removal of small segments, on an image pyramid with per-pixel search ranges (Rothermel et al. 2012, "tSGM").
+Every pixel searches the same number of disparities from a base of its own, so memory stays regular.
+
+This module is the only caller of the matching kernels. Their convention is an *offset*, target column minus
+reference column; with the left image as reference it is minus the disparity.
+"""
+
+import os
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.errors import OptionError
+
+_OFFSET_INVALID = np.iinfo(np.int32).min
+_SUBPIXEL = 256  # offsets come in 1/256 pixel
+_STEP = 32  # search ranges are multiples of this many disparities
+_MAX_DEPTH = 1024
+_CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
+
+
+@dataclass(frozen=True)
+class MatchingOptions:
+    """How rectified images are matched."""
+
+    p1: int = 10
+    """Penalty for a disparity change of one pixel between neighbours, in census bits."""
+    p2: int = 120
+    """Penalty for larger changes in smooth image regions, in census bits."""
+    p2_min: int = 30
+    """Penalty for larger changes across strong intensity edges."""
+    p2_contrast: int = 24
+    """Intensity difference (grey values) at which the penalty has fallen halfway to `p2_min`."""
+    disparities: int = 32
+    """Disparities searched per pixel at full resolution; a multiple of 32."""
+    coarse_disparities: int = 64
+    """Disparities searched per pixel at the levels between the coarsest and the finest; a multiple of 32."""
+    max_coarsest_disparities: int = 128
+    """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
+    range_radius: int = 3
+    """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches."""
+    max_left_right_difference: int = 2
+    """Largest difference, in pixels, between the matches found from the left and from the right image."""
+    min_segment: int = 40
+    """Connected regions of fewer pixels than this are removed at full resolution."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds."""
+        if not 0 <= self.p1 <= self.p2_min <= self.p2 <= 193:
+            raise OptionError(
+                f"penalties must keep 0 <= p1 <= p2_min <= p2 <= 193, not {self.p1}, {self.p2_min}, {self.p2}."
+            )
+        if self.p2_contrast < 1:
+            raise OptionError(f"p2_contrast must be at least 1, not {self.p2_contrast}.")
+        for name in ("disparities", "coarse_disparities", "max_coarsest_disparities"):
+            value = getattr(self, name)
+            if not _STEP <= value <= _MAX_DEPTH or value % _STEP:
+                raise OptionError(f"{name} must be a multiple of {_STEP} up to {_MAX_DEPTH}, not {value}.")
+        if not 0 <= self.range_radius <= 50:
+            raise OptionError(f"range_radius must lie in 0..50, not {self.range_radius}.")
+        if self.max_left_right_difference < 0 or self.min_segment < 0:
+            raise OptionError("max_left_right_difference and min_segment must not be negative.")
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedImage:
+    """One image of a rectified pair: (H, W) uint8 grey values, and 255 where they are image content."""
+
+    image: NDArray[np.uint8]
+    valid: NDArray[np.uint8]
+
+
+def backend() -> str:
+    """Name of the kernels in use: the fastest this processor has, or what COLMAP_SPH_KERNELS asks for."""
+    wanted = os.environ.get("COLMAP_SPH_KERNELS")
+    available: list[str] = _native.backends()
+    if wanted and wanted not in available:
+        raise OptionError(f"COLMAP_SPH_KERNELS={wanted}: this processor has {', '.join(available)}.")
+    return wanted or available[0]
+
+
+def match_pair(
+    left: RectifiedImage,
+    right: RectifiedImage,
+    min_disparity: float,
+    max_disparity: float,
+    options: MatchingOptions,
+) -> NDArray[np.float32]:
+    """Match the left image of a rectified pair in the right one.
+
+    Parameters
+    ----------
+    left, right : RectifiedImage
+        Same height; widths may differ.
+    min_disparity, max_disparity : float
+        Range to search, pixels; disparity = left column − right column.
+    options : MatchingOptions
+
+    Returns
+    -------
+    (H, W) float32 ndarray
+        Disparity of every left pixel, pixels; NaN where there is none or where the two directions disagree.
+
+    References
+    ----------
+    H. Hirschmüller, Stereo processing by semiglobal matching and mutual information, PAMI 2008,
+    doi:10.1109/TPAMI.2007.1166. M. Rothermel et al., SURE: photogrammetric surface reconstruction from imagery,
+    LC3D Workshop 2012.
+    """
+    least, most = int(np.floor(-max_disparity)) - 1, int(np.ceil(-min_disparity)) + 1
+    levels = _num_levels(most - least, min(left.image.shape + right.image.shape), options)
+    lefts, rights = _pyramid(left, levels), _pyramid(right, levels)
+    base: NDArray[np.int32] | None = None
+    for level in range(levels, -1, -1):
+        low, high = least >> level, -(-most >> level)
+        if base is None:
+            depth = min(_round_up(high - low + 3), _MAX_DEPTH)
+            base = np.full(lefts[level].image.shape, low - 1, dtype=np.int32)
+        else:
+            depth = options.disparities if level == 0 else options.coarse_disparities
+            depth = min(depth, _round_up(high - low + 3))
+            base = _propagate(offset, lefts[level].image.shape, depth, low, high, options)
+        offset = _match_level(lefts[level], rights[level], base, depth, options)
+        _remove_small_segments(offset, max(options.min_segment >> level, 4))
+    disparity = offset.astype(np.float32)
+    disparity *= np.float32(-1 / _SUBPIXEL)
+    disparity[offset == _OFFSET_INVALID] = np.nan
+    return disparity
+
+
+def _round_up(count: int) -> int:
+    return -(-count // _STEP) * _STEP
+
+
+def _num_levels(disparities: int, size: int, options: MatchingOptions) -> int:
+    """Levels above full resolution: until the range is short, but never images under 32 pixels."""
+    levels = 0
+    while (disparities >> levels) + 3 > options.max_coarsest_disparities and (size >> levels) >= 64:
+        levels += 1
+    return max(levels, 2 if size >= 256 else 0)
+
+
+def _pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
+    """Full resolution first. Odd rows and columns are doubled, so that pixel x of a level covers 2x, 2x + 1."""
+    pyramid = [image]
+    for _ in range(levels):
+        pixels, valid = pyramid[-1].image, pyramid[-1].valid
+        height, width = pixels.shape
+        border = (0, height % 2, 0, width % 2)
+        if height % 2 or width % 2:
+            pixels = cv2.copyMakeBorder(pixels, *border, cv2.BORDER_REPLICATE)
+            valid = cv2.copyMakeBorder(valid, *border, cv2.BORDER_CONSTANT, value=0)
+        half = ((width + 1) // 2, (height + 1) // 2)
+        coarse_valid = cv2.resize(valid, half, interpolation=cv2.INTER_AREA)
+        pyramid.append(
+            RectifiedImage(
+                np.asarray(cv2.resize(pixels, half, interpolation=cv2.INTER_AREA), dtype=np.uint8),
+                np.where(coarse_valid >= 128, np.uint8(255), np.uint8(0)),
+            )
+        )
+    return pyramid
+
+
+def _census(image: RectifiedImage) -> NDArray[np.uint64]:
+    padded = cv2.copyMakeBorder(image.image, *_CENSUS_BORDER, cv2.BORDER_REPLICATE)
+    census = np.empty(image.image.shape, dtype=np.uint64)
+    _native.census(backend(), padded, np.ascontiguousarray(image.valid), census)
+    return census
+
+
+def _match_level(
+    left: RectifiedImage, right: RectifiedImage, base: NDArray[np.int32], depth: int, options: MatchingOptions
+) -> NDArray[np.int32]:
+    """Offsets of one level, 1/256 pixel."""
+    kernels = backend()
+    height, width = left.image.shape
+    left_census, right_census = _census(left), _census(right)
+    cost = np.empty((height, width, depth), dtype=np.uint8)
+    _native.matching_cost(kernels, left_census, right_census, base, cost)
+    aggregated = np.empty((height, width, depth), dtype=np.uint16)
+    image = np.ascontiguousarray(left.image)
+    _native.aggregation(kernels, cost, base, image, options.p1, _p2_table(options), aggregated)
+    offset = np.empty((height, width), dtype=np.int32)
+    _native.selection(
+        kernels, aggregated, base, left_census, right_census, options.max_left_right_difference, offset
+    )
+    return offset
+
+
+def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:
+    """P2 by absolute intensity difference: hyperbolic decay from `p2` to `p2_min`."""
+    contrast = np.arange(256)
+    p2 = options.p2_min + (options.p2 - options.p2_min) / (1 + contrast / options.p2_contrast)
+    return np.round(p2).astype(np.uint8)
+
+
+def _remove_small_segments(offset: NDArray[np.int32], min_segment: int) -> None:
+    """Invalidate, in place, connected regions smaller than `min_segment` pixels."""
+    if min_segment < 2:
+        return
+    valid = offset != _OFFSET_INVALID
+    # cv2.filterSpeckles works on 16 bits: quarter pixels hold ranges of 8,000 pixels around the middle.
+    quarters = offset // (_SUBPIXEL // 4)
+    middle = int(np.median(quarters[valid])) if valid.any() else 0
+    small = np.where(valid, np.clip(quarters - middle, -32000, 32000), -32768).astype(np.int16)
+    cv2.filterSpeckles(small, -32768, min_segment - 1, 4)
+    offset[small == -32768] = _OFFSET_INVALID
+
+
+def _propagate(
+    offset: NDArray[np.int32],
+    shape: tuple[int, ...],
+    depth: int,
+    low: int,
+    high: int,
+    options: MatchingOptions,
+) -> NDArray[np.int32]:
+    """First offset to search for each pixel of the next finer level, from the offsets of a level.
+
+    A pixel searches around the middle of its neighbourhood's offsets where they fit into `depth`, else around
+    its own; pixels without an offset take the nearest pixel's.
+    """
+    valid = offset != _OFFSET_INVALID
+    if not valid.any():
+        return np.full(shape, (low + high - depth) // 2, dtype=np.int32)
+    own = _fill_nearest(offset.astype(np.float32) / _SUBPIXEL, valid)
+    window = np.ones((2 * options.range_radius + 1,) * 2, dtype=np.uint8)
+    least, most = cv2.erode(own, window), cv2.dilate(own, window)
+    fits = 2 * (most - least) <= depth - 8
+    # A little towards the neighbourhood's middle even where it does not fit.
+    reach = np.float32((depth - 12) / 4)
+    centre = np.where(fits, (least + most) / 2, np.clip((least + most) / 2, own - reach, own + reach))
+    base = np.round(2 * centre - depth / 2).astype(np.int32)
+    fine = np.repeat(np.repeat(base, 2, axis=0), 2, axis=1)[: shape[0], : shape[1]]
+    return np.ascontiguousarray(np.clip(fine, low - 1, max(high + 2 - depth, low - 1)))
+
+
+def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Give pixels that are not valid the value of the nearest one that is."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(labels.max()) + 1, dtype=np.float32)
+    of_label[labels[valid]] = values[valid]
+    return of_label[labels]

@@ -1,0 +1,53 @@
+"""Options of all stages in one record: what the command line, the Python API and the pipeline share."""
+
+import os
+from dataclasses import dataclass, field
+
+from colmap_sph.depth import DepthOptions
+from colmap_sph.errors import OptionError
+from colmap_sph.fusion import FusionOptions
+from colmap_sph.matching import MatchingOptions
+from colmap_sph.normals import NormalOptions
+from colmap_sph.pairs import PairOptions
+from colmap_sph.rectification import RectificationOptions
+from colmap_sph.undistortion import UndistortionOptions
+from colmap_sph.workspace import MapKind
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of all stages and of the run itself."""
+
+    threads: int = 0
+    """Worker threads; 0: as many as the process may use cores."""
+    fusion_input: MapKind = "geometric"
+    """Maps to fuse: "geometric" (confirmed by other views) or "photometric"."""
+    undistortion: UndistortionOptions = field(default_factory=UndistortionOptions)
+    pairs: PairOptions = field(default_factory=PairOptions)
+    rectification: RectificationOptions = field(default_factory=RectificationOptions)
+    matching: MatchingOptions = field(default_factory=MatchingOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+    normals: NormalOptions = field(default_factory=NormalOptions)
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds, in any stage."""
+        if not 0 <= self.threads <= 1024:
+            raise OptionError(f"threads must lie in 0..1024, not {self.threads}.")
+        if self.fusion_input not in ("geometric", "photometric"):
+            raise OptionError(f"fusion_input must be 'geometric' or 'photometric', not {self.fusion_input!r}.")
+        for stage in (
+            self.undistortion,
+            self.pairs,
+            self.rectification,
+            self.matching,
+            self.depth,
+            self.normals,
+            self.fusion,
+        ):
+            stage.check()
+
+    @property
+    def num_threads(self) -> int:
+        """Worker threads to use."""
+        return self.threads or len(os.sched_getaffinity(0))

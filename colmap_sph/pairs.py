@@ -1,0 +1,345 @@
+"""Scene → for every image the partners it is matched with, best first.
+
+The best partners share the most sparse points (3D points both images observe), and see them under some parallax.
+Without tracks the verified matches of COLMAP's database stand in for the shared points, and without these the
+overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
+"""
+
+import logging
+import sqlite3
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from colmap_sph.errors import InputError, NoResultError, OptionError
+from colmap_sph.frusta import observe_frusta, observe_points
+from colmap_sph.scene import Scene
+from colmap_sph.workspace import SourceImages
+
+logger = logging.getLogger(__name__)
+
+PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
+
+# COLMAP numbers a pair `image_id1 * 2147483647 + image_id2`.
+_MAX_NUM_IMAGES = 2147483647
+# A view's candidates whose angles are looked at before giving up, and the points that tell the angle of a pair.
+_MAX_CANDIDATES = 200
+_MAX_ANGLE_POINTS = 512
+_ANGLE_PERCENTILE = 75
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """Which pairs of images are matched."""
+
+    num_pairs: int = 10
+    """Partners of each image, at most."""
+
+    min_triangulation_angle: float = 1.0
+    """Least parallax of a pair in degrees: its 75th percentile over the points that both images see."""
+
+    max_triangulation_angle: float = 60.0
+    """Parallax in degrees above which a partner comes after all others."""
+
+    min_shared_points: int = 10
+    """Least number of sparse points (or verified matches) that both images must have."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of its bounds."""
+        if self.num_pairs < 1:
+            raise OptionError(f"num_pairs must be at least 1, not {self.num_pairs}.")
+        if not 0 <= self.min_triangulation_angle < self.max_triangulation_angle <= 180:
+            raise OptionError(
+                "0 <= min_triangulation_angle < max_triangulation_angle <= 180 degrees must hold, not "
+                f"{self.min_triangulation_angle} and {self.max_triangulation_angle}."
+            )
+        if self.min_shared_points < 1:
+            raise OptionError(f"min_shared_points must be at least 1, not {self.min_shared_points}.")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A reference image and one of its partners.
+
+    Attributes
+    ----------
+    reference, partner : str
+        Image names.
+    shared_points : int
+        Sparse points which both images observe; verified matches or common samples of the frusta where the
+        pair was found by these.
+    angle : float
+        75th percentile of the triangulation angle over these points in degrees; NaN where there is none.
+    """
+
+    reference: str
+    partner: str
+    shared_points: int
+    angle: float
+
+
+@dataclass(frozen=True)
+class PairSelection:
+    """The partners of every reference image.
+
+    Attributes
+    ----------
+    pairs : mapping of str to tuple of Pair
+        For each reference image, in the order of the scene, its pairs with the best first; may be empty.
+    source : "tracks", "database", "frusta" or "patch-match.cfg"
+        What the selection rests on.
+    """
+
+    pairs: Mapping[str, tuple[Pair, ...]]
+    source: PairSource
+
+    @property
+    def without_partner(self) -> tuple[str, ...]:
+        """Reference images that have no pair."""
+        return tuple(name for name, pairs in self.pairs.items() if not pairs)
+
+    def unique_pairs(self) -> list[tuple[str, str]]:
+        """Return every unordered pair once, as two sorted names, in sorted order."""
+        names = {tuple(sorted((p.reference, p.partner))) for pairs in self.pairs.values() for p in pairs}
+        return sorted((first, second) for first, second in names)
+
+
+def select_pairs(
+    scene: Scene,
+    options: PairOptions,
+    *,
+    explicit: Mapping[str, SourceImages] | None = None,
+    database: Path | None = None,
+) -> PairSelection:
+    """Choose the partners of every image.
+
+    Parameters
+    ----------
+    scene : Scene
+    options : PairOptions
+    explicit : mapping, optional
+        ``patch-match.cfg`` as `read_patch_match_cfg` returns it. Only its reference images are processed; their
+        lists are obeyed without any gate; ``__auto__`` means the choice made here.
+    database : Path, optional
+        COLMAP database whose verified matches serve where the model has no tracks.
+
+    Returns
+    -------
+    PairSelection
+
+    Raises
+    ------
+    NoResultError
+        No image has a partner.
+    InputError
+        The database cannot be read.
+    """
+    options.check()
+    graph = _build_graph(scene, options, database)
+    if explicit is None:
+        pairs = {view.name: _best_pairs(graph, options, i) for i, view in enumerate(scene.views)}
+        selection = PairSelection(pairs, graph.source)
+    else:
+        selection = _explicit_selection(graph, options, explicit)
+    _report(selection, options)
+    return selection
+
+
+class _Graph:
+    """Candidates of every view with the weight of each, and the angles of pairs, computed when asked for."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        source: PairSource,
+        weights: sparse.csr_array,
+        points: NDArray[np.float64],
+        observed: list[NDArray[np.int64]],
+    ) -> None:
+        self.scene, self.source = scene, source
+        self.centers = np.array([view.center for view in scene.views])
+        self._weights, self._points, self._observed = weights, points, observed
+        self._angles: dict[tuple[int, int], float] = {}
+        self._is_observed = np.zeros(len(points), dtype=bool)
+
+    def weight(self, i: int, j: int) -> int:
+        """Return what views `i` and `j` share."""
+        return int(self._weights[i, j])
+
+    def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the views that share something with view `i`, most first, and how much it is."""
+        row = slice(self._weights.indptr[i], self._weights.indptr[i + 1])
+        views, weights = self._weights.indices[row], self._weights.data[row]
+        order = np.lexsort((views, -weights))
+        return views[order].astype(np.int64), weights[order].astype(np.int64)
+
+    def angle(self, i: int, j: int) -> float:
+        """Return the 75th percentile of the triangulation angles in degrees; NaN without common points."""
+        key = (min(i, j), max(i, j))
+        if key not in self._angles:
+            self._angles[key] = self._compute_angle(*key)
+        return self._angles[key]
+
+    def _compute_angle(self, i: int, j: int) -> float:
+        self._is_observed[self._observed[i]] = True
+        shared = self._observed[j][self._is_observed[self._observed[j]]]
+        self._is_observed[self._observed[i]] = False
+        if len(shared) == 0:
+            return float("nan")
+        # Spread evenly over the points, whose order says nothing about where they are.
+        points = self._points[shared[:: -(-len(shared) // _MAX_ANGLE_POINTS)]]
+        angles = triangulation_angles(points, self.centers[i], self.centers[j])
+        return float(np.percentile(angles, _ANGLE_PERCENTILE))
+
+
+def triangulation_angles(
+    points: NDArray[np.float64], center1: NDArray[np.float64], center2: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the angles in degrees, 0 to 180, between the rays from (N, 3) points to two projection centres."""
+    rays1, rays2 = center1 - points, center2 - points
+    # Unlike the arc cosine, exact for small angles.
+    sines = np.linalg.norm(np.cross(rays1, rays2), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sines, np.einsum("ij,ij->i", rays1, rays2))))
+
+
+def _build_graph(scene: Scene, options: PairOptions, database: Path | None) -> _Graph:
+    """Find what views have in common: tracks, else verified matches, else samples of the frusta."""
+    finite = np.isfinite(scene.points).all(axis=1)
+    posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
+    observed = [
+        view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
+        for view, good in zip(scene.views, posed, strict=True)
+    ]
+    if any(len(indices) for indices in observed):
+        weights = _shared_points(observed, len(scene.points), options.min_shared_points)
+        return _Graph(scene, "tracks", weights, scene.points, observed)
+    points = scene.points[finite]
+    if len(points):
+        observed = observe_points(scene, points)
+    else:
+        points, observed = observe_frusta(scene)
+    if database is not None:
+        weights = _verified_matches(scene, database, options.min_shared_points)
+        if weights.nnz:
+            return _Graph(scene, "database", weights, points, observed)
+        logger.warning("%s has no verified matches of the model's images", database)
+    return _Graph(scene, "frusta", _shared_points(observed, len(points), 1), points, observed)
+
+
+def _shared_points(observed: list[NDArray[np.int64]], num_points: int, least: int) -> sparse.csr_array:
+    """Count the points that two views share, as a (V, V) matrix of counts of at least `least`."""
+    indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
+    indices = np.concatenate([*observed, np.empty(0, np.int64)])
+    ones = np.ones(len(indices), dtype=np.int32)
+    seen = sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
+    return _without_self_and_few(seen @ seen.T, least)
+
+
+def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_array:
+    entries = counts.tocoo()
+    keep = (entries.row != entries.col) & (entries.data >= least)
+    kept = (entries.data[keep], (entries.row[keep], entries.col[keep]))
+    return sparse.csr_array(kept, shape=counts.shape)
+
+
+def _verified_matches(scene: Scene, database: Path, least: int) -> sparse.csr_array:
+    """Read the numbers of verified matches between views.
+
+    By SQLite itself, read-only: COLMAP's own class would create a missing database and migrate an old one.
+    """
+    try:
+        connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
+        try:
+            names = dict(connection.execute("SELECT image_id, name FROM images"))
+            rows = connection.execute(
+                "SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0"
+            ).fetchall()
+        finally:
+            connection.close()
+    except sqlite3.Error as error:
+        raise InputError(
+            f"The database {database} cannot be read ({error}); give a COLMAP database or none."
+        ) from error
+    index_of = {image_id: scene.index_of.get(name, -1) for image_id, name in names.items()}
+    ids = np.array([divmod(pair_id, _MAX_NUM_IMAGES) for pair_id, _ in rows]).reshape(-1, 2)
+    first, second = (np.array([index_of.get(int(i), -1) for i in column], np.int64) for column in ids.T)
+    matches = np.array([count for _, count in rows], dtype=np.int64)
+    known = (first >= 0) & (second >= 0)
+    first, second, matches = first[known], second[known], matches[known]
+    both = (np.tile(matches, 2), (np.concatenate([first, second]), np.concatenate([second, first])))
+    return _without_self_and_few(sparse.csr_array(both, shape=(len(scene.views),) * 2), least)
+
+
+def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]:
+    """Return the best pairs of view `i`: those which share most, after them those under a wide angle."""
+    near, wide = [], []
+    for j, weight in zip(*graph.candidates(i), strict=True):
+        if len(near) == options.num_pairs or len(near) + len(wide) >= _MAX_CANDIDATES:
+            break
+        angle = graph.angle(i, int(j))
+        if np.isnan(angle) and np.array_equal(graph.centers[i], graph.centers[j]):
+            continue
+        if angle < options.min_triangulation_angle:
+            continue
+        pair = Pair(graph.scene.views[i].name, graph.scene.views[j].name, int(weight), angle)
+        (wide if angle > options.max_triangulation_angle else near).append(pair)
+    return tuple((near + wide)[: options.num_pairs])
+
+
+def _explicit_selection(
+    graph: _Graph, options: PairOptions, explicit: Mapping[str, SourceImages]
+) -> PairSelection:
+    index_of = graph.scene.index_of
+    _warn_unknown(explicit, index_of)
+    pairs: dict[str, tuple[Pair, ...]] = {}
+    obeyed = set(index_of) - set(explicit) != set()
+    for name in sorted(explicit.keys() & index_of.keys(), key=index_of.__getitem__):
+        sources, i = explicit[name], index_of[name]
+        if isinstance(sources, int):
+            pairs[name] = _best_pairs(graph, options, i)
+            continue
+        obeyed = True
+        partners = index_of if sources == "__all__" else sources
+        known = [index_of[partner] for partner in partners if partner in index_of and partner != name]
+        pairs[name] = tuple(
+            Pair(name, graph.scene.views[j].name, graph.weight(i, j), graph.angle(i, j)) for j in known
+        )
+    return PairSelection(pairs, "patch-match.cfg" if obeyed else graph.source)
+
+
+def _warn_unknown(explicit: Mapping[str, SourceImages], index_of: Mapping[str, int]) -> None:
+    listed: set[str] = set(explicit)
+    for sources in explicit.values():
+        if isinstance(sources, list):
+            listed.update(sources)
+    for name in sorted(listed - set(index_of)):
+        logger.warning("patch-match.cfg names %s, which is not among the usable images; ignored", name)
+
+
+def _report(selection: PairSelection, options: PairOptions) -> None:
+    words = {
+        "tracks": "the sparse points that images share",
+        "database": "the verified matches in the database, as the model has no tracks",
+        "frusta": "the overlap of the viewing frusta, as the model has no tracks",
+        "patch-match.cfg": "patch-match.cfg",
+    }
+    num_unique = len(selection.unique_pairs())
+    if num_unique == 0:
+        raise NoResultError(
+            f"No pair of images overlaps, going by {words[selection.source]}: at least "
+            f"{options.min_shared_points} shared points and a triangulation angle of "
+            f"{options.min_triangulation_angle} degrees are needed; check the model or lower these bounds."
+        )
+    logger.info("%d pairs of %d images, by %s", num_unique, len(selection.pairs), words[selection.source])
+    for name in selection.without_partner:
+        logger.warning("%s has no partner with enough overlap and parallax; it gets no depth map", name)
+
+
+def names_of(pairs: Iterable[Pair]) -> list[str]:
+    """Return the partners' names."""
+    return [pair.partner for pair in pairs]

@@ -1,0 +1,388 @@
+"""The whole main job: order of the stages, worker threads, and the report.
+
+Stages talk through files in the workspace: disparity maps of pairs, photometric maps with their standard
+deviations, geometric maps, the cloud.
+"""
+
+import json
+import logging
+import resource
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate_depth
+from colmap_sph.errors import ColmapSphError, InputError, NoResultError, OptionError, OutputError
+from colmap_sph.fusion import explain_losses, fuse
+from colmap_sph.load_cache import LoadCache
+from colmap_sph.matching import RectifiedImage, match_pair
+from colmap_sph.normals import fit_normals
+from colmap_sph.options import RunOptions
+from colmap_sph.pair_files import read_pair, write_pair
+from colmap_sph.pairs import Pair, select_pairs
+from colmap_sph.rectification import rectify_pair, resample
+from colmap_sph.report import Progress, RunReport, Silent
+from colmap_sph.scene import Scene, View, read_scene
+from colmap_sph.undistortion import leave_out_bad_images, open_workspace, prepare_workspace
+from colmap_sph.workspace import (
+    MapKind,
+    SourceImages,
+    Workspace,
+    atomic_file,
+    make_dir,
+    read_depth_map,
+    read_patch_match_cfg,
+    write_depth_map,
+    write_fusion_cfg,
+    write_normal_map,
+)
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+# Fewer points than this share of the pixels with a geometric depth calls for an explanation.
+_FEW_POINTS = 0.02
+_CACHE_BYTES = 512 << 20
+
+
+def run(
+    model: Path | None = None,
+    *,
+    images: Path | None = None,
+    output: Path | None = None,
+    workspace: Path | None = None,
+    options: RunOptions | None = None,
+    progress: Progress | None = None,
+) -> RunReport:
+    """From a sparse model, or a dense workspace, to depth maps, normal maps and a fused cloud.
+
+    Parameters
+    ----------
+    model : Path, optional
+        COLMAP sparse model; its images are undistorted into `output`.
+    images : Path, optional
+        Original images; found by COLMAP's usual layouts if not given.
+    output : Path, optional
+        Dense workspace to create; "dense" beside the model's project if not given.
+    workspace : Path, optional
+        An existing dense workspace, instead of the three above.
+    options : RunOptions, optional
+    progress : Progress, optional
+
+    Returns
+    -------
+    RunReport
+
+    Raises
+    ------
+    ColmapSphError
+        Bad input or options, unwritable output, or nothing to reconstruct.
+    """
+    options, progress, report = options or RunOptions(), progress or Silent(), RunReport()
+    options.check()
+    root = workspace_root(model, images=images, output=output, workspace=workspace)
+    with _stage(report, progress, "undistort", 1):
+        dense = (
+            prepare_workspace(Path(model), images, root, options.undistortion) if model else open_workspace(root)
+        )
+        progress.advance()
+    database = find_database(Path(model)) if model else None
+    return reconstruct(dense, options, progress=progress, report=report, database=database)
+
+
+def workspace_root(
+    model: Path | None, *, images: Path | None, output: Path | None, workspace: Path | None
+) -> Path:
+    """Folder of the dense workspace that `run` with these arguments works in; `OptionError` for contradictions."""
+    if (model is None) == (workspace is None):
+        raise OptionError("give either --model (a sparse model) or --workspace (a dense workspace), not both.")
+    if workspace is not None:
+        if output is not None or images is not None:
+            raise OptionError("--workspace is complete in itself; leave out --images and --output.")
+        return Path(workspace)
+    assert model is not None
+    if output is not None:
+        return Path(output)
+    project = Path(model).resolve()
+    while project.name.isdigit() or project.name == "sparse":
+        project = project.parent
+    return project / "dense"
+
+
+def find_database(model: Path) -> Path | None:
+    """COLMAP's ``database.db`` beside or above the model, if there is one."""
+    folders = [model, *model.resolve().parents[:2]]
+    return next((f / "database.db" for f in folders if (f / "database.db").is_file()), None)
+
+
+def reconstruct(
+    workspace: Workspace,
+    options: RunOptions,
+    *,
+    progress: Progress | None = None,
+    report: RunReport | None = None,
+    database: Path | None = None,
+) -> RunReport:
+    """Match, fuse and check everything in a dense workspace; see `run`."""
+    progress, report = progress or Silent(), report or RunReport()
+    make_dir(workspace.state_dir)
+    with _one_opencv_thread():
+        whole = read_scene(workspace.sparse_dir)
+        scene = leave_out_bad_images(whole, workspace)
+        for view in whole.views:
+            if view.name not in scene.index_of:
+                report.skipped_images[view.name] = "its undistorted image is missing or damaged"
+        with _stage(report, progress, "select pairs", 1):
+            selection = select_pairs(
+                scene,
+                options.pairs,
+                explicit=_written_pairs(workspace),
+                database=database,
+            )
+            report.pair_source = selection.source
+            progress.advance()
+        pairs = match_pairs(workspace, scene, selection.unique_pairs(), options, progress, report)
+        partners = _partners(pairs)
+        estimate_views(workspace, scene, partners, options, progress, report)
+        check_views(workspace, scene, partners, options, progress, report)
+    return fuse_views(workspace, scene, options, progress, report)
+
+
+# ---- stages -------------------------------------------------------------------------------------------------
+
+
+def match_pairs(
+    workspace: Workspace,
+    scene: Scene,
+    pairs: Sequence[Pair],
+    options: RunOptions,
+    progress: Progress,
+    report: RunReport,
+) -> list[tuple[str, str]]:
+    """Rectify and match pairs, each once; writes their disparity maps and returns the names of those matched."""
+    make_dir(_pairs_dir(workspace))
+    images = LoadCache(lambda name: _read_grey(workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
+
+    def work(pair: Pair) -> tuple[str, str]:
+        left, right = scene.view(pair.reference), scene.view(pair.partner)
+        geometry = rectify_pair(scene, left, right, options.rectification)
+        rectified = [
+            RectifiedImage(*resample(images.get(view.name), view, geometry, side))
+            for view, side in ((left, "left"), (right, "right"))
+        ]
+        disparity = match_pair(*rectified, geometry.min_disparity, geometry.max_disparity, options.matching)
+        write_pair(
+            _pair_path(workspace, left.name, right.name, scene),
+            PairDisparity(left.name, right.name, geometry, disparity),
+        )
+        return left.name, right.name
+
+    def skip(pair: Pair, error: ColmapSphError) -> None:
+        report.skipped_pairs[f"{pair.reference} - {pair.partner}"] = str(error)
+
+    with _stage(report, progress, "match pairs", len(pairs)):
+        matched = _for_all(work, pairs, options.num_threads, progress, skip)
+    if not matched:
+        reason = next(iter(report.skipped_pairs.values()), "no pair")
+        raise NoResultError(f"None of the {len(pairs)} pairs could be matched ({reason}).")
+    report.pairs = len(matched)
+    return sorted(matched)
+
+
+def estimate_views(
+    workspace: Workspace,
+    scene: Scene,
+    partners: dict[str, list[str]],
+    options: RunOptions,
+    progress: Progress,
+    report: RunReport,
+) -> None:
+    """Vote the photometric depth of every view; writes depth, normal and sigma maps."""
+    workspace.create_stereo_dirs(view.name for view in scene.views)
+    for view in scene.views:
+        make_dir(_sigma_path(workspace, view.name).parent)
+
+    def work(view: View) -> None:
+        files = (_pair_path(workspace, view.name, other, scene) for other in partners.get(view.name, []))
+        estimate = estimate_depth(view, (read_pair(file) for file in files), options.depth)
+        _write_maps(workspace, view, estimate, "photometric", options)
+        with atomic_file(_sigma_path(workspace, view.name)) as file:
+            np.savez(file, depth=estimate.depth, sigma=estimate.sigma, support=estimate.support)
+
+    with _stage(report, progress, "estimate depth", len(scene.views)):
+        _for_all(work, scene.views, options.num_threads, progress)
+
+
+def check_views(
+    workspace: Workspace,
+    scene: Scene,
+    partners: dict[str, list[str]],
+    options: RunOptions,
+    progress: Progress,
+    report: RunReport,
+) -> None:
+    """Check every view's depth against its partners'; writes the geometric depth and normal maps."""
+    estimates = LoadCache(
+        lambda name: _read_estimate(workspace, name), lambda e: 9 * e.depth.size, _CACHE_BYTES
+    )
+
+    def work(view: View) -> None:
+        others = ((scene.view(name), estimates.get(name)) for name in partners.get(view.name, []))
+        checked = check_depth(view, estimates.get(view.name), others, options.depth)
+        depth = _write_maps(workspace, view, checked, "geometric", options)
+        report.coverage[view.name] = float((depth > 0).mean())
+
+    with _stage(report, progress, "check consistency", len(scene.views)):
+        _for_all(work, scene.views, options.num_threads, progress)
+    report.coverage = dict(sorted(report.coverage.items()))
+    report.images = sum(share > 0 for share in report.coverage.values())
+    for view in scene.views:
+        if report.coverage[view.name] == 0:
+            report.skipped_images[view.name] = "no depth of it is confirmed by another image"
+    if not report.images:
+        raise NoResultError(
+            "No depth was confirmed by a second image; are the model's poses right for these images?"
+        )
+
+
+def fuse_views(
+    workspace: Workspace, scene: Scene, options: RunOptions, progress: Progress, report: RunReport
+) -> RunReport:
+    """Fuse the maps into the cloud; writes ``fused.ply``, ``fused.ply.vis`` and the report."""
+    names = [view.name for view in scene.views if report.coverage.get(view.name, 0) > 0]
+    write_fusion_cfg(workspace.fusion_cfg_path, names)
+    kind = options.fusion_input
+    with _stage(report, progress, "fuse", 1):
+        report.points = fuse(workspace, options.fusion, threads=options.num_threads, kind=kind)
+        progress.advance()
+    pixels = sum(report.coverage[view.name] * view.width * view.height for view in scene.views)
+    if report.points < _FEW_POINTS * pixels:
+        report.advice = explain_losses(workspace, scene, options.fusion, kind=kind).sentence()
+        logger.warning("Only %d points survived fusion. %s", report.points, report.advice)
+    report.peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (
+        1 if sys.platform == "darwin" else 1024
+    )
+    with atomic_file(workspace.state_dir / "report.json") as file:
+        file.write(json.dumps({"options": asdict(options), **asdict(report)}, indent=1, default=str).encode())
+    return report
+
+
+# ---- helpers ------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _stage(report: RunReport, progress: Progress, name: str, total: int) -> Iterator[None]:
+    logger.info("%s (%d)", name.capitalize(), total)
+    progress.start(name, total)
+    start = time.perf_counter()
+    yield
+    report.seconds[name] = round(time.perf_counter() - start, 3)
+    logger.info("%s: %.1f s", name.capitalize(), report.seconds[name])
+
+
+@contextmanager
+def _one_opencv_thread() -> Iterator[None]:
+    """Our workers are the threads; OpenCV's own would fight them for the cores."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _for_all(
+    work: Callable[[T], object],
+    items: Iterable[T],
+    threads: int,
+    progress: Progress,
+    skip: Callable[[T, ColmapSphError], None] | None = None,
+) -> list:  # type: ignore[type-arg]
+    """`work` on all items in worker threads; results in the items' order.
+
+    An item that raises a `ColmapSphError` is handed to `skip` and has no result; any other error, and an output
+    that cannot be written, ends the stage.
+    """
+    lock = threading.Lock()
+    with ThreadPoolExecutor(threads) as pool:
+        futures: dict[Future[object], T] = {pool.submit(work, item): item for item in items}
+        try:
+            for future in as_completed(futures):
+                error = future.exception()
+                if error is not None:
+                    if skip is None or not isinstance(error, ColmapSphError) or isinstance(error, OutputError):
+                        raise error
+                    with lock:
+                        skip(futures[future], error)
+                    logger.warning("Skipped: %s", error)
+                progress.advance()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+        return [future.result() for future in futures if future.exception() is None]
+
+
+def _partners(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    partners: dict[str, list[str]] = {}
+    for left, right in pairs:
+        partners.setdefault(left, []).append(right)
+        partners.setdefault(right, []).append(left)
+    return {name: sorted(others) for name, others in partners.items()}
+
+
+def _written_pairs(workspace: Workspace) -> dict[str, SourceImages] | None:
+    path = workspace.patch_match_cfg_path
+    return read_patch_match_cfg(path) if path.exists() else None
+
+
+def _pairs_dir(workspace: Workspace) -> Path:
+    return workspace.state_dir / "pairs"
+
+
+def _pair_path(workspace: Workspace, a: str, b: str, scene: Scene) -> Path:
+    """File of a pair's disparity map: named by COLMAP's image ids, since names may hold anything."""
+    low, high = sorted((scene.view(a).image_id, scene.view(b).image_id))
+    return _pairs_dir(workspace) / f"{low:06d}-{high:06d}.npz"
+
+
+def _sigma_path(workspace: Workspace, name: str) -> Path:
+    return workspace.state_dir / "photometric" / f"{name}.npz"
+
+
+def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:
+    path = workspace.image_path(name)
+    # Undistorted images have their camera's orientation; an EXIF tag must not turn them.
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _read_estimate(workspace: Workspace, name: str) -> DepthEstimate:
+    path = _sigma_path(workspace, name)
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return DepthEstimate(data["depth"], data["sigma"], data["support"])
+    except (OSError, ValueError, KeyError, EOFError) as error:
+        raise InputError(f"{path} cannot be read ({error}); delete it and run again.") from error
+
+
+def _write_maps(
+    workspace: Workspace, view: View, estimate: DepthEstimate, kind: MapKind, options: RunOptions
+) -> NDArray[np.float32]:
+    """Fit normals, write both maps, return the depth written (that of the fitted planes)."""
+    normals, depth = fit_normals(view, estimate, options.normals)
+    write_depth_map(workspace.depth_map_path(view.name, kind), depth)
+    write_normal_map(workspace.normal_map_path(view.name, kind), normals)
+    return depth

@@ -1,0 +1,64 @@
+"""What a run tells while it works and when it is done."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """What the pipeline tells a progress display."""
+
+    def start(self, stage: str, total: int) -> None:
+        """A stage of `total` steps begins."""
+
+    def advance(self) -> None:
+        """One step is done."""
+
+
+class Silent:
+    """A display that shows nothing."""
+
+    def start(self, stage: str, total: int) -> None:
+        """Nothing."""
+
+    def advance(self) -> None:
+        """Nothing."""
+
+
+@dataclass
+class RunReport:
+    """What a run did.
+
+    Attributes
+    ----------
+    images : int
+        Images with depth maps.
+    skipped_images : dict
+        Image name → why it has no depth map.
+    pair_source : str
+        Where the pairs come from.
+    pairs : int
+        Pairs matched.
+    skipped_pairs : dict
+        "left - right" → why the pair was not matched.
+    coverage : dict
+        Image name → share of its pixels with a geometric depth.
+    points : int
+        Points of the fused cloud.
+    advice : str
+        Where few points survived: which gate took them.
+    seconds : dict
+        Stage → wall time.
+    peak_memory : int
+        Largest resident set of the process, bytes.
+    """
+
+    images: int = 0
+    skipped_images: dict[str, str] = field(default_factory=dict)
+    pair_source: str = ""
+    pairs: int = 0
+    skipped_pairs: dict[str, str] = field(default_factory=dict)
+    coverage: dict[str, float] = field(default_factory=dict)
+    points: int = 0
+    advice: str = ""
+    seconds: dict[str, float] = field(default_factory=dict)
+    peak_memory: int = 0

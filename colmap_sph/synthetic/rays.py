@@ -1,0 +1,184 @@
+"""Cameras, their rays, and the first surface along each.
+
+COLMAP's frames: x right, y down, z forward, `x_cam = R x_world + t`, the first pixel's centre at (0.5, 0.5).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from colmap_sph.synthetic.primitives import FloatArray, Surface
+
+_NEAR = 1e-6
+
+Index = tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with its pose.
+
+    Attributes
+    ----------
+    K : (3, 3) float64
+        Calibration matrix in COLMAP's image coordinates (first pixel's centre at 0.5).
+    R, t : (3, 3) and (3,) float64
+        `x_cam = R x_world + t`.
+    width, height : int
+        Pixels.
+    """
+
+    K: FloatArray
+    R: FloatArray
+    t: FloatArray
+    width: int
+    height: int
+
+    @property
+    def centre(self) -> FloatArray:
+        """Camera centre (3,) in the world."""
+        return -self.R.T @ self.t
+
+    def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Image coordinates (N, 2) and z-depth (N,) of world points (N, 3)."""
+        in_camera = points @ self.R.T + self.t
+        with np.errstate(divide="ignore", invalid="ignore"):
+            homogeneous = in_camera @ self.K.T
+            image = homogeneous[:, :2] / homogeneous[:, 2:]
+        return image, in_camera[:, 2]
+
+    def back_project(self, image: FloatArray, depth: FloatArray) -> FloatArray:
+        """World points (N, 3) at image coordinates (N, 2) and z-depth (N,)."""
+        rays = np.column_stack([image, np.ones(len(image))]) @ np.linalg.inv(self.K).T
+        points: FloatArray = (rays * depth[:, None] - self.t) @ self.R
+        return points
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What rays meet first: ray parameter (inf: nothing), number of the surface (-1: nothing), its face."""
+
+    distance: FloatArray
+    surface: npt.NDArray[np.int16]
+    face: npt.NDArray[np.int8]
+
+
+class Rays:
+    """Rays of one camera: origins and directions (3, ...) and the part of them that can meet a surface."""
+
+    origins: FloatArray
+    directions: FloatArray
+    shape: tuple[int, ...]
+
+    def image(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Where world points (N, 3) appear: coordinates (N, 2) among the rays, depth (N,)."""
+        raise NotImplementedError
+
+    def window(self, low: FloatArray, high: FloatArray) -> Index | None:
+        """Index of the rays within a rectangle of those coordinates; None if there is none."""
+        raise NotImplementedError
+
+    def windows(self, hulls: Sequence[FloatArray]) -> list[Index | None]:
+        """Index of the rays that may meet the convex hull of each set of points (M, 3)."""
+        if not hulls:
+            return []
+        starts = np.cumsum([0] + [len(hull) for hull in hulls[:-1]])
+        image, depth = self.image(np.concatenate(hulls))
+        low, high = np.minimum.reduceat(image, starts), np.maximum.reduceat(image, starts)
+        nearest, farthest = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
+        everything: Index = (slice(None),) * len(self.shape)
+        found: list[Index | None] = []
+        for number in range(len(hulls)):
+            if nearest[number] > _NEAR:
+                found.append(self.window(low[number], high[number]))
+            else:  # the object reaches behind the camera: its outline has no bounds
+                found.append(everything if farthest[number] > 0 else None)
+        return found
+
+    def take(self, index: Index) -> tuple[FloatArray, FloatArray]:
+        """Origins and directions of the rays at an index."""
+        return _take(self.origins, index), _take(self.directions, index)
+
+
+def _take(array: FloatArray, index: Index) -> FloatArray:
+    constant = all(size == 1 for size in array.shape[1:])
+    return array if constant else array[(slice(None), *index)]
+
+
+def _grid_window(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray) -> Index | None:
+    left, right = np.searchsorted(x, [low[0], high[0]])
+    top, bottom = np.searchsorted(y, [low[1], high[1]])
+    return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
+
+
+class OrthographicRays(Rays):
+    """Parallel rays on the grid x, y along the first two axes."""
+
+    def __init__(
+        self, x: FloatArray, y: FloatArray, origins: FloatArray, direction: FloatArray, axes: FloatArray
+    ) -> None:
+        self.x, self.y, self.axes = x, y, axes
+        self.origins, self.directions = origins, direction
+        self.shape = (y.size, x.size)
+
+    def image(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return points @ self.axes[:2].T, np.full(len(points), np.inf)
+
+    def window(self, low: FloatArray, high: FloatArray) -> Index | None:
+        return _grid_window(self.x, self.y, low, high)
+
+
+class PinholeRays(Rays):
+    """Rays of unit z through image coordinates: a grid, or a list of places."""
+
+    def __init__(self, camera: Camera, x: FloatArray, y: FloatArray, *, grid: bool) -> None:
+        self.camera, self.x, self.y, self.grid = camera, x, y, grid
+        self.shape = (y.size, x.size) if grid else x.shape
+        ones = (1,) * len(self.shape)
+        across = x[None, :] if grid else x
+        down = y[:, None] if grid else y
+        along_x, along_y, constant = (camera.R.T @ np.linalg.inv(camera.K)).T
+        self.origins = camera.centre.reshape(3, *ones)
+        self.directions = (
+            along_x.reshape(3, *ones) * across + along_y.reshape(3, *ones) * down + constant.reshape(3, *ones)
+        )
+
+    def image(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return self.camera.project(points)
+
+    def window(self, low: FloatArray, high: FloatArray) -> Index | None:
+        if self.grid:
+            return _grid_window(self.x, self.y, low, high)
+        inside = (self.x >= low[0]) & (self.x <= high[0]) & (self.y >= low[1]) & (self.y <= high[1])
+        places = np.flatnonzero(inside)
+        return (places,) if places.size else None
+
+
+def trace(surfaces: Sequence[Surface], rays: Rays) -> Hits:
+    """First surface along every ray."""
+    distance = np.full(rays.shape, np.inf)
+    number = np.full(rays.shape, -1, dtype=np.int16)
+    face = np.zeros(rays.shape, dtype=np.int8)
+    everything: Index = (slice(None),) * len(rays.shape)
+    hulls = [surface.corners() for surface in surfaces]
+    windows = iter(rays.windows([hull for hull in hulls if hull is not None]))
+    for index, (surface, hull) in enumerate(zip(surfaces, hulls, strict=True)):
+        window = everything if hull is None else next(windows)
+        if window is None:
+            continue
+        here, side = surface.intersect(*rays.take(window))
+        nearer = here < distance[window]
+        distance[window] = np.where(nearer, here, distance[window])
+        number[window] = np.where(nearer, np.int16(index), number[window])
+        face[window] = np.where(nearer, side, face[window]).astype(np.int8)
+    return Hits(distance, number, face)
+
+
+def trace_points(surfaces: Sequence[Surface], camera: Camera, image: FloatArray) -> Hits:
+    """First surface along the rays through image coordinates (N, 2); the ray parameter is the z-depth."""
+    return trace(surfaces, PinholeRays(camera, image[:, 0], image[:, 1], grid=False))

@@ -1,0 +1,324 @@
+"""Sparse model and original images → COLMAP dense workspace of undistorted images; or open an existing one.
+
+COLMAP itself undistorts (`pycolmap.undistort_images`). This module checks what goes in, because COLMAP ends
+the process at some bad input, and mends what comes out, because COLMAP leaves images which it did not
+undistort, and cameras without distortion but of a distorted model, in the model it writes.
+"""
+
+import hashlib
+import logging
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import pycolmap
+
+from colmap_sph.errors import InputError, OptionError, OutputError
+from colmap_sph.image_check import image_problem
+from colmap_sph.scene import Scene, is_pinhole, load_model, make_pinhole, model_files
+from colmap_sph.staging import is_finished, move_into_place, read_marker, scratch_folder, write_marker
+from colmap_sph.workspace import (
+    Workspace,
+    make_dir,
+    write_fusion_cfg,
+    write_patch_match_cfg,
+)
+
+logger = logging.getLogger(__name__)
+
+_FULL_DISK_BYTES = 64 << 20
+
+
+@dataclass(frozen=True)
+class UndistortionOptions:
+    """How the original images become undistorted ones."""
+
+    max_image_size: int = -1
+    """Longest side of the undistorted images in pixels; larger ones are reduced. -1: keep their size."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of its bounds."""
+        if self.max_image_size != -1 and self.max_image_size < 16:
+            raise OptionError(
+                f"max_image_size must be -1 (keep the size) or at least 16, not {self.max_image_size}."
+            )
+
+
+def find_images(model_dir: Path, names: Sequence[str]) -> Path:
+    """Find the image folder of a model by COLMAP's usual layouts.
+
+    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
+    folder that holds most of the model's images is taken, the first among equals.
+
+    Raises
+    ------
+    InputError
+        None of the folders holds any image of the model; the message lists them.
+    """
+    absolute, resolved = Path.cwd() / model_dir, Path(model_dir).resolve()
+    parents = [p for model in (absolute, resolved) for p in (model.parent.parent, model.parent, model)]
+    folders = list(dict.fromkeys(parent / "images" for parent in parents))
+    found = [sum((folder / name).is_file() for name in names) for folder in folders]
+    if max(found) == 0:
+        tried = ", ".join(str(folder) for folder in folders)
+        raise InputError(
+            f"The images of {model_dir} were not found in {tried}; give their folder as --images."
+        )
+    return folders[found.index(max(found))]
+
+
+def prepare_workspace(
+    model_dir: Path, image_dir: Path | None, output: Path, options: UndistortionOptions
+) -> Workspace:
+    """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
+
+    Everything is made inside ``output/colmap_sph`` and moved to its place when complete, so that an
+    interrupted undistortion is never taken for a workspace. An image that is missing, unreadable or not of
+    its camera's size is reported and left out of the workspace and its model.
+
+    Parameters
+    ----------
+    model_dir : Path
+        COLMAP model, binary or text, any camera model that has a pinhole equivalent.
+    image_dir : Path or None
+        Original images; None: found by `find_images`.
+    output : Path
+        The dense workspace; created where missing.
+    options : UndistortionOptions
+
+    Returns
+    -------
+    Workspace
+        With ``images``, ``sparse`` and ``stereo``.
+
+    Raises
+    ------
+    InputError
+        No usable model or image, or `output` holds a workspace made from something else.
+    OutputError
+        `output` cannot be written.
+    """
+    options.check()
+    model = load_model(model_dir)
+    names = sorted(model.image(image_id).name for image_id in model.reg_image_ids())
+    if image_dir is None:
+        image_dir = find_images(model_dir, names)
+    elif not image_dir.is_dir():
+        raise InputError(f"The image folder {image_dir} does not exist; check --images.")
+    workspace = Workspace(output)
+    marker = {
+        "version": 1,
+        "options": asdict(options),
+        "model": _hash_model(model_dir),
+        "images": _hash_images(image_dir, names),
+    }
+    scratch = workspace.state_dir / "undistorting"
+    if read_marker(scratch) == marker:
+        move_into_place(scratch, workspace)
+    if is_finished(workspace, marker):
+        logger.info("The undistorted images in %s are up to date", output)
+        return workspace
+    good = _usable_images(model, image_dir)
+    with scratch_folder(scratch):
+        kept = _undistort(model, model_dir, image_dir, good, scratch, options)
+        Workspace(scratch).create_stereo_dirs(kept)
+        shutil.rmtree(Workspace(scratch).state_dir)
+        write_marker(scratch, marker)
+        move_into_place(scratch, workspace)
+    logger.info("Undistorted %d of %d images into %s", len(kept), len(names), output)
+    return workspace
+
+
+def open_workspace(root: Path) -> Workspace:
+    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and create the folders for our maps.
+
+    Raises
+    ------
+    InputError
+        The folder is missing or is not a dense workspace.
+    OutputError
+        The folders for the maps cannot be created.
+    """
+    workspace = Workspace(root)
+    if not root.is_dir():
+        raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
+    for folder in (workspace.images_dir, workspace.sparse_dir):
+        if not folder.is_dir():
+            raise InputError(
+                f"{root} is not a dense workspace: it has no {folder.name} folder; "
+                "run COLMAP's image_undistorter, or give the sparse model with --model."
+            )
+    model = load_model(workspace.sparse_dir)
+    workspace.create_stereo_dirs(model.image(image_id).name for image_id in model.reg_image_ids())
+    return workspace
+
+
+def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
+    """Return the scene without the views whose undistorted image is missing, damaged or of another size.
+
+    Each of them is reported by a warning.
+
+    Raises
+    ------
+    InputError
+        No view is left.
+    """
+    good = []
+    for view in scene.views:
+        problem = image_problem(workspace.image_path(view.name), view.width, view.height)
+        if problem is None:
+            good.append(view)
+        else:
+            logger.warning("%s %s; left out", workspace.image_path(view.name), problem)
+    if not good:
+        raise InputError(f"None of the {len(scene.views)} images in {workspace.images_dir} is usable.")
+    return replace(scene, views=tuple(good))
+
+
+def _usable_images(model: pycolmap.Reconstruction, image_dir: Path) -> list[str]:
+    """Return the sorted names of the registered images that are fit for undistortion; report the others."""
+    source, good = Workspace(image_dir), []
+    for image in sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name):
+        camera = model.camera(image.camera_id)
+        source.image_path(image.name)  # refuses a name that leads out of the folder
+        problem = image_problem(image_dir / image.name, camera.width, camera.height)
+        if problem is None:
+            good.append(image.name)
+        else:
+            logger.warning("%s %s; left out", image_dir / image.name, problem)
+    if not good:
+        raise InputError(
+            f"None of the model's {model.num_reg_images()} images in {image_dir} is usable; check --images."
+        )
+    return good
+
+
+def _undistort(
+    model: pycolmap.Reconstruction,
+    model_dir: Path,
+    image_dir: Path,
+    names: list[str],
+    scratch: Path,
+    options: UndistortionOptions,
+) -> list[str]:
+    """Let COLMAP undistort images `names` into `scratch`; return the names that came out well."""
+    if _replace_ideal_fisheyes(model):
+        model_dir = scratch / "model"
+        make_dir(model_dir)
+        model.write_binary(model_dir)
+    camera_options = pycolmap.UndistortCameraOptions()
+    camera_options.max_image_size = options.max_image_size
+    logger.info("Undistorting %d images", len(names))
+    try:
+        with _quiet_colmap():
+            pycolmap.undistort_images(
+                scratch, model_dir, image_dir, image_names=names, undistort_options=camera_options
+            )
+    except (RuntimeError, ValueError, OSError) as error:
+        _raise_if_disk_is_full(scratch)
+        raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {error}") from error
+    return _mend_workspace(Workspace(scratch), names)
+
+
+def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
+    """Make COLMAP undistort fisheye cameras whose coefficients are all zero.
+
+    COLMAP takes any camera without distortion coefficients for a pinhole and copies its images. A coefficient
+    just above its threshold (1e-8) changes nothing: at 1 rad and f = 4000 px it is 4e-4 px.
+    """
+    changed = False
+    for camera in model.cameras.values():
+        if camera.is_spherical():
+            raise InputError(
+                f"Camera {camera.camera_id} is a panorama ({camera.model_name}); "
+                "render perspective images from it and register those."
+            )
+        if camera.is_undistorted() and not is_pinhole(camera):
+            K = camera.calibration_matrix()
+            camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 1e-7, 0.0, 0.0, 0.0]
+            changed = True
+    return changed
+
+
+def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
+    """Leave only undistorted images and PINHOLE cameras in the model; write the configuration for them."""
+    model = load_model(workspace.sparse_dir)
+    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    kept = []
+    for name in names:
+        problem = image_problem(workspace.image_path(name), cameras[name].width, cameras[name].height)
+        if problem is None:
+            kept.append(name)
+        else:
+            _raise_if_disk_is_full(workspace.root)
+            logger.warning("%s could not be undistorted: the result %s; left out", name, problem)
+    if not kept:
+        raise InputError("COLMAP could not undistort any of the images; see its messages above.")
+    if len(kept) < model.num_reg_images():
+        model = _submodel(model, set(kept))
+    for camera in model.cameras.values():
+        make_pinhole(camera)
+    shutil.rmtree(workspace.sparse_dir)
+    make_dir(workspace.sparse_dir)
+    model.write_binary(workspace.sparse_dir)
+    write_fusion_cfg(workspace.fusion_cfg_path, kept)
+    write_patch_match_cfg(workspace.patch_match_cfg_path, dict.fromkeys(kept, 20))
+    return kept
+
+
+def _submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Reconstruction:
+    """Return the model of images `names` alone, with the tracks of two or more observations they share."""
+    part = pycolmap.Reconstruction()
+    images = [model.image(i) for i in model.reg_image_ids() if model.image(i).name in names]
+    for camera_id in sorted({image.camera_id for image in images}):
+        part.add_camera_with_trivial_rig(model.camera(camera_id))
+    for image in images:
+        keypoints = [point.xy for point in image.points2D]
+        copy = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
+        part.add_image_with_trivial_frame(copy, image.cam_from_world())
+    ids = {image.image_id for image in images}
+    for point_id, point in model.points3D.items():
+        elements = [element for element in point.track.elements if element.image_id in ids]
+        if len(elements) >= 2:
+            kept = pycolmap.Point3D()
+            kept.xyz, kept.color, kept.error = point.xyz, point.color, point.error
+            kept.track = pycolmap.Track(elements)
+            part.add_point3D_with_id(point_id, kept)
+    return part
+
+
+def _hash_model(model_dir: Path) -> str:
+    digest = hashlib.sha256()
+    for path in model_files(model_dir):
+        with path.open("rb") as file:
+            digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _hash_images(image_dir: Path, names: list[str]) -> str:
+    """Hash names, sizes and times of the images: their content would take as long to read as to undistort."""
+    digest = hashlib.sha256()
+    for name in names:
+        with suppress(OSError):
+            status = (image_dir / name).stat()
+            digest.update(f"{name}\n{status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
+
+
+def _raise_if_disk_is_full(folder: Path) -> None:
+    if shutil.disk_usage(folder).free < _FULL_DISK_BYTES:
+        raise OutputError(f"The disk of {folder} is full; free some space or choose another --output.")
+
+
+@contextmanager
+def _quiet_colmap() -> Iterator[None]:
+    """Keep COLMAP's progress messages, which it writes straight to the terminal, to warnings and errors."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = int(pycolmap.logging.WARNING)
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level

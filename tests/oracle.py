@@ -1,0 +1,201 @@
+"""Slow, readable NumPy versions of the kernels, written from the definitions in `_native/kernels.h`.
+
+Nothing here is shared with the C code: plain loops over pixels, 64-bit integers or float64 throughout.
+"""
+
+import numpy as np
+
+CENSUS_INVALID = 1 << 63
+COST_UNSEEN = 32
+NO_SLOT = 255
+OFFSET_INVALID = np.iinfo(np.int32).min
+
+# (row step, column step) from the pixel before on each of the 8 paths.
+DIRECTIONS = [(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 1)]
+
+
+def census(padded, valid):
+    """Census words (H, W) uint64 of an image with a border of 3 rows and 4 columns."""
+    words = np.empty(valid.shape, dtype=np.uint64)
+    for y, x in np.ndindex(valid.shape):
+        window = padded[y : y + 7, x : x + 9].ravel()
+        neighbours = np.delete(window, 31)  # the centre
+        bits = [int(neighbour < window[31]) << k for k, neighbour in enumerate(neighbours)]
+        words[y, x] = sum(bits) if valid[y, x] else CENSUS_INVALID
+    return words
+
+
+def matching_cost(reference, target, base, depth):
+    """Hamming costs (H, W, depth) uint8."""
+    cost = np.zeros((*reference.shape, depth), dtype=np.uint8)
+    for y, x, i in np.ndindex(cost.shape):
+        word, column = int(reference[y, x]), x + int(base[y, x]) + i
+        if word >= CENSUS_INVALID:
+            continue
+        other = int(target[y, column]) if 0 <= column < target.shape[1] else CENSUS_INVALID
+        cost[y, x, i] = COST_UNSEEN if other >= CENSUS_INVALID else (word ^ other).bit_count()
+    return cost
+
+
+def _slots(costs, indices):
+    inside = (indices >= 0) & (indices < len(costs))
+    return np.where(inside, costs[np.clip(indices, 0, len(costs) - 1)], NO_SLOT)
+
+
+def path_costs(cost, base, image, p1, p2, direction):
+    """L (H, W, D) int64 along one path direction, without any narrowing."""
+    height, width, depth = cost.shape
+    rows = range(height) if direction[0] >= 0 else range(height - 1, -1, -1)
+    columns = range(width) if direction[1] >= 0 else range(width - 1, -1, -1)
+    path = cost.astype(np.int64)
+    slot = np.arange(depth)
+    for y in rows:
+        for x in columns:
+            y0, x0 = y - direction[0], x - direction[1]
+            if not (0 <= y0 < height and 0 <= x0 < width):
+                continue
+            before, least = path[y0, x0], path[y0, x0].min()
+            same = slot + (int(base[y, x]) - int(base[y0, x0]))
+            one_step = np.minimum(_slots(before, same - 1), _slots(before, same + 1)) + p1
+            jump = least + int(p2[abs(int(image[y, x]) - int(image[y0, x0]))])
+            best = np.minimum(np.minimum(_slots(before, same), one_step), jump)
+            path[y, x] += best - least
+    return path
+
+
+def aggregation(cost, base, image, p1, p2):
+    """Sum of the 8 paths, (H, W, D) int64."""
+    return sum(path_costs(cost, base, image, p1, p2, direction) for direction in DIRECTIONS)
+
+
+def subpixel_offset(before, best, after):
+    """Equiangular fit in 1/256 pixel, rounded towards zero."""
+    rise = max(before, after) - best
+    return 0 if rise <= 0 else int(np.trunc((before - after) * 128 / rise))
+
+
+def selection(aggregated, base, reference, target, max_difference):
+    """Offsets (H, W) int32 in 1/256 pixel, OFFSET_INVALID = none."""
+    height, width, depth = aggregated.shape
+    offsets = np.full((height, width), OFFSET_INVALID, dtype=np.int32)
+    for y in range(height):
+        content = [x for x in range(width) if int(reference[y, x]) < CENSUS_INVALID]
+        best_of_target = {}  # column in the target: (sum, column in the reference)
+        for x in content:
+            for i in range(depth):
+                r, vote = x + int(base[y, x]) + i, (int(aggregated[y, x, i]), x)
+                if 0 <= r < target.shape[1] and vote[0] < 65535:
+                    best_of_target[r] = min(best_of_target.get(r, vote), vote)
+        for x in content:
+            sums = aggregated[y, x].astype(int)
+            best = int(np.argmin(sums))
+            r = x + int(base[y, x]) + best
+            if best in (0, depth - 1) or r not in best_of_target or int(target[y, r]) >= CENSUS_INVALID:
+                continue
+            if abs(best_of_target[r][1] - x) <= max_difference:
+                offsets[y, x] = (r - x) * 256 + subpixel_offset(*(int(s) for s in sums[best - 1 : best + 2]))
+    return offsets
+
+
+def transfer_disparity(left, max_step, right_width):
+    """Disparity map of the right image's columns: the nearest of the surfaces that meet a column."""
+    right = np.full((left.shape[0], right_width), np.nan)
+    for y, row in enumerate(left.astype(float)):
+        claims = {}  # right column: disparities
+        for x, d in enumerate(row):
+            if np.isnan(d):
+                continue
+            beside = row[x + 1] if x + 1 < len(row) else np.nan
+            if not abs(beside - d) <= max_step:
+                claims.setdefault(int(np.rint(x - d)), []).append(d)
+                continue
+            start, end = x - d, x + 1 - beside
+            if end > start:
+                for r in range(int(np.ceil(start)), int(np.floor(end)) + 1):
+                    claims.setdefault(r, []).append(d + (r - start) * (beside - d) / (end - start))
+        for r, disparities in claims.items():
+            if 0 <= r < right_width:
+                right[y, r] = max(disparities)
+    return right
+
+
+def vote_depth(depths, sigmas, tolerance):
+    """Depth, sigma, support, and the least distance of any pair of candidates from the gate, per pixel."""
+    shape = depths.shape[1:]
+    depth, sigma = np.zeros(shape), np.zeros(shape)
+    support, clearance = np.zeros(shape, dtype=int), np.full(shape, np.inf)
+    for pixel in np.ndindex(shape):
+        index = (slice(None), *pixel)
+        found = depths[index] > 0
+        z, variance = depths[index][found].astype(float), sigmas[index][found].astype(float) ** 2
+        if not len(z):
+            continue
+        gate = tolerance * np.sqrt(variance[:, None] + variance)
+        difference = np.abs(z[:, None] - z)
+        clearance[pixel] = np.abs(difference / gate - 1).min()
+        agree = difference <= gate
+        # Most friends first, then the smallest variance, then the first.
+        centre = min(range(len(z)), key=lambda k: (-agree[k].sum(), variance[k], k))
+        weight = 1 / variance[agree[centre]]
+        depth[pixel] = (z[agree[centre]] * weight).sum() / weight.sum()
+        sigma[pixel] = weight.sum() ** -0.5
+        support[pixel] = agree[centre].sum()
+    return depth, sigma, support, clearance
+
+
+def _read_depth(depth, u, v):
+    """Inverse-depth bilinear value of one surface, else the nearest pixel's; 0 = none."""
+    height, width = depth.shape
+    if not (0 <= u <= width - 1 and 0 <= v <= height - 1):
+        return 0.0
+    nearest = depth[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))]
+    x, y = int(u), int(v)
+    if x + 1 >= width or y + 1 >= height or not nearest > 0:
+        return nearest
+    corners = depth[y : y + 2, x : x + 2]
+    if (np.abs(corners - nearest) > 0.02 * nearest).any():
+        return nearest
+    weights = np.outer([1 - (v - y), v - y], [1 - (u - x), u - x])
+    return 1 / (weights / corners).sum()
+
+
+def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma, max_error, tolerance):
+    """Verdict (+1 agrees, -1 looks through, 0 none), the partner's depth on the reference ray, clearance.
+
+    `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
+    origin of depth maps. The clearance is the least relative distance from any gate or from a pixel's border.
+    """
+    shape = depth.shape
+    verdict, carried, clearance = np.zeros(shape, dtype=int), np.zeros(shape), np.full(shape, np.inf)
+    for row, col in np.ndindex(shape):
+        z = float(depth[row, col])
+        if not z > 0:
+            continue
+        world = view.R.T @ (np.linalg.solve(view.K, [col, row, 1.0]) * z - view.t)
+        seen = partner.R @ world + partner.t
+        pixel = partner.K @ seen
+        if not seen[2] > 0:
+            continue
+        u, v = pixel[:2] / pixel[2]
+        found = _read_depth(partner_depth.astype(float), u, v)
+        if not found > 0:
+            continue
+        spread = float(partner_sigma[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))])
+        back = partner.R.T @ (np.linalg.solve(partner.K, [u, v, 1.0]) * found - partner.t)
+        back = view.R @ back + view.t
+        home = view.K @ back
+        error = np.hypot(home[0] / home[2] - col, home[1] / home[2] - row)
+        gate = tolerance * np.hypot(spread, float(sigma[row, col]))
+        difference = found - seen[2]
+        carried[row, col] = back[2]
+        if back[2] > 0 and error <= max_error and abs(difference) <= gate:
+            verdict[row, col] = 1
+        elif difference > 2 * gate:
+            verdict[row, col] = -1
+        clearance[row, col] = min(
+            abs(error / max_error - 1),
+            abs(abs(difference) / gate - 1),
+            abs(difference / (2 * gate) - 1),
+            abs((u + 0.5) % 1 - 0.5) + 1e-3 if 0.5 - abs(u % 1 - 0.5) else np.inf,
+        )
+    return verdict, carried, clearance

@@ -1,0 +1,138 @@
+"""Reading clouds and meshes."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from colmap_sph.errors import InputError
+from colmap_sph.evaluation import Mesh, PointCloud, read_geometry
+
+laspy = pytest.importorskip("laspy")
+pytest.importorskip("trimesh")
+
+POINTS = np.random.default_rng(0).random((50, 3)) * 10 + [512_345, 5_403_210, 250]
+ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+def ply(style: str, points: np.ndarray, *, kind: str = "double", faces: np.ndarray | None = None) -> bytes:
+    header = f"ply\nformat {style} 1.0\ncomment written by hand\nelement vertex {len(points)}\n"
+    header += "".join(f"property {kind} {axis}\n" for axis in "xyz") + "property uchar red\n"
+    if faces is not None:
+        header += f"element face {len(faces)}\nproperty list uchar int vertex_indices\n"
+    header += "end_header\n"
+    if style == "ascii":
+        body = "".join(f"{x!r} {y!r} {z!r} 9\n" for x, y, z in points.tolist())
+        body += "" if faces is None else "".join(f"3 {a} {b} {c}\n" for a, b, c in faces.tolist())
+        return header.encode() + body.encode()
+    order = ORDERS[style]
+    record = np.zeros(len(points), [("xyz", order + ("f8" if kind == "double" else "f4"), 3), ("red", "u1")])
+    record["xyz"] = points
+    data = header.encode() + record.tobytes()
+    if faces is not None:
+        triangles = np.zeros(len(faces), [("n", "u1"), ("rows", order + "i4", 3)])
+        triangles["n"], triangles["rows"] = 3, faces
+        data += triangles.tobytes()
+    return data
+
+
+def write_las(path: Path, points: np.ndarray, crs_records: list | None = None) -> Path:
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.offsets, header.scales = np.floor(points.min(axis=0)), np.full(3, 1e-4)
+    header.vlrs.extend(crs_records or [])
+    las = laspy.LasData(header)
+    las.xyz = points
+    las.write(path)
+    return path
+
+
+@pytest.mark.parametrize("style", ["ascii", *ORDERS])
+def test_ply_clouds_keep_every_digit(tmp_path: Path, style: str):
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(ply(style, POINTS))
+    cloud = read_geometry(path)
+    assert isinstance(cloud, PointCloud) and cloud.points.dtype == np.float64
+    np.testing.assert_array_equal(cloud.points, POINTS)
+
+
+@pytest.mark.parametrize("style", ["ascii", *ORDERS])
+def test_ply_with_faces_is_a_mesh(tmp_path: Path, style: str):
+    path = tmp_path / "mesh.ply"
+    faces = np.array([[0, 1, 2], [2, 1, 3]])
+    path.write_bytes(ply(style, POINTS[:4], faces=faces))
+    mesh = read_geometry(path)
+    assert isinstance(mesh, Mesh)
+    np.testing.assert_array_equal(mesh.vertices, POINTS[:4])
+    np.testing.assert_array_equal(mesh.faces, faces)
+
+
+def test_obj(tmp_path: Path):
+    path = tmp_path / "mesh.obj"
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    mesh = read_geometry(path)
+    assert isinstance(mesh, Mesh) and len(mesh.faces) == 2
+    path.write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\n")
+    assert isinstance(read_geometry(path), PointCloud)
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_las(tmp_path: Path, ending: str):
+    cloud = read_geometry(write_las(tmp_path / f"cloud.{ending}", POINTS))
+    assert isinstance(cloud, PointCloud) and cloud.z_is_up and cloud.crs is None
+    np.testing.assert_allclose(cloud.points, POINTS, rtol=0, atol=5.1e-5)
+
+
+def test_las_states_its_coordinate_system(tmp_path: Path):
+    from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
+
+    projected = WktCoordinateSystemVlr('PROJCS["WGS 84 / UTM zone 33N",GEOGCS["WGS 84"]]')
+    assert read_geometry(write_las(tmp_path / "a.las", POINTS, [projected])).crs == (
+        "projected (WGS 84 / UTM zone 33N)"
+    )
+    geographic = WktCoordinateSystemVlr('GEOGCS["WGS 84",DATUM["WGS_1984"]]')
+    assert read_geometry(write_las(tmp_path / "b.las", POINTS, [geographic])).crs == "geographic (WGS 84)"
+    keys = GeoKeyDirectoryVlr()
+    keys.parse_record_data(np.array([1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 32633], "<u2").tobytes())
+    assert read_geometry(write_las(tmp_path / "c.las", POINTS, [keys])).crs == "projected (EPSG:32633)"
+
+
+def test_bad_files_are_named(tmp_path: Path):
+    def refuses(name: str, content: bytes | None, message: str) -> None:
+        path = tmp_path / name
+        if content is not None:
+            path.write_bytes(content)
+        with pytest.raises(InputError, match=message):
+            read_geometry(path)
+
+    whole = ply("binary_little_endian", POINTS)
+    broken = POINTS.copy()
+    broken[3, 1] = np.nan
+    refuses("absent.ply", None, r"absent\.ply does not exist")
+    refuses("cloud.xyz", b"1 2 3\n", "unknown format '.xyz': convert it to PLY")
+    refuses("short.ply", whole[:-50], r"short\.ply cannot be read as PLY")
+    refuses("text.ply", b"not a cloud", r"text\.ply cannot be read as PLY")
+    refuses("zero.ply", b"", r"zero\.ply cannot be read as PLY")
+    refuses("none.ply", ply("binary_little_endian", POINTS[:0]), r"none\.ply is empty")
+    refuses("none_ascii.ply", ply("ascii", POINTS[:0]), r"none_ascii\.ply is empty")
+    refuses(
+        "nan.ply",
+        ply("binary_little_endian", broken),
+        r"nan\.ply: 1 of 50 points have coordinates that are NaN",
+    )
+    refuses("flat.ply", whole.replace(b"property double z\n", b""), r"flat\.ply")
+    refuses("text.las", b"not a cloud", r"text\.las cannot be read as LAS")
+    las = write_las(tmp_path / "good.las", POINTS).read_bytes()
+    refuses("short.las", las[:-200], r"short\.las")
+    laz = write_las(tmp_path / "good.laz", POINTS).read_bytes()
+    refuses("short.laz", laz[: len(laz) // 2], r"short\.laz")
+    write_las(tmp_path / "none.las", POINTS[:1])
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    laspy.LasData(header).write(tmp_path / "none.las")
+    refuses("none.las", None, r"none\.las is empty")
+
+
+def test_map_coordinates_in_short_floats_are_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture):
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(ply("binary_little_endian", POINTS, kind="float"))
+    read_geometry(path)
+    assert "32-bit floats, in steps of 0.5" in caplog.text

@@ -1,0 +1,158 @@
+"""The scene is what COLMAP's own objects say, and damage is told in one sentence."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_sph.errors import InputError
+from colmap_sph.scene import load_model, read_scene
+
+
+def make_model(camera_model: str = "PINHOLE", num_images: int = 4) -> pycolmap.Reconstruction:
+    """Cameras on a circle about a cloud of random points, tracks in every image."""
+    rng = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, camera_model, 500.0, 640, 480)
+    model.add_camera_with_trivial_rig(camera)
+    points = rng.uniform(-1, 1, (30, 3))
+    for image_id in range(1, num_images + 1):
+        angle = 0.2 * image_id
+        rotation = np.array(
+            [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.array([0.1, -0.2, 5.0]))
+        # Names in the reverse order of the ids.
+        image = pycolmap.Image(
+            name=f"sub/{num_images - image_id}.png",
+            keypoints=np.zeros((40, 2)),
+            camera_id=1,
+            image_id=image_id,
+        )
+        model.add_image_with_trivial_frame(image, pose)
+    for index, xyz in enumerate(points):
+        track = pycolmap.Track()
+        for image_id in range(1, num_images + 1):
+            if (index + image_id) % 3:
+                track.add_element(image_id, index + 5)
+        model.add_point3D(xyz, track, np.zeros(3, np.uint8))
+    return model
+
+
+def write(model: pycolmap.Reconstruction, folder: Path, text: bool) -> Path:
+    folder.mkdir(parents=True)
+    (model.write_text if text else model.write_binary)(folder)
+    return folder
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("camera_model", ["PINHOLE", "SIMPLE_PINHOLE", "OPENCV"])
+def test_scene_agrees_with_colmap(tmp_path: Path, text: bool, camera_model: str) -> None:
+    model = make_model(camera_model)
+    scene = read_scene(write(model, tmp_path / "sparse", text))
+    assert [view.name for view in scene.views] == [f"sub/{i}.png" for i in range(4)]
+    for view in scene.views:
+        image = model.image(view.image_id)
+        assert (view.name, view.width, view.height) == (image.name, 640, 480)
+        seen = [i for i in range(30) if (i + view.image_id) % 3]
+        expected = np.array([model.point3D(i + 1).xyz for i in seen])
+        np.testing.assert_allclose(scene.points[view.point_indices], expected, atol=1e-12)
+        for point in expected:
+            x, y, z = view.K @ (view.R @ point + view.t)
+            projected = image.project_point(point)
+            assert projected is not None
+            np.testing.assert_allclose([x / z, y / z], projected, atol=1e-9)
+        np.testing.assert_allclose(view.center, image.projection_center(), atol=1e-12)
+        np.testing.assert_allclose(view.viewing_direction, image.viewing_direction(), atol=1e-12)
+        np.testing.assert_allclose(view.cam_from_world, image.cam_from_world().matrix(), atol=1e-12)
+
+
+def test_view_by_name(tmp_path: Path) -> None:
+    scene = read_scene(write(make_model(), tmp_path / "sparse", text=False))
+    assert scene.view("sub/2.png") is scene.views[2]
+    with pytest.raises(InputError, match="nothing"):
+        scene.view("nothing.png")
+
+
+def test_model_without_points(tmp_path: Path) -> None:
+    model = make_model()
+    model.delete_all_points2D_and_points3D()
+    scene = read_scene(write(model, tmp_path / "sparse", text=False))
+    assert scene.points.shape == (0, 3)
+    assert all(view.point_indices.shape == (0,) for view in scene.views)
+
+
+def test_pose_that_is_not_finite_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    model = make_model()
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, np.nan, 0.0]))
+    frame = model.image(2).frame
+    assert frame is not None
+    frame.rig_from_world = pose
+    model.points3D[3].xyz = np.array([np.inf, 0.0, 0.0])
+    scene = read_scene(write(model, tmp_path / "sparse", text=False))
+    assert [view.image_id for view in scene.views] == [4, 3, 1]
+    assert scene.points.shape == (29, 3) and np.isfinite(scene.points).all()
+    assert "sub/2.png" in caplog.text and "1 sparse points are not finite" in caplog.text
+
+
+def test_distorted_camera_is_refused(tmp_path: Path) -> None:
+    model = make_model("OPENCV")
+    model.camera(1).params = [500.0, 500.0, 320.0, 240.0, 0.1, 0.0, 0.0, 0.0]
+    sparse = write(model, tmp_path / "sparse", text=False)
+    assert load_model(sparse).num_reg_images() == 4
+    with pytest.raises(InputError, match="OPENCV"):
+        read_scene(sparse)
+
+
+def test_missing_model_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        read_scene(tmp_path / "nowhere")
+    write(make_model(), tmp_path / "sparse" / "0", text=False)
+    with pytest.raises(InputError, match=r"did you mean .*sparse/0\?"):
+        read_scene(tmp_path / "sparse")
+
+
+def test_model_without_registered_image(tmp_path: Path) -> None:
+    sparse = write(pycolmap.Reconstruction(), tmp_path / "sparse", text=False)
+    with pytest.raises(InputError, match="no registered image"):
+        read_scene(sparse)
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+@pytest.mark.parametrize("damage", ["empty", "truncated", "garbage"])
+def test_damaged_binary_model(tmp_path: Path, name: str, damage: str) -> None:
+    sparse = write(make_model(), tmp_path / "sparse", text=False)
+    path = sparse / f"{name}.bin"
+    data = path.read_bytes()
+    path.write_bytes(
+        {"empty": b"", "truncated": data[: len(data) * 2 // 3], "garbage": b"\xff" * 300}[damage]
+    )
+    with pytest.raises(InputError, match=r"sparse.*(damaged|truncated|unknown camera)"):
+        read_scene(sparse)
+
+
+def test_real_model(data_dir: Path, tmp_path: Path) -> None:
+    source = data_dir / "fountain" / "sparse" / "0"
+    scene = read_scene(source)
+    assert len(scene.views) == 11
+    # Every observation projects to where its feature was found (undistorted image, 0.5 px mean error).
+    model = pycolmap.Reconstruction(source)
+    for view in scene.views:
+        camera_points = scene.points[view.point_indices] @ view.R.T + view.t
+        pixels = (camera_points @ view.K.T)[:, :2] / camera_points[:, 2:]
+        observed = np.array([p.xy for p in model.image(view.image_id).points2D if p.has_point3D()])
+        ids = [p.point3D_id for p in model.image(view.image_id).points2D if p.has_point3D()]
+        order = np.argsort(ids, kind="stable")
+        if len(set(ids)) == len(ids):
+            assert np.median(np.linalg.norm(pixels - observed[order], axis=1)) < 1.0
+    # A text export without the rig files of COLMAP 3.12 is what older versions write.
+    old = write(model, tmp_path / "text", text=True)
+    for name in ("rigs.txt", "frames.txt"):
+        (old / name).unlink()
+    again = read_scene(old)
+    for view, same in zip(scene.views, again.views, strict=True):
+        np.testing.assert_allclose(view.cam_from_world, same.cam_from_world, atol=1e-9)
+        np.testing.assert_array_equal(view.point_indices, same.point_indices)
+    shutil.rmtree(old)

@@ -1,0 +1,302 @@
+"""Undistorted workspaces: COLMAP's model of them holds exactly, and bad input never stops the process."""
+
+import logging
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_sph import staging
+from colmap_sph.errors import InputError, OptionError, OutputError
+from colmap_sph.image_check import image_problem
+from colmap_sph.scene import read_scene
+from colmap_sph.undistortion import (
+    UndistortionOptions,
+    find_images,
+    leave_out_bad_images,
+    open_workspace,
+    prepare_workspace,
+)
+
+WIDTH, HEIGHT, FOCAL = 96, 64, 90.0
+NAMES = ["a.png", "b.png", "cam/c.png", "cam/d.png"]
+OPTIONS = UndistortionOptions()
+
+
+def make_project(
+    root: Path, camera_model: str = "PINHOLE", extra: tuple[float, ...] = (), text: bool = False
+) -> Path:
+    """Four views of a plane with random points, and images as dark as their number; returns the model."""
+    rng = np.random.default_rng(3)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, camera_model, FOCAL, WIDTH, HEIGHT)
+    if extra:
+        camera.params = [*camera.params[: len(camera.params) - len(extra)], *extra]
+    model.add_camera_with_trivial_rig(camera)
+    points = np.column_stack([rng.uniform(-0.3, 0.3, (20, 2)), np.full(20, 3.0)])
+    for image_id, name in enumerate(NAMES, start=1):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.1 * image_id, 0.0, 0.0]))
+        keypoints = camera.img_from_cam(points + pose.translation)
+        assert keypoints is not None
+        model.add_image_with_trivial_frame(pycolmap.Image(name, keypoints, 1, image_id), pose)
+        path = root / "images" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shades = rng.integers(0, 200, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        assert cv2.imwrite(str(path), shades + np.uint8(image_id))
+    for index, xyz in enumerate(points):
+        elements = [pycolmap.TrackElement(image_id, index) for image_id in range(1, 5)]
+        # The first point is seen by the first two images only.
+        model.add_point3D(xyz, pycolmap.Track(elements[: 2 if index == 0 else 4]), np.zeros(3, np.uint8))
+    sparse = root / "sparse" / "0"
+    sparse.mkdir(parents=True)
+    (model.write_text if text else model.write_binary)(sparse)
+    return sparse
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_workspace_of_undistorted_images(tmp_path: Path, text: bool) -> None:
+    sparse = make_project(tmp_path, text=text)
+    workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    assert [view.name for view in read_scene(workspace.sparse_dir).views] == NAMES
+    for name in NAMES:
+        assert workspace.image_path(name).read_bytes() == (tmp_path / "images" / name).read_bytes()
+        assert workspace.depth_map_path(name, "geometric").parent.is_dir()
+    assert workspace.fusion_cfg_path.read_text().split() == NAMES
+    expected = ["colmap_sph", "images", "run-colmap-geometric.sh", "run-colmap-photometric.sh", "sparse"]
+    assert sorted(path.name for path in workspace.root.iterdir()) == [*expected, "stereo"]
+    assert [path.name for path in workspace.state_dir.iterdir()] == ["undistortion.json"]
+
+
+def test_max_image_size(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    workspace = prepare_workspace(sparse, None, tmp_path / "dense", UndistortionOptions(48))
+    view = read_scene(workspace.sparse_dir).views[0]
+    assert (view.width, view.height) == (48, 32)
+    np.testing.assert_allclose(view.K, [[45, 0, 24], [0, 45, 16], [0, 0, 1]])
+    assert image_problem(workspace.image_path("a.png"), 48, 32) is None
+
+
+@pytest.mark.parametrize(
+    ("camera_model", "extra"),
+    [
+        ("OPENCV", (0.1, 0.01, 1e-3, -1e-3)),
+        ("OPENCV", (0.0, 0.0, 0.0, 0.0)),  # COLMAP leaves such a model as it is
+        ("SIMPLE_RADIAL", (0.0,)),
+        ("FULL_OPENCV", (0.1, 0, 0, 0, 0, 0, 0, 0)),
+        ("FOV", (0.5,)),
+        ("OPENCV_FISHEYE", (0.0, 0.0, 0.0, 0.0)),  # COLMAP takes it for a pinhole
+        ("SIMPLE_RADIAL_FISHEYE", (0.1,)),
+        ("SIMPLE_FISHEYE", ()),
+    ],
+)
+def test_any_camera_model_becomes_pinhole(
+    tmp_path: Path, camera_model: str, extra: tuple[float, ...]
+) -> None:
+    sparse = make_project(tmp_path, camera_model, extra)
+    workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    scene = read_scene(workspace.sparse_dir)
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
+    for view in scene.views:
+        # COLMAP moved the features with the pixels: points project onto them.
+        projected = (scene.points[view.point_indices] @ view.R.T + view.t) @ view.K.T
+        features = [point.xy for point in model.image(view.image_id).points2D if point.has_point3D()]
+        np.testing.assert_allclose(projected[:, :2] / projected[:, 2:], features, atol=1e-3)
+        assert image_problem(workspace.image_path(view.name), view.width, view.height) is None
+
+
+def test_panorama_is_refused(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path, "EQUIRECTANGULAR")
+    with pytest.raises(InputError, match="panorama"):
+        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    assert not (tmp_path / "dense").exists()
+
+
+def damage(path: Path, kind: str) -> None:
+    data = path.read_bytes()
+    if kind == "missing":
+        path.unlink()
+    elif kind == "size":
+        cv2.imwrite(str(path), np.zeros((HEIGHT, WIDTH + 2, 3), np.uint8))
+    else:
+        path.write_bytes({"empty": b"", "cut off": data[: len(data) // 2], "text": b"no image" * 9}[kind])
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "cut off", "text", "size"])
+def test_bad_image_is_reported_and_left_out(
+    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    damage(tmp_path / "images" / "b.png", kind)
+    workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
+    assert len(warnings) == 1 and "b.png" in warnings[0]
+    rest = ["a.png", "cam/c.png", "cam/d.png"]
+    scene = read_scene(workspace.sparse_dir)
+    assert [view.name for view in scene.views] == rest
+    assert workspace.fusion_cfg_path.read_text().split() == rest
+    assert not workspace.image_path("b.png").exists()
+    # The point that only the first two images saw is gone; the others are still tracked three times.
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    assert model.num_points3D() == 19
+    assert {point.track.length() for point in model.points3D.values()} == {3}
+    assert all(len(view.point_indices) == 19 for view in scene.views)
+
+
+def test_no_usable_image(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    for name in NAMES:
+        damage(tmp_path / "images" / name, "size")
+    with pytest.raises(InputError, match="None of the model's 4 images"):
+        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    assert not (tmp_path / "dense").exists()
+
+
+def test_finished_workspace_is_reused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sparse = make_project(tmp_path)
+    prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    monkeypatch.setattr(pycolmap, "undistort_images", None)
+    prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    with pytest.raises(InputError, match="different options"):
+        prepare_workspace(sparse, None, tmp_path / "dense", UndistortionOptions(48))
+    (tmp_path / "images" / "a.png").unlink()
+    with pytest.raises(InputError, match="different images"):
+        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+
+
+def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sparse, dense = make_project(tmp_path), tmp_path / "dense"
+
+    def interrupted(output: Path, *args: object, **kwargs: object) -> None:
+        (output / "images").mkdir()
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pycolmap, "undistort_images", interrupted)
+        prepare_workspace(sparse, None, dense, OPTIONS)
+    assert not dense.exists()
+    # A killed process cleans nothing up.
+    (dense / "colmap_sph" / "undistorting" / "images").mkdir(parents=True)
+    workspace = prepare_workspace(sparse, None, dense, OPTIONS)
+    assert len(read_scene(workspace.sparse_dir).views) == 4
+
+
+@pytest.mark.parametrize("num_moved", range(6))
+def test_interrupted_move_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_moved: int
+) -> None:
+    sparse, dense = make_project(tmp_path), tmp_path / "dense"
+    finished = prepare_workspace(sparse, None, tmp_path / "other", OPTIONS)
+    scratch = dense / "colmap_sph" / "undistorting"
+    scratch.mkdir(parents=True)
+    (finished.state_dir / "undistortion.json").rename(scratch / "undistortion.json")
+    for index, part in enumerate(staging._PARTS):
+        (finished.root / part).rename((dense if index < num_moved else scratch) / part)
+    monkeypatch.setattr(pycolmap, "undistort_images", None)
+    workspace = prepare_workspace(sparse, None, dense, OPTIONS)
+    assert len(leave_out_bad_images(read_scene(workspace.sparse_dir), workspace).views) == 4
+    assert not scratch.exists()
+
+
+def test_folder_of_someone_else_is_left_alone(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    # The project folder itself, whose images are the originals.
+    with pytest.raises(InputError, match="did not make"):
+        prepare_workspace(sparse, None, tmp_path, OPTIONS)
+    assert (tmp_path / "images" / "a.png").is_file()
+    assert not (tmp_path / "colmap_sph").exists()
+
+
+def test_output_that_cannot_be_made(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    (tmp_path / "dense").write_text("a file in the way")
+    with pytest.raises(OutputError, match="dense"):
+        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+
+
+@pytest.mark.parametrize("folder", ["images", "sparse/images", "sparse/0/images"])
+def test_images_are_found(tmp_path: Path, folder: str) -> None:
+    model_dir = tmp_path / "sparse" / "0"
+    (model_dir / "images").mkdir(parents=True)
+    (tmp_path / "images").mkdir()
+    (tmp_path / folder / "cam").mkdir(parents=True)
+    (tmp_path / folder / "cam" / "c.png").touch()
+    assert find_images(model_dir, NAMES) == tmp_path / folder
+
+
+def test_images_are_found_from_a_relative_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    make_project(tmp_path)
+    monkeypatch.chdir(tmp_path / "sparse")
+    assert find_images(Path("0"), NAMES).resolve() == tmp_path / "images"
+
+
+def test_images_not_found_lists_the_folders(tmp_path: Path) -> None:
+    with pytest.raises(InputError) as error:
+        find_images(tmp_path / "sparse" / "0", NAMES)
+    for folder in ("images", "sparse/images", "sparse/0/images"):
+        assert str(tmp_path / folder) in str(error.value)
+
+
+def test_wrong_image_folder(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    with pytest.raises(InputError, match="--images"):
+        prepare_workspace(sparse, tmp_path / "nowhere", tmp_path / "dense", OPTIONS)
+
+
+def test_options() -> None:
+    with pytest.raises(OptionError, match="max_image_size"):
+        UndistortionOptions(0).check()
+
+
+def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    sparse = make_project(tmp_path, "OPENCV", (0.0, 0.0, 0.0, 0.0))
+    pycolmap.undistort_images(tmp_path / "dense", sparse, tmp_path / "images")
+    workspace = open_workspace(tmp_path / "dense")
+    assert workspace.normal_map_path("cam/c.png", "photometric").parent.is_dir()
+    scene = read_scene(workspace.sparse_dir)  # an OPENCV camera without distortion
+    workspace.image_path("a.png").unlink()
+    assert [view.name for view in leave_out_bad_images(scene, workspace).views] == NAMES[1:]
+    assert "a.png is missing" in caplog.text
+
+
+def test_what_is_no_workspace_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        open_workspace(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="no images folder"):
+        open_workspace(tmp_path)
+    (tmp_path / "images").mkdir()
+    with pytest.raises(InputError, match="no sparse folder"):
+        open_workspace(tmp_path)
+    (tmp_path / "sparse").mkdir()
+    with pytest.raises(InputError, match="No COLMAP model"):
+        open_workspace(tmp_path)
+
+
+@pytest.mark.parametrize("extension", ["jpg", "png", "tif", "bmp"])
+def test_image_check_by_format(tmp_path: Path, extension: str) -> None:
+    path = tmp_path / f"image.{extension}"
+    pixels = np.random.default_rng(0).integers(0, 255, (40, 50, 3), dtype=np.uint8)
+    cv2.imwrite(str(path), pixels)
+    assert image_problem(path, 50, 40) is None
+    assert image_problem(path, 40, 50) == "has 50 x 40 pixels, but its camera 40 x 50"
+    data = path.read_bytes()
+    for length in (1, 3, 12, len(data) // 2, len(data) - 20):
+        path.write_bytes(data[:length])
+        assert image_problem(path, 50, 40) == "is damaged or cut off"
+
+
+def test_image_check_with_preview_and_trailer(tmp_path: Path) -> None:
+    encode = {"image": (40, 50), "preview": (8, 10)}
+    files = {
+        name: bytes(cv2.imencode(".jpg", np.full((*size, 3), 90, np.uint8))[1])
+        for name, size in encode.items()
+    }
+    app1 = b"\xff\xe1" + (len(files["preview"]) + 2).to_bytes(2, "big") + files["preview"]
+    with_preview = files["image"][:2] + app1 + files["image"][2:]
+    path = tmp_path / "image.jpg"
+    path.write_bytes(with_preview + bytes(1000))
+    assert image_problem(path, 50, 40) is None
+    path.write_bytes(with_preview[:-20])
+    assert image_problem(path, 50, 40) == "is damaged or cut off"
