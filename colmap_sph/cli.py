@@ -15,8 +15,10 @@ from rich.console import Console
 from rich.table import Table
 
 import colmap_sph
+from colmap_sph.demo import run_demo
 from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import ColmapSphError, OutputError
+from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.fusion import FusionOptions
 from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
@@ -116,9 +118,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def run_command(command: RunCommand, console: Console) -> int:
     """`colmap_sph run`."""
-    root = workspace_root(
-        command.model, images=command.images, output=command.output, workspace=command.workspace
-    )
+    root = workspace_root(command.model, images=command.images, output=command.output, workspace=command.workspace)
     options = command.options()
     options.check()
     with _log_file(root, creates=command.model is not None), _Display(console) as display:
@@ -161,7 +161,13 @@ def print_summary(report: RunReport, workspace: Workspace, console: Console) -> 
 
 def demo_command(command: DemoCommand, console: Console) -> int:
     """`colmap_sph demo`."""
-    raise NotImplementedError
+    with _log_file(command.output / "dense", creates=False), _Display(console) as display:
+        result = run_demo(command.output, options=RunOptions(threads=command.threads), progress=display)
+    print_summary(result.report, result.workspace, console)
+    console.print("\n[bold]Against exact depth[/], in pixels on the ground (GSD)", highlight=False)
+    console.print(format_depth_maps(result.depth_maps), highlight=False, soft_wrap=True)
+    console.print(format_clouds([result.cloud]), highlight=False, soft_wrap=True)
+    return 0
 
 
 class _Display:
@@ -202,9 +208,7 @@ def _escaped(text: object) -> str:
 def _console_logging(console: Console) -> Iterator[None]:
     """Warnings of the package on the console."""
     package = logging.getLogger("colmap_sph")
-    handler = rich.logging.RichHandler(
-        logging.WARNING, console, show_time=False, show_path=False, markup=False
-    )
+    handler = rich.logging.RichHandler(logging.WARNING, console, show_time=False, show_path=False, markup=False)
     package.setLevel(logging.INFO)
     package.addHandler(handler)
     try:

@@ -32,13 +32,15 @@ class DepthOptions:
     """Two candidates agree when they differ by less than this many standard deviations."""
     min_support: int = 1
     """Pairs that must agree on a photometric depth."""
-    max_reprojection_error: float = 1.0
+    max_reprojection_error: float = 2.0
     """Two views' depths agree when the point, seen by the other view, projects back within this many pixels."""
-    consistency_tolerance: float = 4.0
+    consistency_tolerance: float = 5.0
     """… and when they differ by less than this many standard deviations."""
     min_consistent: int = 2
     """Views, of those that share a pair with the image, that must confirm a geometric depth."""
-    max_contradiction: float = 0.5
+    min_support_alone: int = 2
+    """A depth that only one view confirms is kept where at least this many pairs agree on it."""
+    max_contradiction: float = 1.0
     """A depth is dropped when more views look through it than this share of those that confirm it."""
 
     def check(self) -> None:
@@ -52,11 +54,12 @@ class DepthOptions:
         ):
             if not getattr(self, name) > 0:
                 raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
-        if not 1 <= self.min_support <= 255:
-            raise OptionError(f"min_support must lie in 1..255, not {self.min_support}.")
+        for name in ("min_support", "min_support_alone"):
+            if not 1 <= getattr(self, name) <= 255:
+                raise OptionError(f"{name} must lie in 1..255, not {getattr(self, name)}.")
         if not 0 <= self.min_consistent <= 255:
             raise OptionError(f"min_consistent must lie in 0..255, not {self.min_consistent}.")
-        if self.max_contradiction < 0:
+        if not self.max_contradiction >= 0:
             raise OptionError(f"max_contradiction must not be negative, not {self.max_contradiction}.")
 
 
@@ -165,9 +168,7 @@ def estimate_depth(view: View, pairs: Iterable[PairDisparity], options: DepthOpt
     depths, sigmas = [], []
     for pair in pairs:
         side: Side = "left" if pair.left == view.name else "right"
-        disparity = (
-            pair.disparity if side == "left" else right_disparity(pair, options.max_disparity_step)
-        )
+        disparity = pair.disparity if side == "left" else right_disparity(pair, options.max_disparity_step)
         depth, sigma = depth_candidates(view, disparity, pair.geometry, side, options)
         depths.append(depth)
         sigmas.append(sigma)
@@ -175,7 +176,12 @@ def estimate_depth(view: View, pairs: Iterable[PairDisparity], options: DepthOpt
     voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
     if depths:
         _native.vote_depth(
-            np.stack(depths), np.stack(sigmas), options.vote_tolerance, voted.depth, voted.sigma, voted.support
+            np.stack(depths),
+            np.stack(sigmas),
+            options.vote_tolerance,
+            voted.depth,
+            voted.sigma,
+            voted.support,
         )
     voted.depth[voted.support < options.min_support] = 0
     return voted
@@ -221,7 +227,9 @@ def check_depth(
             weight,
         )
     found = estimate.depth > 0
-    kept = found & (agreeing >= options.min_consistent)
+    enough = agreeing >= options.min_consistent
+    enough |= (agreeing >= 1) & (estimate.support >= options.min_support_alone)
+    kept = found & enough
     kept &= contradicting <= options.max_contradiction * agreeing
     with np.errstate(divide="ignore", invalid="ignore"):
         own = 1 / np.square(estimate.sigma)

@@ -1,10 +1,10 @@
 """What views would see: sample points stand in for a model's tracks where it has none.
 
-Where the model has points (without tracks), these are projected into the views. Where it has none, the depth of
-the scene is unknown, and all that poses tell is how far views that look the same way are apart. Photographers
-choose that distance so that images overlap: for overlaps of 60 to 90 % the scene lies 2 to 10 of these
-distances away. So every view's frustum is sampled at a few multiples of its distance to its neighbours, and
-whoever sees most of each other's samples overlaps most. Occlusion is not considered.
+Where the model has points (without tracks), these are projected into the views. Where it has none, the depth
+of the scene is unknown, and all that poses tell is how far views that look the same way are apart.
+Photographers choose that distance so that images overlap: for overlaps of 60 to 90 % the scene lies 2 to 10
+of these distances away. So every view's frustum is sampled at a few multiples of that distance,
+and whoever sees most of each other's samples overlaps most. Occlusion is not considered.
 """
 
 import numpy as np
@@ -67,9 +67,7 @@ def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
     return np.concatenate(points), [np.concatenate([*rows, np.empty(0, np.int64)]) for rows in observed]
 
 
-def _neighbour_distances(
-    centers: NDArray[np.float64], directions: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _neighbour_distances(centers: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return every view's typical distance to its neighbours that look the same way, as a (V,) array."""
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
     distances, nearest = cKDTree(centers).query(centers, k=min(_NUM_NEAREST, len(centers)))
@@ -82,7 +80,7 @@ def _neighbour_distances(
             if usable.any():
                 typical[i] = np.median(distances[i][usable][:_NUM_NEIGHBOURS])
                 break
-    return np.nan_to_num(typical, nan=max(extent, 1.0))
+    return np.asarray(np.nan_to_num(typical, nan=max(extent, 1.0)), dtype=np.float64)
 
 
 def _sample(view: View, depth: float) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import OptionError, OutputError
 from colmap_sph.scene import Scene, View
 from colmap_sph.workspace import MapKind, Workspace, read_depth_map, read_normal_map
@@ -129,9 +130,10 @@ def fuse(workspace: Workspace, options: FusionOptions, *, threads: int = -1, kin
     temporary = workspace.state_dir / "fused.ply"
     visibility = temporary.with_name(temporary.name + ".vis")
     try:
-        cloud = pycolmap.stereo_fusion(
-            temporary, workspace.root, input_type=kind, options=colmap_options, output_type="PLY"
-        )
+        with quiet_colmap():
+            cloud = pycolmap.stereo_fusion(
+                temporary, workspace.root, input_type=kind, options=colmap_options, output_type="PLY"
+            )
         temporary.replace(workspace.fused_path)
         visibility.replace(workspace.fused_path.with_name(workspace.fused_path.name + ".vis"))
     except (OSError, RuntimeError, ValueError) as error:

@@ -22,6 +22,8 @@ _OFFSET_INVALID = np.iinfo(np.int32).min
 _SUBPIXEL = 256  # offsets come in 1/256 pixel
 _STEP = 32  # search ranges are multiples of this many disparities
 _MAX_DEPTH = 1024
+# Within 3 x 3 pixels of a coarser level, offsets on one surface differ by no more (in pixels of the finer one).
+_MAX_SURFACE_STEP = 4
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
 
 
@@ -29,7 +31,7 @@ _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
 class MatchingOptions:
     """How rectified images are matched."""
 
-    p1: int = 10
+    p1: int = 16
     """Penalty for a disparity change of one pixel between neighbours, in census bits."""
     p2: int = 120
     """Penalty for larger changes in smooth image regions, in census bits."""
@@ -45,6 +47,8 @@ class MatchingOptions:
     """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
     range_radius: int = 3
     """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches."""
+    max_slant: int = 3
+    """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
     min_segment: int = 40
@@ -64,8 +68,9 @@ class MatchingOptions:
                 raise OptionError(f"{name} must be a multiple of {_STEP} up to {_MAX_DEPTH}, not {value}.")
         if not 0 <= self.range_radius <= 50:
             raise OptionError(f"range_radius must lie in 0..50, not {self.range_radius}.")
-        if self.max_left_right_difference < 0 or self.min_segment < 0:
-            raise OptionError("max_left_right_difference and min_segment must not be negative.")
+        for name in ("max_slant", "max_left_right_difference", "min_segment"):
+            if getattr(self, name) < 0:
+                raise OptionError(f"{name} must not be negative, not {getattr(self, name)}.")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,18 +121,18 @@ def match_pair(
     least, most = int(np.floor(-max_disparity)) - 1, int(np.ceil(-min_disparity)) + 1
     levels = _num_levels(most - least, min(left.image.shape + right.image.shape), options)
     lefts, rights = _pyramid(left, levels), _pyramid(right, levels)
-    base: NDArray[np.int32] | None = None
+    offset: NDArray[np.int32] | None = None
     for level in range(levels, -1, -1):
         low, high = least >> level, -(-most >> level)
-        if base is None:
-            depth = min(_round_up(high - low + 3), _MAX_DEPTH)
-            base = np.full(lefts[level].image.shape, low - 1, dtype=np.int32)
+        shape, depth = lefts[level].image.shape, min(_round_up(high - low + 3), _MAX_DEPTH)
+        if offset is None:
+            base = np.full(shape, low - 1, dtype=np.int32)
         else:
-            depth = options.disparities if level == 0 else options.coarse_disparities
-            depth = min(depth, _round_up(high - low + 3))
-            base = _propagate(offset, lefts[level].image.shape, depth, low, high, options)
+            depth = min(depth, options.disparities if level == 0 else options.coarse_disparities)
+            base = _propagate(offset, shape, depth, low, high, options)
         offset = _match_level(lefts[level], rights[level], base, depth, options)
         _remove_small_segments(offset, max(options.min_segment >> level, 4))
+    assert offset is not None
     disparity = offset.astype(np.float32)
     disparity *= np.float32(-1 / _SUBPIXEL)
     disparity[offset == _OFFSET_INVALID] = np.nan
@@ -154,8 +159,8 @@ def _pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
         height, width = pixels.shape
         border = (0, height % 2, 0, width % 2)
         if height % 2 or width % 2:
-            pixels = cv2.copyMakeBorder(pixels, *border, cv2.BORDER_REPLICATE)
-            valid = cv2.copyMakeBorder(valid, *border, cv2.BORDER_CONSTANT, value=0)
+            pixels = _with_border(pixels, border, cv2.BORDER_REPLICATE)
+            valid = _with_border(valid, border, cv2.BORDER_CONSTANT)
         half = ((width + 1) // 2, (height + 1) // 2)
         coarse_valid = cv2.resize(valid, half, interpolation=cv2.INTER_AREA)
         pyramid.append(
@@ -167,8 +172,13 @@ def _pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
     return pyramid
 
 
+def _with_border(image: NDArray[np.uint8], border: tuple[int, int, int, int], kind: int) -> NDArray[np.uint8]:
+    """The image with rows and columns added at its top, bottom, left and right."""
+    return np.asarray(cv2.copyMakeBorder(image, *border, kind, value=0), dtype=np.uint8)
+
+
 def _census(image: RectifiedImage) -> NDArray[np.uint64]:
-    padded = cv2.copyMakeBorder(image.image, *_CENSUS_BORDER, cv2.BORDER_REPLICATE)
+    padded = _with_border(image.image, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
     census = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), census)
     return census
@@ -185,7 +195,7 @@ def _match_level(
     _native.matching_cost(kernels, left_census, right_census, base, cost)
     aggregated = np.empty((height, width, depth), dtype=np.uint16)
     image = np.ascontiguousarray(left.image)
-    _native.aggregation(kernels, cost, base, image, options.p1, _p2_table(options), aggregated)
+    _native.aggregation(kernels, cost, base, image, options.p1, _p2_table(options), options.max_slant, aggregated)
     offset = np.empty((height, width), dtype=np.int32)
     _native.selection(
         kernels, aggregated, base, left_census, right_census, options.max_left_right_difference, offset
@@ -229,16 +239,35 @@ def _propagate(
     valid = offset != _OFFSET_INVALID
     if not valid.any():
         return np.full(shape, (low + high - depth) // 2, dtype=np.int32)
-    own = _fill_nearest(offset.astype(np.float32) / _SUBPIXEL, valid)
-    window = np.ones((2 * options.range_radius + 1,) * 2, dtype=np.uint8)
-    least, most = cv2.erode(own, window), cv2.dilate(own, window)
+    filled = _fill_nearest(offset.astype(np.float32) * np.float32(1 / _SUBPIXEL), valid)
+    own = np.asarray(cv2.medianBlur(filled, 5), dtype=np.float32)
+    least, most = _neighbourhood(own, options.range_radius)
     fits = 2 * (most - least) <= depth - 8
     # A little towards the neighbourhood's middle even where it does not fit.
     reach = np.float32((depth - 12) / 4)
-    centre = np.where(fits, (least + most) / 2, np.clip((least + most) / 2, own - reach, own + reach))
-    base = np.round(2 * centre - depth / 2).astype(np.int32)
-    fine = np.repeat(np.repeat(base, 2, axis=0), 2, axis=1)[: shape[0], : shape[1]]
-    return np.ascontiguousarray(np.clip(fine, low - 1, max(high + 2 - depth, low - 1)))
+    middle = (least + most) / 2
+    centre = 2 * np.where(fits, middle, np.clip(middle, own - reach, own + reach))
+    fine = np.round(_upsample(centre, shape) - depth / 2).astype(np.int32)
+    return np.clip(fine, low - 1, max(high + 2 - depth, low - 1))
+
+
+def _neighbourhood(values: NDArray[np.float32], radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Least and largest value within `radius` of every pixel."""
+    window = np.ones((2 * radius + 1,) * 2, dtype=np.uint8)
+    return np.asarray(cv2.erode(values, window)), np.asarray(cv2.dilate(values, window))
+
+
+def _upsample(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Twice the size, cut to `shape`: interpolated on surfaces, so that aggregation can follow their slope, and
+    repeated at steps."""
+    doubled = (2 * values.shape[1], 2 * values.shape[0])
+    least, most = _neighbourhood(values, 1)
+    flat = (most - least <= _MAX_SURFACE_STEP).astype(np.uint8)
+    interpolated = cv2.resize(values, doubled, interpolation=cv2.INTER_LINEAR)
+    repeated = cv2.resize(values, doubled, interpolation=cv2.INTER_NEAREST)
+    on_surface = cv2.resize(flat, doubled, interpolation=cv2.INTER_NEAREST) > 0
+    chosen = np.where(on_surface, interpolated, repeated)
+    return np.asarray(chosen[: shape[0], : shape[1]], dtype=np.float32)
 
 
 def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:

@@ -34,9 +34,7 @@ def check_binary_file(path: Path) -> None:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 end = _walk(data, _RECORD_END[path.name])
     except OSError as error:
-        raise InputError(
-            f"{path} cannot be read ({error.strerror or error}); check its permissions."
-        ) from error
+        raise InputError(f"{path} cannot be read ({error.strerror or error}); check its permissions.") from error
     if end != size:
         raise InputError(f"{path} is truncated or damaged; export the model from COLMAP again.")
 

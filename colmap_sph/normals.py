@@ -21,7 +21,7 @@ class NormalOptions:
 
     radius: int = 4
     """Radius of the window, pixels."""
-    tolerance: float = 3.0
+    tolerance: float = 6.0
     """Neighbours further from the plane than this many standard deviations hardly count."""
 
     def check(self) -> None:
@@ -56,7 +56,5 @@ def fit_normals(
     inverse_sigma = (estimate.sigma * inverse * inverse).astype(np.float32)
     normals = np.empty((*inverse.shape, 3), dtype=np.float32)
     fitted = np.empty_like(inverse)
-    _native.fit_planes(
-        inverse, inverse_sigma, view.K.copy(), options.radius, options.tolerance, normals, fitted
-    )
+    _native.fit_planes(inverse, inverse_sigma, view.K.copy(), options.radius, options.tolerance, normals, fitted)
     return normals, fitted

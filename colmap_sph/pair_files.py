@@ -3,8 +3,8 @@
 Disparities are stored in 16 bits, 1/64 pixel apart or as fine as the pair's range allows; 0 = none.
 """
 
-from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,15 +31,10 @@ def write_pair(path: Path, pair: PairDisparity) -> None:
     most = float(pair.disparity[found].max()) if found.any() else 0.0
     step = max(_FINEST_STEP, (most - least) / (_CODES - 1))
     codes = np.where(found, np.rint((pair.disparity - least) / step) + 1, 0).astype(np.uint16)
+    content: dict[str, Any] = {name: getattr(pair.geometry, name) for name in RectifiedPair.__dataclass_fields__}
+    content |= {"left": pair.left, "right": pair.right, "codes": codes, "scale": np.array([least, step])}
     with atomic_file(path) as file:
-        np.savez(
-            file,
-            left=pair.left,
-            right=pair.right,
-            codes=codes,
-            scale=np.array([least, step]),
-            **{name: np.asarray(value) for name, value in asdict(pair.geometry).items()},
-        )
+        np.savez(file, **content)
 
 
 def read_pair(path: Path) -> PairDisparity:

@@ -1,13 +1,13 @@
 """Scene → for every image the partners it is matched with, best first.
 
-The best partners share the most sparse points (3D points both images observe), and see them under some parallax.
+The best partners share the most sparse points (3D points both images observe), seen under some parallax.
 Without tracks the verified matches of COLMAP's database stand in for the shared points, and without these the
 overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
 """
 
 import logging
 import sqlite3
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -27,7 +27,7 @@ PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
 
 # COLMAP numbers a pair `image_id1 * 2147483647 + image_id2`.
 _MAX_NUM_IMAGES = 2147483647
-# A view's candidates whose angles are looked at before giving up, and the points that tell the angle of a pair.
+# A view's candidates whose angles are looked at before giving up, and the points that tell a pair's angle.
 _MAX_CANDIDATES = 200
 _MAX_ANGLE_POINTS = 512
 _ANGLE_PERCENTILE = 75
@@ -123,8 +123,8 @@ def select_pairs(
     scene : Scene
     options : PairOptions
     explicit : mapping, optional
-        ``patch-match.cfg`` as `read_patch_match_cfg` returns it. Only its reference images are processed; their
-        lists are obeyed without any gate; ``__auto__`` means the choice made here.
+        ``patch-match.cfg`` as `read_patch_match_cfg` returns it. Only its reference images are processed;
+        their lists are obeyed without any gate; ``__auto__`` means the choice made here.
     database : Path, optional
         COLMAP database whose verified matches serve where the model has no tracks.
 
@@ -200,7 +200,7 @@ class _Graph:
 def triangulation_angles(
     points: NDArray[np.float64], center1: NDArray[np.float64], center2: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the angles in degrees, 0 to 180, between the rays from (N, 3) points to two projection centres."""
+    """Return the angles in degrees, 0 to 180, between the rays from (N, 3) points to two centres."""
     rays1, rays2 = center1 - points, center2 - points
     # Unlike the arc cosine, exact for small angles.
     sines = np.linalg.norm(np.cross(rays1, rays2), axis=1)
@@ -209,7 +209,7 @@ def triangulation_angles(
 
 def _build_graph(scene: Scene, options: PairOptions, database: Path | None) -> _Graph:
     """Find what views have in common: tracks, else verified matches, else samples of the frusta."""
-    finite = np.isfinite(scene.points).all(axis=1)
+    finite = np.asarray(np.isfinite(scene.points).all(axis=1))
     posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
     observed = [
         view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
@@ -256,9 +256,7 @@ def _verified_matches(scene: Scene, database: Path, least: int) -> sparse.csr_ar
         connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
         try:
             names = dict(connection.execute("SELECT image_id, name FROM images"))
-            rows = connection.execute(
-                "SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0"
-            ).fetchall()
+            rows = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0").fetchall()
         finally:
             connection.close()
     except sqlite3.Error as error:
@@ -277,7 +275,8 @@ def _verified_matches(scene: Scene, database: Path, least: int) -> sparse.csr_ar
 
 def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]:
     """Return the best pairs of view `i`: those which share most, after them those under a wide angle."""
-    near, wide = [], []
+    near: list[Pair] = []
+    wide: list[Pair] = []
     for j, weight in zip(*graph.candidates(i), strict=True):
         if len(near) == options.num_pairs or len(near) + len(wide) >= _MAX_CANDIDATES:
             break
@@ -338,8 +337,3 @@ def _report(selection: PairSelection, options: PairOptions) -> None:
     logger.info("%d pairs of %d images, by %s", num_unique, len(selection.pairs), words[selection.source])
     for name in selection.without_partner:
         logger.warning("%s has no partner with enough overlap and parallax; it gets no depth map", name)
-
-
-def names_of(pairs: Iterable[Pair]) -> list[str]:
-    """Return the partners' names."""
-    return [pair.partner for pair in pairs]

@@ -29,7 +29,7 @@ from colmap_sph.matching import RectifiedImage, match_pair
 from colmap_sph.normals import fit_normals
 from colmap_sph.options import RunOptions
 from colmap_sph.pair_files import read_pair, write_pair
-from colmap_sph.pairs import Pair, select_pairs
+from colmap_sph.pairs import select_pairs
 from colmap_sph.rectification import rectify_pair, resample
 from colmap_sph.report import Progress, RunReport, Silent
 from colmap_sph.scene import Scene, View, read_scene
@@ -40,7 +40,6 @@ from colmap_sph.workspace import (
     Workspace,
     atomic_file,
     make_dir,
-    read_depth_map,
     read_patch_match_cfg,
     write_depth_map,
     write_fusion_cfg,
@@ -165,31 +164,34 @@ def reconstruct(
 def match_pairs(
     workspace: Workspace,
     scene: Scene,
-    pairs: Sequence[Pair],
+    pairs: Sequence[tuple[str, str]],
     options: RunOptions,
     progress: Progress,
     report: RunReport,
 ) -> list[tuple[str, str]]:
-    """Rectify and match pairs, each once; writes their disparity maps and returns the names of those matched."""
+    """Rectify and match pairs of image names, each once.
+
+    Writes their disparity maps; returns the pairs that could be matched.
+    """
     make_dir(_pairs_dir(workspace))
     images = LoadCache(lambda name: _read_grey(workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
 
-    def work(pair: Pair) -> tuple[str, str]:
-        left, right = scene.view(pair.reference), scene.view(pair.partner)
+    def work(pair: tuple[str, str]) -> tuple[str, str]:
+        left, right = (scene.view(name) for name in pair)
         geometry = rectify_pair(scene, left, right, options.rectification)
-        rectified = [
-            RectifiedImage(*resample(images.get(view.name), view, geometry, side))
-            for view, side in ((left, "left"), (right, "right"))
-        ]
-        disparity = match_pair(*rectified, geometry.min_disparity, geometry.max_disparity, options.matching)
+        left_image = RectifiedImage(*resample(images.get(left.name), left, geometry, "left"))
+        right_image = RectifiedImage(*resample(images.get(right.name), right, geometry, "right"))
+        disparity = match_pair(
+            left_image, right_image, geometry.min_disparity, geometry.max_disparity, options.matching
+        )
         write_pair(
             _pair_path(workspace, left.name, right.name, scene),
             PairDisparity(left.name, right.name, geometry, disparity),
         )
-        return left.name, right.name
+        return pair
 
-    def skip(pair: Pair, error: ColmapSphError) -> None:
-        report.skipped_pairs[f"{pair.reference} - {pair.partner}"] = str(error)
+    def skip(pair: tuple[str, str], error: ColmapSphError) -> None:
+        report.skipped_pairs[" - ".join(pair)] = str(error)
 
     with _stage(report, progress, "match pairs", len(pairs)):
         matched = _for_all(work, pairs, options.num_threads, progress, skip)
@@ -233,9 +235,7 @@ def check_views(
     report: RunReport,
 ) -> None:
     """Check every view's depth against its partners'; writes the geometric depth and normal maps."""
-    estimates = LoadCache(
-        lambda name: _read_estimate(workspace, name), lambda e: 9 * e.depth.size, _CACHE_BYTES
-    )
+    estimates = LoadCache(lambda name: _read_estimate(workspace, name), lambda e: 9 * e.depth.size, _CACHE_BYTES)
 
     def work(view: View) -> None:
         others = ((scene.view(name), estimates.get(name)) for name in partners.get(view.name, []))

@@ -29,6 +29,8 @@ _SEAM_ROWS = 32
 # Fewer shared points than this say too little about the range of parallaxes.
 _MIN_RANGE_POINTS = 8
 _SIDE_SAMPLES = 33
+# cv2.remap takes no more rows or columns.
+_MAX_SIDE = 32766
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,11 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
 
 
 def resample(
-    image: NDArray[np.uint8], view: View, pair: RectifiedPair, side: Side, interpolation: int = cv2.INTER_LINEAR
+    image: NDArray[np.uint8],
+    view: View,
+    pair: RectifiedPair,
+    side: Side,
+    interpolation: int = cv2.INTER_LINEAR,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Resample an image to the rectified surface, once and straight from its pixels.
 
@@ -411,13 +417,13 @@ def _crop(
     return left, right
 
 
-def _checked_size(
-    pair: RectifiedPair, left: View, right: View, options: RectificationOptions
-) -> RectifiedPair:
+def _checked_size(pair: RectifiedPair, left: View, right: View, options: RectificationOptions) -> RectifiedPair:
     pixels = pair.height * (pair.left_width + pair.right_width)
     originals = left.width * left.height + right.width * right.height
     allowed = options.max_pixels_ratio * originals * max(1.0, options.sampling**2)
-    if pixels > allowed or max(pair.left_width, pair.right_width) > 65535:
+    if max(pair.height, pair.left_width, pair.right_width) > _MAX_SIDE:
+        raise RectificationError(f"its rectified images would have more than {_MAX_SIDE} rows or columns")
+    if pixels > allowed:
         raise RectificationError(
             f"its rectified images would have {pixels / originals:.1f} times the pixels of the originals"
         )

@@ -124,9 +124,7 @@ def read_scene(sparse_dir: Path) -> Scene:
         if not _is_finite(view):
             logger.warning("%s: the pose or calibration in %s is not finite; left out", view.name, sparse_dir)
     if not usable:
-        raise InputError(
-            f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again."
-        )
+        raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
     return Scene(tuple(sorted(usable, key=lambda view: view.name)), points)
 
 
@@ -173,11 +171,7 @@ def is_pinhole(camera: pycolmap.Camera) -> bool:
     """Whether a camera of any model maps as its calibration matrix does, to 0.001 px inside the image."""
     if camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE):
         return True
-    if (
-        not camera.is_perspective()
-        or not np.all(np.isfinite(camera.params))
-        or camera.mean_focal_length() <= 0
-    ):
+    if not camera.is_perspective() or not np.all(np.isfinite(camera.params)) or camera.mean_focal_length() <= 0:
         return False
     u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))
     pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
@@ -221,9 +215,7 @@ def _read_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], d
     return points[kept], {ids[index]: row for row, index in enumerate(kept)}
 
 
-def _read_view(
-    model: pycolmap.Reconstruction, image_id: int, row_of: dict[int, int], sparse_dir: Path
-) -> View:
+def _read_view(model: pycolmap.Reconstruction, image_id: int, row_of: dict[int, int], sparse_dir: Path) -> View:
     image = model.image(image_id)
     camera = model.camera(image.camera_id)
     if not is_pinhole(camera):

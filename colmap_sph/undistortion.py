@@ -8,13 +8,14 @@ undistort, and cameras without distortion but of a distorted model, in the model
 import hashlib
 import logging
 import shutil
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import pycolmap
 
+from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
 from colmap_sph.scene import Scene, is_pinhole, load_model, make_pinhole, model_files
@@ -63,9 +64,7 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     found = [sum((folder / name).is_file() for name in names) for folder in folders]
     if max(found) == 0:
         tried = ", ".join(str(folder) for folder in folders)
-        raise InputError(
-            f"The images of {model_dir} were not found in {tried}; give their folder as --images."
-        )
+        raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
     return folders[found.index(max(found))]
 
 
@@ -212,7 +211,7 @@ def _undistort(
     camera_options.max_image_size = options.max_image_size
     logger.info("Undistorting %d images", len(names))
     try:
-        with _quiet_colmap():
+        with quiet_colmap():
             pycolmap.undistort_images(
                 scratch, model_dir, image_dir, image_names=names, undistort_options=camera_options
             )
@@ -311,14 +310,3 @@ def _hash_images(image_dir: Path, names: list[str]) -> str:
 def _raise_if_disk_is_full(folder: Path) -> None:
     if shutil.disk_usage(folder).free < _FULL_DISK_BYTES:
         raise OutputError(f"The disk of {folder} is full; free some space or choose another --output.")
-
-
-@contextmanager
-def _quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP's progress messages, which it writes straight to the terminal, to warnings and errors."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.WARNING)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level

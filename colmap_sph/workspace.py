@@ -302,7 +302,5 @@ def _checked_name(name: str) -> str:
     """Refuse a name that would lead out of the workspace."""
     parts = PurePosixPath(name)
     if not name or parts.is_absolute() or ".." in parts.parts:
-        raise InputError(
-            f"The image name {name!r} leads out of the workspace; rename the image in the model."
-        )
+        raise InputError(f"The image name {name!r} leads out of the workspace; rename the image in the model.")
     return name

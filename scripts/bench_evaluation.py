@@ -34,9 +34,7 @@ def main() -> None:
     parser.add_argument("--definition", default="points", help="points, tanks-and-temples or eth3d")
     parser.add_argument("--threads", type=int, default=0, help="0: one per core")
     arguments = parser.parse_args()
-    options = EvaluationOptions(
-        tau=(0.1, 0.2, 0.5), definition=arguments.definition, threads=arguments.threads
-    )
+    options = EvaluationOptions(tau=(0.1, 0.2, 0.5), definition=arguments.definition, threads=arguments.threads)
     cloud = ground(arguments.points, 0.1, 1) + np.array([0.2, -0.1, 0.15])
     outliers = int(OUTLIER_SHARE * arguments.points)
     cloud[:outliers, 2] += np.random.default_rng(3).normal(0, 20, outliers)

@@ -42,7 +42,7 @@ def _slots(costs, indices):
     return np.where(inside, costs[np.clip(indices, 0, len(costs) - 1)], NO_SLOT)
 
 
-def path_costs(cost, base, image, p1, p2, direction):
+def path_costs(cost, base, image, p1, p2, max_slant, direction):
     """L (H, W, D) int64 along one path direction, without any narrowing."""
     height, width, depth = cost.shape
     rows = range(height) if direction[0] >= 0 else range(height - 1, -1, -1)
@@ -55,7 +55,8 @@ def path_costs(cost, base, image, p1, p2, direction):
             if not (0 <= y0 < height and 0 <= x0 < width):
                 continue
             before, least = path[y0, x0], path[y0, x0].min()
-            same = slot + (int(base[y, x]) - int(base[y0, x0]))
+            difference = int(base[y, x]) - int(base[y0, x0])
+            same = slot + (0 if abs(difference) <= max_slant else difference)
             one_step = np.minimum(_slots(before, same - 1), _slots(before, same + 1)) + p1
             jump = least + int(p2[abs(int(image[y, x]) - int(image[y0, x0]))])
             best = np.minimum(np.minimum(_slots(before, same), one_step), jump)
@@ -63,9 +64,9 @@ def path_costs(cost, base, image, p1, p2, direction):
     return path
 
 
-def aggregation(cost, base, image, p1, p2):
+def aggregation(cost, base, image, p1, p2, max_slant):
     """Sum of the 8 paths, (H, W, D) int64."""
-    return sum(path_costs(cost, base, image, p1, p2, direction) for direction in DIRECTIONS)
+    return sum(path_costs(cost, base, image, p1, p2, max_slant, direction) for direction in DIRECTIONS)
 
 
 def subpixel_offset(before, best, after):
@@ -160,13 +161,14 @@ def _read_depth(depth, u, v):
 
 
 def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma, max_error, tolerance):
-    """Verdict (+1 agrees, -1 looks through, 0 none), the partner's depth on the reference ray, clearance.
+    """Verdict (+1 agrees, -1 looks through, 0 none), the partner's depth and sigma, clearance.
 
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
     origin of depth maps. The clearance is the least relative distance from any gate or from a pixel's border.
     """
     shape = depth.shape
-    verdict, carried, clearance = np.zeros(shape, dtype=int), np.zeros(shape), np.full(shape, np.inf)
+    verdict, clearance = np.zeros(shape, dtype=int), np.full(shape, np.inf)
+    carried, spread = np.zeros(shape), np.zeros(shape)
     for row, col in np.ndindex(shape):
         z = float(depth[row, col])
         if not z > 0:
@@ -180,12 +182,12 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
         found = _read_depth(partner_depth.astype(float), u, v)
         if not found > 0:
             continue
-        spread = float(partner_sigma[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))])
+        spread[row, col] = float(partner_sigma[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))])
         back = partner.R.T @ (np.linalg.solve(partner.K, [u, v, 1.0]) * found - partner.t)
         back = view.R @ back + view.t
         home = view.K @ back
         error = np.hypot(home[0] / home[2] - col, home[1] / home[2] - row)
-        gate = tolerance * np.hypot(spread, float(sigma[row, col]))
+        gate = tolerance * np.hypot(spread[row, col], float(sigma[row, col]))
         difference = found - seen[2]
         carried[row, col] = back[2]
         if back[2] > 0 and error <= max_error and abs(difference) <= gate:
@@ -196,6 +198,7 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
             abs(error / max_error - 1),
             abs(abs(difference) / gate - 1),
             abs(difference / (2 * gate) - 1),
-            abs((u + 0.5) % 1 - 0.5) + 1e-3 if 0.5 - abs(u % 1 - 0.5) else np.inf,
+            abs(u % 1 - 0.5),
+            abs(v % 1 - 0.5),
         )
-    return verdict, carried, clearance
+    return verdict, carried, spread, clearance

@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,6 +23,7 @@ from colmap_sph.evaluation import (
     make_reference,
     write_json,
 )
+from colmap_sph.evaluation.geometry_io import require
 from colmap_sph.evaluation.neighbours import PointIndex, thin, voxel_centroids, voxel_keys
 
 FIXED = EvaluationOptions(tau=(0.05, 0.25), register=False)
@@ -156,9 +159,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
 @settings(max_examples=40, deadline=None)
 def test_nearest_distances_are_those_of_brute_force(seed, cloud_count, query_count):
     random = np.random.default_rng(seed)
-    points = (
-        random.normal(size=(cloud_count, 3)) * 10.0 ** random.integers(-3, 4) + random.normal(size=3) * 1e5
-    )
+    points = random.normal(size=(cloud_count, 3)) * 10.0 ** random.integers(-3, 4) + random.normal(size=3) * 1e5
     queries = points[random.integers(0, cloud_count, query_count)] + random.normal(size=(query_count, 3))
     expected = np.linalg.norm(queries[:, None] - points[None], axis=2).min(axis=1)
     np.testing.assert_allclose(PointIndex(points).distances(queries), expected, rtol=1e-12)
@@ -171,6 +172,19 @@ def test_voxels():
     np.testing.assert_allclose(voxel_centroids(points, 100.0), [points.mean(axis=0)], rtol=1e-15)
     with pytest.raises(OptionError, match="too small"):
         voxel_keys(points * 1e9, 1e-9)
+
+
+def test_evaluation_imports_no_stage():
+    code = "import sys, colmap_sph.evaluation; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    ours = [name for name in done.stdout.split() if name.startswith("colmap_sph")]
+    others = [name for name in ours if not name.startswith("colmap_sph.evaluation")]
+    assert others == ["colmap_sph", "colmap_sph.errors"]
+
+
+def test_a_missing_library_is_named():
+    with pytest.raises(InputError, match=r"needs no_such_library: pip install 'colmap_sph\[evaluation\]'"):
+        require("no_such_library")
 
 
 def test_scores_survive_json(tmp_path: Path):

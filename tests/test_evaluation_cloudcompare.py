@@ -59,9 +59,7 @@ def test_real_clouds(tmp_path: Path, data_dir: Path, cap: float | None):
     model = pycolmap.Reconstruction(str(data_dir / "penta" / "sparse" / "0"))
     image = next(image for image in model.images.values() if Path(image.name).stem == "B_02_05")
     pose = image.cam_from_world().matrix()
-    depth = (
-        cv2.imread(str(data_dir / "penta" / "depth" / "B_02_05.png"), cv2.IMREAD_UNCHANGED)[::3, ::3] * 0.005
-    )
+    depth = cv2.imread(str(data_dir / "penta" / "depth" / "B_02_05.png"), cv2.IMREAD_UNCHANGED)[::3, ::3] * 0.005
     row, column = np.nonzero(depth > 0)
     z = depth[row, column]
     x, y = (3 * column + 0.5 - 600) / 1200, (3 * row + 0.5 - 450) / 1200

@@ -9,11 +9,13 @@ from colmap_sph.evaluation import (
     EvaluationOptions,
     PointCloud,
     compare_depth_map,
+    count_views,
     evaluate_cloud,
     format_depth_maps,
     make_reference,
     mean_of_depth_maps,
     truth_at_pixel_origin,
+    truth_normals_at_pixel_origin,
     visible_surface,
 )
 
@@ -38,6 +40,18 @@ def test_truth_moves_from_pixel_centres_to_pixel_corners_exactly():
     exact = plane_depth(normal, 10, shift=0.0)
     assert not corner[0].any() and not corner[:, 0].any()
     np.testing.assert_allclose(corner[1:, 1:], exact[1:, 1:], rtol=1e-6)
+
+
+def test_truth_normals_are_those_of_the_plane():
+    normal = np.array([0.3, -0.5, 1.0])
+    normals = truth_normals_at_pixel_origin(plane_depth(normal, 10, shift=0.5), K, edge_tolerance=0.01)
+    assert not normals[0].any() and not normals[:, 0].any()
+    exact = -normal / np.linalg.norm(normal)
+    np.testing.assert_allclose(normals[1:, 1:], np.broadcast_to(exact, (HEIGHT - 1, WIDTH - 1, 3)), atol=1e-6)
+    step = np.full((HEIGHT, WIDTH), 10.0)
+    step[:, 60:] = 9.9
+    normals = truth_normals_at_pixel_origin(step, K)
+    assert not normals[:, 60].any() and normals[1:, 61:].any(axis=2).all()
 
 
 def test_truth_leaves_out_edges_and_nothing_else():
@@ -119,14 +133,14 @@ def test_visible_surface_counts_views_and_knows_what_is_hidden():
         depth[:, left:right] = 5.0
         depths.append(view(f"camera {x}", x, depth))
     surface = visible_surface(depths, 0.05)
-    on_wall = surface.points[:, 2] > 9
-    x = surface.points[:, 0]
+    counts = count_views(surface, depths)
+    on_wall, x = surface[:, 2] > 9, surface[:, 0]
     # Behind the screen the left camera misses -2 … 2 m of the wall, the right one -3 … 1: none sees -2 … 1.
     assert not np.any(on_wall & (x > -1.9) & (x < 0.9))
-    assert set(surface.view_counts[on_wall & (x > -2.9) & (x < -2.1)]) == {1}
-    assert set(surface.view_counts[on_wall & (x > 1.1) & (x < 1.9)]) == {1}
-    assert set(surface.view_counts[on_wall & (x > 2.1) & (x < 5.9)]) == {2}
-    assert set(surface.view_counts[~on_wall & (np.abs(x) < 0.9)]) == {2}
+    assert set(counts[on_wall & (x > -2.9) & (x < -2.1)]) == {1}
+    assert set(counts[on_wall & (x > 1.1) & (x < 1.9)]) == {1}
+    assert set(counts[on_wall & (x > 2.1) & (x < 5.9)]) == {2}
+    assert set(counts[~on_wall & (np.abs(x) < 0.9)]) == {2}
 
 
 def test_a_cloud_is_judged_by_what_the_views_see():

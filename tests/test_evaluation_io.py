@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from colmap_sph.errors import InputError
-from colmap_sph.evaluation import Mesh, PointCloud, read_geometry
+from colmap_sph.evaluation import EvaluationOptions, Mesh, PointCloud, evaluate_files, read_geometry
 
 laspy = pytest.importorskip("laspy")
 pytest.importorskip("trimesh")
@@ -94,6 +94,14 @@ def test_las_states_its_coordinate_system(tmp_path: Path):
     keys = GeoKeyDirectoryVlr()
     keys.parse_record_data(np.array([1, 1, 0, 2, 1024, 0, 1, 1, 3072, 0, 1, 32633], "<u2").tobytes())
     assert read_geometry(write_las(tmp_path / "c.las", POINTS, [keys])).crs == "projected (EPSG:32633)"
+
+
+def test_files_are_measured(tmp_path: Path):
+    reference = write_las(tmp_path / "lidar.laz", POINTS)
+    (tmp_path / "fused.ply").write_bytes(ply("binary_little_endian", POINTS + np.array([0, 0, 0.5])))
+    scores = evaluate_files([tmp_path / "fused.ply"], reference, EvaluationOptions(tau=(0.6,), register=False))
+    assert len(scores) == 1 and scores[0].thresholds[0].f_score == 1
+    assert scores[0].cloud.endswith("fused.ply") and scores[0].reference.endswith("lidar.laz")
 
 
 def test_bad_files_are_named(tmp_path: Path):

@@ -20,9 +20,7 @@ def make_model(camera_model: str = "PINHOLE", num_images: int = 4) -> pycolmap.R
     points = rng.uniform(-1, 1, (30, 3))
     for image_id in range(1, num_images + 1):
         angle = 0.2 * image_id
-        rotation = np.array(
-            [[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]]
-        )
+        rotation = np.array([[np.cos(angle), 0, -np.sin(angle)], [0, 1, 0], [np.sin(angle), 0, np.cos(angle)]])
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.array([0.1, -0.2, 5.0]))
         # Names in the reverse order of the ids.
         image = pycolmap.Image(
@@ -126,9 +124,7 @@ def test_damaged_binary_model(tmp_path: Path, name: str, damage: str) -> None:
     sparse = write(make_model(), tmp_path / "sparse", text=False)
     path = sparse / f"{name}.bin"
     data = path.read_bytes()
-    path.write_bytes(
-        {"empty": b"", "truncated": data[: len(data) * 2 // 3], "garbage": b"\xff" * 300}[damage]
-    )
+    path.write_bytes({"empty": b"", "truncated": data[: len(data) * 2 // 3], "garbage": b"\xff" * 300}[damage])
     with pytest.raises(InputError, match=r"sparse.*(damaged|truncated|unknown camera)"):
         read_scene(sparse)
 

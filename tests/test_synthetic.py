@@ -42,9 +42,7 @@ def test_plane_depth_is_the_formula_at_every_pixel(origin, slant, tilt):
     offset = normal @ [0, 0, 7.0] - normal @ camera.centre
     expected = offset / (rays(camera.K, *SIZE, origin) @ normal)
     np.testing.assert_allclose(depth, np.where(expected > 0, expected, 0.0), rtol=1e-12)
-    np.testing.assert_allclose(
-        normals[depth > 0], np.broadcast_to(normal, normals[depth > 0].shape), atol=1e-12
-    )
+    np.testing.assert_allclose(normals[depth > 0], np.broadcast_to(normal, normals[depth > 0].shape), atol=1e-12)
 
 
 def test_bounded_plane_ends_where_it_should():
@@ -71,9 +69,7 @@ def test_sphere_depth_solves_the_quadratic(distance):
     inner = discriminant > 1e-3 * b**2
     expected = (b - np.sqrt(np.maximum(discriminant, 0))) / a
     np.testing.assert_allclose(depth[inner], expected[inner], rtol=1e-10)
-    np.testing.assert_allclose(
-        normals[inner], ((direction * depth[..., None] - c) / radius)[inner], atol=1e-9
-    )
+    np.testing.assert_allclose(normals[inner], ((direction * depth[..., None] - c) / radius)[inner], atol=1e-9)
     assert np.all(depth[~hit] == 0)
     assert np.all(normals[~hit] == 0)
 
@@ -284,9 +280,7 @@ def test_a_surface_reaching_behind_the_camera_is_not_culled():
     alone, _, _ = syn.exact_geometry([long_box], camera)
     points = world_points(alone, camera, 0.5)[alone > 0]
     assert len(points) > 500
-    np.testing.assert_allclose(
-        np.maximum(np.abs(points[:, 0]) / 0.25, np.abs(points[:, 2] + 0.75) / 0.25), 1.0
-    )
+    np.testing.assert_allclose(np.maximum(np.abs(points[:, 0]) / 0.25, np.abs(points[:, 2] + 0.75) / 0.25), 1.0)
 
 
 def test_shadow_falls_where_the_sun_says():

@@ -91,9 +91,7 @@ def test_max_image_size(tmp_path: Path) -> None:
         ("SIMPLE_FISHEYE", ()),
     ],
 )
-def test_any_camera_model_becomes_pinhole(
-    tmp_path: Path, camera_model: str, extra: tuple[float, ...]
-) -> None:
+def test_any_camera_model_becomes_pinhole(tmp_path: Path, camera_model: str, extra: tuple[float, ...]) -> None:
     sparse = make_project(tmp_path, camera_model, extra)
     workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
     scene = read_scene(workspace.sparse_dir)
@@ -125,9 +123,7 @@ def damage(path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["missing", "empty", "cut off", "text", "size"])
-def test_bad_image_is_reported_and_left_out(
-    tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_bad_image_is_reported_and_left_out(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
     sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
     damage(tmp_path / "images" / "b.png", kind)
     workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
@@ -184,9 +180,7 @@ def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytes
 
 
 @pytest.mark.parametrize("num_moved", range(6))
-def test_interrupted_move_is_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_moved: int
-) -> None:
+def test_interrupted_move_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_moved: int) -> None:
     sparse, dense = make_project(tmp_path), tmp_path / "dense"
     finished = prepare_workspace(sparse, None, tmp_path / "other", OPTIONS)
     scratch = dense / "colmap_sph" / "undistorting"
@@ -290,8 +284,7 @@ def test_image_check_by_format(tmp_path: Path, extension: str) -> None:
 def test_image_check_with_preview_and_trailer(tmp_path: Path) -> None:
     encode = {"image": (40, 50), "preview": (8, 10)}
     files = {
-        name: bytes(cv2.imencode(".jpg", np.full((*size, 3), 90, np.uint8))[1])
-        for name, size in encode.items()
+        name: bytes(cv2.imencode(".jpg", np.full((*size, 3), 90, np.uint8))[1]) for name, size in encode.items()
     }
     app1 = b"\xff\xe1" + (len(files["preview"]) + 2).to_bytes(2, "big") + files["preview"]
     with_preview = files["image"][:2] + app1 + files["image"][2:]

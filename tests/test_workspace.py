@@ -94,9 +94,7 @@ def test_every_truncation_is_told(tmp_path_factory: pytest.TempPathFactory, cut:
         read_depth_map(path)
 
 
-@pytest.mark.parametrize(
-    "data", [b"7&5&1&" + bytes(141), b"7&5&3&" + bytes(420), b"-1&5&1&", b"PNG\x00", b""]
-)
+@pytest.mark.parametrize("data", [b"7&5&1&" + bytes(141), b"7&5&3&" + bytes(420), b"-1&5&1&", b"PNG\x00", b""])
 def test_garbage_is_told(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "d.bin").write_bytes(data)
     with pytest.raises(InputError, match=r"d\.bin"):

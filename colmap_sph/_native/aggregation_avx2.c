@@ -51,13 +51,13 @@ typedef struct {
     uint8_t *path;
 } step;
 
-static inline void begin_step(step *s, const uint8_t *slots, uint8_t least, int32_t base_difference,
+static inline void begin_step(step *s, const uint8_t *slots, uint8_t least, ptrdiff_t difference,
                               ptrdiff_t depth, uint8_t p2, uint8_t *path) {
     const ptrdiff_t limit = depth + 1;
-    const ptrdiff_t difference = base_difference;
     s->before = slots + (difference > limit ? limit : difference < -limit ? -limit : difference);
     s->least = _mm256_set1_epi8((char)least);
-    s->jump = _mm256_set1_epi8((char)(least + p2));
+    /* Saturated: without common slots `least` itself has grown to 62 + P2. */
+    s->jump = _mm256_set1_epi8((char)(least + p2 > 255 ? 255 : least + p2));
     s->minimum = _mm256_set1_epi8((char)255);
     s->path = path;
 }
@@ -98,7 +98,7 @@ static inline void add_paths(uint16_t *sums, int accumulate, __m256i a, __m256i 
 }
 
 static inline void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                         uint8_t p1, const uint8_t *p2, int backward, path_buffers *buffers,
+                         uint8_t p1, const uint8_t *p2, int32_t max_slant, int backward, path_buffers *buffers,
                          uint16_t *aggregated) {
     const ptrdiff_t direction = backward ? -1 : 1, depth = size.depth;
     const __m256i p1_vector = _mm256_set1_epi8((char)p1);
@@ -121,11 +121,8 @@ static inline void sweep(const uint8_t *cost, const int32_t *base, const uint8_t
                     begin_step(&steps[k], buffers->edge, 0, 0, depth, p2[0], path);
                 } else {
                     const ptrdiff_t difference = (ptrdiff_t)base[p] - base[q];
-                    const int32_t clamped = (int32_t)(difference > MAX_DEPTH + 1    ? MAX_DEPTH + 1
-                                                      : difference < -MAX_DEPTH - 1 ? -MAX_DEPTH - 1
-                                                                                    : difference);
                     begin_step(&steps[k], from->slots + before_x * buffers->stride, from->minima[before_x],
-                               clamped, depth, p2[abs(image[p] - image[q])], path);
+                               llabs(difference) <= max_slant ? 0 : difference, depth, p2[abs(image[p] - image[q])], path);
                 }
             }
             for (ptrdiff_t i = 0; i < depth; i += DEPTH_STEP) {
@@ -144,13 +141,13 @@ static inline void sweep(const uint8_t *cost, const int32_t *base, const uint8_t
 }
 
 int aggregation_avx2(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
-                     const uint8_t *p2, uint16_t *aggregated) {
+                     const uint8_t *p2, int32_t max_slant, uint16_t *aggregated) {
     path_buffers buffers;
     if (allocate(&buffers, size.width, size.depth)) {
         return -1;
     }
-    sweep(cost, base, image, size, p1, p2, 0, &buffers, aggregated);
-    sweep(cost, base, image, size, p1, p2, 1, &buffers, aggregated);
+    sweep(cost, base, image, size, p1, p2, max_slant, 0, &buffers, aggregated);
+    sweep(cost, base, image, size, p1, p2, max_slant, 1, &buffers, aggregated);
     free(buffers.memory);
     return 0;
 }

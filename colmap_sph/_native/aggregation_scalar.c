@@ -3,8 +3,10 @@
  *     L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + P1, L(q, d + 1) + P1, min_k L(q, k) + P2) - min_k L(q, k)
  *
  * q is the pixel before p on the path. d is a column offset into the target, so slot i of p meets slot
- * i + base(p) - base(q) of q; slots that q does not have count as 255. 8 bits are enough: min_k L <= 62, so
- * L <= 62 + P2 <= 255. */
+ * i + base(p) - base(q) of q; but where the bases differ by no more than `max_slant`, they follow a slanted surface,
+ * and slot i meets slot i (an orientation prior as in Scharstein et al. 2017, doi:10.1109/3DV.2017.00033). Slots that q does not have count as 255. 8 bits are enough: with C <= 62 the minimum
+ * of the four terms exceeds min_k L by at most P2, so L <= 62 + P2 <= 255. (min_k L itself exceeds 62 where the
+ * slots that p and q share do not hold q's minimum.) */
 #include <stdlib.h>
 #include <string.h>
 
@@ -38,7 +40,7 @@ static void path_step(const uint8_t *cost, const uint8_t *before, ptrdiff_t dept
 
 /* One sweep: the four paths that come from pixels already visited, top-left to bottom-right or back. */
 static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
-                  const uint8_t *p2, int backward, uint8_t *scratch, uint16_t *aggregated) {
+                  const uint8_t *p2, int32_t max_slant, int backward, uint8_t *scratch, uint16_t *aggregated) {
     const ptrdiff_t step = backward ? -1 : 1;
     const ptrdiff_t row_size = size.width * size.depth;
     uint8_t *rows[2][4]; /* [current or previous row][path] */
@@ -58,10 +60,11 @@ static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image
                 const int inside = before_x >= 0 && before_x < size.width && (path == 0 || n > 0);
                 const ptrdiff_t q = (path == 0 ? y : y - step) * size.width + before_x;
                 const uint8_t *before = rows[path == 0 ? now : !now][path] + before_x * size.depth;
+                const int64_t difference = inside ? (int64_t)base[p] - base[q] : 0;
                 const int contrast = inside ? abs(image[p] - image[q]) : 0;
                 uint8_t *current = rows[now][path] + x * size.depth;
                 path_step(cost + p * size.depth, inside ? before : NULL, size.depth,
-                          inside ? (int64_t)base[p] - base[q] : 0, p1, p2[contrast], current);
+                          llabs(difference) <= max_slant ? 0 : difference, p1, p2[contrast], current);
                 for (ptrdiff_t i = 0; i < size.depth; i++) {
                     const int first = path == 0 && !backward;
                     sums[i] = (uint16_t)((first ? 0 : sums[i]) + current[i]);
@@ -72,13 +75,13 @@ static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image
 }
 
 int aggregation_scalar(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
-                       const uint8_t *p2, uint16_t *aggregated) {
+                       const uint8_t *p2, int32_t max_slant, uint16_t *aggregated) {
     uint8_t *scratch = malloc((size_t)(8 * size.width * size.depth));
     if (!scratch) {
         return -1;
     }
-    sweep(cost, base, image, size, p1, p2, 0, scratch, aggregated);
-    sweep(cost, base, image, size, p1, p2, 1, scratch, aggregated);
+    sweep(cost, base, image, size, p1, p2, max_slant, 0, scratch, aggregated);
+    sweep(cost, base, image, size, p1, p2, max_slant, 1, scratch, aggregated);
     free(scratch);
     return 0;
 }

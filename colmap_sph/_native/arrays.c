@@ -1,5 +1,6 @@
 #include "arrays.h"
 
+#include <stdint.h>
 #include <string.h>
 
 static char format_kind(const char *format) {
@@ -36,6 +37,10 @@ void *array_get(array_set *set, PyObject *object, const char *name, char kind, P
     }
     if (view->ndim != ndim) {
         PyErr_Format(PyExc_ValueError, "%s must have %d dimensions, not %d", name, ndim, view->ndim);
+        return NULL;
+    }
+    if (view->len > 0 && (uintptr_t)view->buf % (size_t)itemsize) {
+        PyErr_Format(PyExc_ValueError, "%s must be aligned to its items", name);
         return NULL;
     }
     for (int k = 0; shape && k < ndim; k++) {

@@ -1,5 +1,5 @@
-/* Array arguments by the buffer protocol: type, shape and contiguity checked, with the argument's name in the
- * message. */
+/* Array arguments by the buffer protocol: type, shape, contiguity and alignment checked, with the argument's name
+ * in the message. */
 #ifndef COLMAP_SPH_ARRAYS_H
 #define COLMAP_SPH_ARRAYS_H
 

@@ -100,7 +100,8 @@ static PyObject *py_matching_cost(PyObject *self, PyObject *args) {
     const uint64_t *target = reference ? array_get(&arrays, o[1], "target", U64, 2, READ, target_shape) : NULL;
     const int32_t *base = target ? array_get(&arrays, o[2], "base", I32, 2, READ, shape) : NULL;
     uint8_t *cost = base ? array_get(&arrays, o[3], "cost", U8, 3, WRITE, shape) : NULL;
-    if (cost && check_depth(shape[2]) && arrays_disjoint(&arrays)) {
+    if (cost && check_depth(shape[2]) && check_width(shape[1]) && check_width(target_shape[1]) &&
+        arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], target_shape[1], shape[2]};
         Py_BEGIN_ALLOW_THREADS;
         status = table->cost(reference, target, base, size, cost);
@@ -122,8 +123,8 @@ static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
     PyObject *o[5];
-    int p1;
-    if (!PyArg_ParseTuple(args, "sOOOiOO", &backend, &o[0], &o[1], &o[2], &p1, &o[3], &o[4])) {
+    int p1, max_slant;
+    if (!PyArg_ParseTuple(args, "sOOOiOiO", &backend, &o[0], &o[1], &o[2], &p1, &o[3], &max_slant, &o[4])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
@@ -135,10 +136,12 @@ static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     const uint8_t *image = base ? array_get(&arrays, o[2], "image", U8, 2, READ, shape) : NULL;
     const uint8_t *p2 = image ? array_get(&arrays, o[3], "p2", U8, 1, READ, lut_shape) : NULL;
     uint16_t *aggregated = p2 ? array_get(&arrays, o[4], "aggregated", U16, 3, WRITE, shape) : NULL;
-    if (aggregated && check_depth(shape[2]) && check_penalties(p1, p2) && arrays_disjoint(&arrays)) {
+    if (aggregated && check_depth(shape[2]) && check_width(shape[1]) && check_penalties(p1, p2) &&
+        check(max_slant >= 0, "the slant must not be negative") &&
+        arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], 0, shape[2]};
         Py_BEGIN_ALLOW_THREADS;
-        status = table->aggregation(cost, base, image, size, (uint8_t)p1, p2, aggregated);
+        status = table->aggregation(cost, base, image, size, (uint8_t)p1, p2, max_slant, aggregated);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
@@ -319,7 +322,7 @@ static PyMethodDef methods[] = {
     {"backends", py_backends, METH_NOARGS, "Names of the kernel versions this processor runs, fastest first."},
     {"census", py_census, METH_VARARGS, "census(backend, padded, valid, census)"},
     {"matching_cost", py_matching_cost, METH_VARARGS, "matching_cost(backend, reference, target, base, cost)"},
-    {"aggregation", py_aggregation, METH_VARARGS, "aggregation(backend, cost, base, image, p1, p2, aggregated)"},
+    {"aggregation", py_aggregation, METH_VARARGS, "aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)"},
     {"selection", py_selection, METH_VARARGS,
      "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},

@@ -4,23 +4,40 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.evaluation.cloud_scores import CloudScores, distance_statistics, threshold_scores
-from colmap_sph.evaluation.geometry_io import Mesh, PointCloud
+from colmap_sph.evaluation.geometry_io import Mesh, PointCloud, read_geometry
 from colmap_sph.evaluation.mesh_surface import MeshSurface
-from colmap_sph.evaluation.neighbours import Points
+from colmap_sph.evaluation.neighbours import Points, bounds
 from colmap_sph.evaluation.options import EvaluationOptions
-from colmap_sph.evaluation.references import Reference
+from colmap_sph.evaluation.references import Reference, make_reference
 from colmap_sph.evaluation.registration import Registration, register
 
 logger = logging.getLogger(__name__)
 
 _MAP_COORDINATES = 2e4
 """Distance from the origin beyond which coordinates look like map coordinates rather than a local frame."""
+
+
+def evaluate_files(
+    clouds: Sequence[Path], reference: Path, options: EvaluationOptions | None = None
+) -> list[CloudScores]:
+    """Measure the clouds of some files, read one at a time, against the cloud or mesh of another.
+
+    Raises
+    ------
+    InputError, NoResultError, OptionError
+        As `read_geometry`, `make_reference` and `evaluate_cloud`.
+    """
+    options = options or EvaluationOptions()
+    prepared = make_reference(read_geometry(reference), options)
+    return [evaluate_cloud(read_geometry(cloud), prepared, options) for cloud in clouds]
 
 
 def evaluate_cloud(
@@ -83,11 +100,9 @@ def check_overlap(cloud: PointCloud, reference: Reference, reach: float) -> None
     """Raise InputError, with the remedy, unless the two bounding boxes come within `reach` of each other."""
     for name, crs in ((cloud.name, cloud.crs), (reference.name, reference.crs)):
         if crs is not None and crs.startswith("geographic"):
-            raise InputError(
-                f"{name} is in degrees, {crs}: reproject it to the metric frame of the other first"
-            )
-    cloud_low, cloud_high = cloud.points.min(axis=0), cloud.points.max(axis=0)
-    low, high = reference.points.min(axis=0), reference.points.max(axis=0)
+            raise InputError(f"{name} is in degrees, {crs}: reproject it to the metric frame of the other first")
+    cloud_low, cloud_high = bounds(cloud.points)
+    low, high = bounds(reference.points)
     if np.all(cloud_low - reach <= high) and np.all(low - reach <= cloud_high):
         return
     here, there = (cloud_low + cloud_high) / 2, (low + high) / 2
@@ -137,9 +152,8 @@ def _is_judged(points: Points, reference: Reference, options: EvaluationOptions)
         crop = "none" if not reference.movable else "horizontal" if reference.z_is_up else "box"
     if crop == "none":
         return judged
-    axes = slice(0, 2) if crop == "horizontal" else slice(0, 3)
+    low, high = bounds(reference.points)
     margin = options.taus[-1]
-    low = reference.points[:, axes].min(axis=0) - margin
-    high = reference.points[:, axes].max(axis=0) + margin
-    inside = (points[:, axes] >= low) & (points[:, axes] <= high)
-    return np.asarray(judged & inside.all(axis=1))
+    for axis in range(2 if crop == "horizontal" else 3):
+        judged &= (points[:, axis] >= low[axis] - margin) & (points[:, axis] <= high[axis] + margin)
+    return judged

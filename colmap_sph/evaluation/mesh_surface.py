@@ -10,15 +10,16 @@ from colmap_sph.evaluation.geometry_io import Mesh
 from colmap_sph.evaluation.neighbours import PointIndex, Points
 
 _MAX_SAMPLES = 8_000_000
-_CANDIDATES = 4
+_CANDIDATES = 8
 _CHUNK = 1 << 17
 
 
 class MeshSurface:
     """Random samples of a mesh, evenly by area, and distances to the mesh itself.
 
-    A point's distance is the exact distance to the triangles of its four nearest samples, so it is as good as
-    exact wherever triangles are not much smaller than the spacing, and never below the true distance.
+    A point's distance is the exact distance to the triangles of its eight nearest samples: never below the true
+    distance, and above it only where a nearer triangle has no sample among them (on rolling ground 0.03 % of
+    the mean distance at a spacing of a fifth of the triangles' edges).
     """
 
     def __init__(self, mesh: Mesh, spacing: float) -> None:
@@ -36,9 +37,7 @@ class MeshSurface:
         self._owners = np.concatenate([owners, np.arange(len(centroids))])
         self.index = PointIndex(np.concatenate([self.samples, centroids]))
 
-    def distances(
-        self, points: Points, *, threads: int = 1, bound: float = np.inf
-    ) -> npt.NDArray[np.float64]:
+    def distances(self, points: Points, *, threads: int = 1, bound: float = np.inf) -> npt.NDArray[np.float64]:
         """Distance of each of (N, 3) points to the mesh; infinite beyond `bound`."""
         result = np.empty(len(points))
         for start in range(0, len(points), _CHUNK):

@@ -13,7 +13,7 @@ from colmap_sph.evaluation.geometry_io import Mesh, PointCloud
 from colmap_sph.evaluation.mesh_surface import MeshSurface
 from colmap_sph.evaluation.neighbours import PointIndex, Points, thin
 from colmap_sph.evaluation.options import EvaluationOptions
-from colmap_sph.evaluation.visible_surface import DepthView, observed, visible_surface
+from colmap_sph.evaluation.visible_surface import DepthView, count_views, observed, visible_surface
 
 
 class Reference(Protocol):
@@ -89,14 +89,14 @@ class DepthReference:
         self.z_is_up = False
         self._views = views
         surface = visible_surface(views, options.sample_spacing)
-        seen_enough = surface.points[surface.view_counts >= options.min_view_count]
+        candidates = surface[thin(surface, options.taus[0])]
+        seen_enough = candidates[count_views(candidates, views) >= options.min_view_count]
         if not len(seen_enough):
             raise NoResultError(
-                f"no surface is seen by {options.min_view_count} images with exact depth: "
-                "lower min_view_count"
+                f"no surface is seen by {options.min_view_count} images with exact depth: lower min_view_count"
             )
-        self.points = seen_enough[thin(seen_enough, options.taus[0])]
-        self._index = PointIndex(surface.points)
+        self.points = seen_enough
+        self._index = PointIndex(surface)
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
         return self._index.distances(points, threads=threads, bound=bound)

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from colmap_sph.errors import InputError
 from colmap_sph.evaluation.geometry_io import require
-from colmap_sph.evaluation.neighbours import PointIndex, Points
+from colmap_sph.evaluation.neighbours import PointIndex, Points, bounds
 
 logger = logging.getLogger(__name__)
 
@@ -95,9 +95,7 @@ def register(cloud: Points, reference: Points, *, max_distance: float, threads: 
     after, inlier_share = _residual(index, moved, max_distance, threads)
     applied = bool(np.isfinite(motion).all() and after <= before)
     if not applied:
-        logger.warning(
-            "registration made the residual larger (%.4g to %.4g m): it is not applied", before, after
-        )
+        logger.warning("registration made the residual larger (%.4g to %.4g m): it is not applied", before, after)
     matrix = motion.copy()
     matrix[:3, 3] += centre - motion[:3, :3] @ centre
     shift = moved.mean(axis=0) - source.mean(axis=0)
@@ -138,8 +136,11 @@ def _generalised_icp(source: Points, target: Points, max_distance: float) -> npt
 
 def _in_reach(points: Points, others: Points, distance: float) -> Points:
     """The points inside the other cloud's bounding box enlarged by `distance`."""
-    low, high = others.min(axis=0) - distance, others.max(axis=0) + distance
-    return np.asarray(points[((points >= low) & (points <= high)).all(axis=1)])
+    low, high = bounds(others)
+    inside = np.ones(len(points), bool)
+    for axis in range(3):
+        inside &= (points[:, axis] >= low[axis] - distance) & (points[:, axis] <= high[axis] + distance)
+    return np.asarray(points[inside])
 
 
 def _sample(points: Points) -> Points:

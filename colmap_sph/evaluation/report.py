@@ -25,8 +25,7 @@ def format_clouds(scores: Sequence[CloudScores]) -> str:
     rows = [header, *(_cloud_row(cloud) for cloud in scores)]
     first = scores[0]
     lines = [
-        f"reference: {first.reference}, {first.reference_count:,} samples; "
-        f"shares counted as {first.definition}"
+        f"reference: {first.reference}, {first.reference_count:,} samples; shares counted as {first.definition}"
     ]
     if first.cloud_to_reference.cap is not None:
         lines.append(f"distances above {first.cloud_to_reference.cap:g} m count as that")

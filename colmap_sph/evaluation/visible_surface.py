@@ -11,7 +11,9 @@ import numpy.typing as npt
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.evaluation.neighbours import Points, thin
 
-_CHUNK = 1 << 20
+_CHUNK = 1 << 18
+_THIN_AFTER = 2_000_000
+"""The union is thinned anew when it has doubled and grown by so many points."""
 _SAME_DEPTH = 0.005
 """Relative depth difference up to which a view is taken to see a point."""
 
@@ -29,45 +31,40 @@ class DepthView:
     so that a large block fits in memory."""
 
 
-@dataclass(frozen=True)
-class VisibleSurface:
-    """Samples of all surface that the views see."""
-
-    points: Points
-    """(N, 3), at most one per voxel of the spacing."""
-    view_counts: npt.NDArray[np.int32]
-    """(N,) how many views see each."""
-
-
-def visible_surface(views: Sequence[DepthView], spacing: float) -> VisibleSurface:
-    """Back-project exact depth maps, thin the union, and count the views that see each point.
-
-    A view sees a point when it projects into the image and the exact depth at one of the four pixel centres
-    around it is within 0.5 % of the point's own.
+def visible_surface(views: Sequence[DepthView], spacing: float) -> Points:
+    """Samples (N, 3) of all surface that the views see, at most one per voxel of edge `spacing`.
 
     Parameters
     ----------
     views : sequence of DepthView
     spacing : float
-        Edge of the voxels that keep one point each, in the unit of the views.
+        In the unit of the views.
 
     Raises
     ------
     NoResultError
         No view has any depth.
     """
-    points = np.empty((0, 3))
-    limit = 0
+    parts: list[Points] = []
+    limit = _THIN_AFTER
     for view in views:
         seen = back_project(view, _depth_of(view))
         if len(seen):
-            points = np.concatenate([points, seen[thin(seen, spacing)]])
-        if len(points) > limit:
-            points = points[thin(points, spacing)]
-            limit = 2 * len(points) + 5_000_000
-    if not len(points):
+            parts.append(seen[thin(seen, spacing)])
+        if sum(map(len, parts)) > limit:
+            parts = [_thinned_union(parts, spacing)]
+            limit = 2 * len(parts[0]) + _THIN_AFTER
+    if not parts:
         raise NoResultError("none of the exact depth maps has a pixel with a depth: there is no truth")
-    points = points[thin(points, spacing)]
+    return _thinned_union(parts, spacing)
+
+
+def count_views(points: Points, views: Sequence[DepthView]) -> npt.NDArray[np.int32]:
+    """How many views see each of (N, 3) points.
+
+    A view sees a point when it projects into the image and the exact depth at one of the four pixel centres
+    around it is within 0.5 % of the point's own.
+    """
     counts = np.zeros(len(points), np.int32)
     for view in views:
         depth = _depth_of(view)
@@ -77,7 +74,7 @@ def visible_surface(views: Sequence[DepthView], spacing: float) -> VisibleSurfac
             for exact in around:
                 agrees |= (exact > 0) & (np.abs(exact - z) <= _SAME_DEPTH * z)
             counts[start + rows[agrees]] += 1
-    return VisibleSurface(points, counts)
+    return counts
 
 
 def observed(points: Points, views: Sequence[DepthView]) -> npt.NDArray[np.bool_]:
@@ -105,9 +102,18 @@ def back_project(view: DepthView, depth: npt.NDArray[np.float32]) -> Points:
     """World points (N, 3) of the pixels of one exact depth map, sampled at pixel centres."""
     row, column = np.nonzero(depth > 0)
     z = depth[row, column].astype(np.float64)
-    image = np.stack([column + 0.5, row + 0.5, np.ones(len(row))], axis=1)
-    camera = image @ np.linalg.inv(view.K).T * z[:, None]
-    return np.asarray((camera - view.t) @ view.R)
+    x, y = column + 0.5, row + 0.5
+    world_rays, centre = view.R.T @ np.linalg.inv(view.K), -view.R.T @ view.t
+    points = np.empty((len(z), 3))
+    for axis in range(3):
+        ray = world_rays[axis]
+        points[:, axis] = (ray[0] * x + ray[1] * y + ray[2]) * z + centre[axis]
+    return points
+
+
+def _thinned_union(parts: Sequence[Points], spacing: float) -> Points:
+    points = np.concatenate(parts)
+    return np.asarray(points[thin(points, spacing)])
 
 
 def _depth_of(view: DepthView) -> npt.NDArray[np.float32]:
@@ -123,11 +129,12 @@ def _look_up(
     """The rows of `points` that project into the image, their depths, and the exact depth of the four pixels
     whose centres surround each."""
     height, width = depth.shape
-    camera = points @ view.R.T + view.t
-    z = camera[:, 2]
+    # Column by column: a threaded matrix product of so slim matrices stalls on a busy machine.
+    X, Y, Z = points[:, 0], points[:, 1], points[:, 2]
+    matrix, offset = view.K @ view.R, view.K @ view.t
+    x, y, z = (row[0] * X + row[1] * Y + row[2] * Z + shift for row, shift in zip(matrix, offset, strict=True))
     safe = np.where(z > 0, z, 1.0)
-    image = camera @ view.K.T / safe[:, None]
-    x, y = image[:, 0], image[:, 1]
+    x, y = x / safe, y / safe
     rows = np.nonzero((z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))[0]
     x, y = x[rows], y[rows]
 

@@ -198,9 +198,7 @@ def _ground_corners(cameras: Mapping[str, Camera]) -> FloatArray:
     """Corners of the ground that the pictures show, at the lowest and highest level of the scene."""
     corners = []
     for camera in cameras.values():
-        image = np.array(
-            [[0, 0], [0, camera.height], [camera.width, 0], [camera.width, camera.height]], float
-        )
+        image = np.array([[0, 0], [0, camera.height], [camera.width, 0], [camera.width, camera.height]], float)
         far = camera.back_project(image, np.ones(4)) - camera.centre
         for level in (-_RELIEF / 2, _RELIEF):
             reach = (level - camera.centre[2]) / np.minimum(far[:, 2], -0.05)

@@ -26,9 +26,7 @@ class ShadowMap:
     distance: Float32Array
 
     @classmethod
-    def cast(
-        cls, surfaces: Sequence[Surface], sun: npt.ArrayLike, extent: FloatArray, texel: float
-    ) -> ShadowMap:
+    def cast(cls, surfaces: Sequence[Surface], sun: npt.ArrayLike, extent: FloatArray, texel: float) -> ShadowMap:
         """Map of the shadows of all bounded surfaces.
 
         Parameters

@@ -102,9 +102,7 @@ def sample_sparse_points(
     kept = rng.permutation(np.flatnonzero(seen.sum(axis=0) >= min_track_length))[:count]
     points, seen = points[kept], seen[:, kept]
     indices = tuple(np.flatnonzero(row) for row in seen)
-    observations = tuple(
-        camera.project(points[rows])[0] for camera, rows in zip(cameras, indices, strict=True)
-    )
+    observations = tuple(camera.project(points[rows])[0] for camera, rows in zip(cameras, indices, strict=True))
     return SparsePoints(points, observations, indices)
 
 

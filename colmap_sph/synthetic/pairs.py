@@ -19,9 +19,7 @@ _UP = (0.0, 0.0, 1.0)
 _YARD_DEPTH = 6.0
 
 
-def look_at(
-    eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = _UP
-) -> tuple[FloatArray, FloatArray]:
+def look_at(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = _UP) -> tuple[FloatArray, FloatArray]:
     """Pose of a camera that looks from one point to another.
 
     Parameters

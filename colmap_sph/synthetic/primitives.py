@@ -111,9 +111,7 @@ class Plane(Surface):
     def intersect(self, origins: FloatArray, directions: FloatArray) -> tuple[FloatArray, IntArray]:
         """See `Surface.intersect`."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            distance = (self._normal @ self._point - _dot(self._normal, origins)) / _dot(
-                self._normal, directions
-            )
+            distance = (self._normal @ self._point - _dot(self._normal, origins)) / _dot(self._normal, directions)
         hit = np.isfinite(distance) & (distance > 0)
         if self.half_size is not None:
             offset = origins - self._point.reshape((3,) + (1,) * (origins.ndim - 1))
@@ -274,9 +272,7 @@ def _solid(
     world_normals = normals @ rotation.T
     half = 0.5 * np.asarray(extent)
     hull = anchor + (_SIGNS * half + [0.0, 0.0, half[2]]) @ rotation.T
-    return ConvexPolyhedron(
-        world_normals, offsets + world_normals @ anchor, hull, anchor, tuple(materials), yaw
-    )
+    return ConvexPolyhedron(world_normals, offsets + world_normals @ anchor, hull, anchor, tuple(materials), yaw)
 
 
 def box(

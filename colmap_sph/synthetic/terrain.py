@@ -143,9 +143,7 @@ class Terrain(Surface):
         step = -gap / (directions[2] - x_slope * directions[0] - y_slope * directions[1])
         return step, distance + step
 
-    def _is_small(
-        self, step: FloatArray, distance: FloatArray, directions: FloatArray
-    ) -> npt.NDArray[np.bool_]:
+    def _is_small(self, step: FloatArray, distance: FloatArray, directions: FloatArray) -> npt.NDArray[np.bool_]:
         """Whether Newton's error after this step, at most curvature times its square, is negligible."""
         level_square = directions[0] ** 2 + directions[1] ** 2
         falling = -directions[2] - self.steepest * np.sqrt(level_square)

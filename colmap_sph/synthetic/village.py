@@ -98,9 +98,7 @@ def _plots(count: int, roads: list[Road], rng: np.random.Generator) -> list[Plot
         else:
             centre, yaw = rng.uniform(-1, 1, 2) * _BUILT, rng.uniform(0, np.pi)
         large = rng.random() < 0.28
-        size = (
-            (rng.uniform(13, 19), rng.uniform(10, 12)) if large else (rng.uniform(9, 12), rng.uniform(7, 9))
-        )
+        size = (rng.uniform(13, 19), rng.uniform(10, 12)) if large else (rng.uniform(9, 12), rng.uniform(7, 9))
         radius = 0.5 * np.hypot(*size)
         free = np.all(np.abs(centre) < _BUILT) and all(
             np.hypot(*(plot.centre - centre)) > radius + 0.5 * np.hypot(*plot.size) + 1.0 for plot in plots
@@ -168,9 +166,7 @@ def _tree(place: FloatArray, terrain: Terrain, noise: Noise, rng: np.random.Gene
         # The golden angle spreads the boughs evenly about the stem.
         bearing, rise = 2.4 * number + rng.uniform(-0.4, 0.4), rng.uniform(-0.15, 0.75)
         reach = 0.0 if number == 0 else np.sqrt(1.0 - rise**2) * 0.68
-        shift = radius * np.array(
-            [reach * np.cos(bearing), reach * np.sin(bearing), 0.8 * rise * (number > 0)]
-        )
+        shift = radius * np.array([reach * np.cos(bearing), reach * np.sin(bearing), 0.8 * rise * (number > 0)])
         radii = radius * share * np.array([1.0, 1.0, rng.uniform(0.8, 1.1)])
         centre = np.array([*place, ground + 1.1 * radius]) + shift
         leaves = Mottled(noise, colour, 0.27, tuple(rng.uniform(0, 60, 2)), stretch=1.3)
@@ -196,9 +192,7 @@ def _trees(count: int, plots: list[Plot], roads: list[Road], rng: np.random.Gene
     return places
 
 
-def _cars(
-    roads: list[Road], terrain: Terrain, noise: Noise, rng: np.random.Generator
-) -> list[ConvexPolyhedron]:
+def _cars(roads: list[Road], terrain: Terrain, noise: Noise, rng: np.random.Generator) -> list[ConvexPolyhedron]:
     """Cars on both lanes, each a body and a cabin."""
     parts = []
     for road in roads:

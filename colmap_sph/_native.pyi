@@ -1,0 +1,77 @@
+"""The compiled kernels; see `_native/kernels.h` for what they compute and `_native/module.c` for their checks."""
+
+from typing import Any
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+def backends() -> list[str]: ...
+def census(backend: str, padded: Array, valid: Array, census: Array, /) -> None: ...
+def matching_cost(backend: str, reference: Array, target: Array, base: Array, cost: Array, /) -> None: ...
+def aggregation(
+    backend: str,
+    cost: Array,
+    base: Array,
+    image: Array,
+    p1: int,
+    p2: Array,
+    max_slant: int,
+    aggregated: Array,
+    /,
+) -> None: ...
+def selection(
+    backend: str,
+    aggregated: Array,
+    base: Array,
+    reference: Array,
+    target: Array,
+    max_difference: int,
+    offset: Array,
+    /,
+) -> None: ...
+def transfer_disparity(left: Array, max_step: float, right: Array, /) -> None: ...
+def depth_candidates(
+    disparity: Array,
+    rectified_from_pixel: Array,
+    scales: tuple[float, float],
+    origins: tuple[float, float],
+    disparity_origin: float,
+    baseline: float,
+    disparity_sigma: float,
+    max_disparity_step: float,
+    spherical: bool,
+    is_left: bool,
+    first_row: int,
+    depth: Array,
+    sigma: Array,
+    /,
+) -> None: ...
+def vote_depth(
+    depths: Array, sigmas: Array, tolerance: float, depth: Array, sigma: Array, support: Array, /
+) -> None: ...
+def check_consistency(
+    depth: Array,
+    sigma: Array,
+    partner_depth: Array,
+    partner_sigma: Array,
+    partner_from_reference: Array,
+    reference_from_partner: Array,
+    max_reprojection_error: float,
+    tolerance: float,
+    agreeing: Array,
+    contradicting: Array,
+    weighted_depth: Array,
+    weight: Array,
+    /,
+) -> None: ...
+def fit_planes(
+    inverse_depth: Array,
+    inverse_sigma: Array,
+    K: Array,
+    radius: int,
+    tolerance: float,
+    normals: Array,
+    fitted_depth: Array,
+    /,
+) -> None: ...

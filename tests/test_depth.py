@@ -1,0 +1,496 @@
+"""Depth from disparities against exact geometry, the vote and the consistency check against the oracle."""
+
+from dataclasses import replace
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from rendered import (
+    disparities,
+    exact_disparity,
+    pixel_rays,
+    scene_of,
+    scene_of_pair,
+    surface_points,
+)
+
+from colmap_sph import _native
+from colmap_sph import synthetic as syn
+from colmap_sph.depth import (
+    DepthEstimate,
+    DepthOptions,
+    PairDisparity,
+    check_depth,
+    depth_candidates,
+    estimate_depth,
+    right_disparity,
+)
+from colmap_sph.errors import OptionError
+from colmap_sph.rectification import RectificationOptions, RectifiedPair, rectify_pair
+from colmap_sph.scene import View
+
+SPHERE, FRAME = RectificationOptions(), RectificationOptions(rectification="frame")
+OPTIONS = DepthOptions(
+    disparity_sigma=0.3,
+    max_disparity_step=2.0,
+    vote_tolerance=3.0,
+    min_support=1,
+    max_reprojection_error=1.0,
+    consistency_tolerance=4.0,
+    min_consistent=2,
+    max_contradiction=1.0,
+)
+SIZE = (160, 120)
+RENDERED = {
+    "convergent": syn.convergent_pair(20.0, focal_length=200.0, size=SIZE),
+    "widely convergent": syn.convergent_pair(60.0, focal_length=200.0, size=SIZE),
+    "forward": syn.forward_motion_pair(1.0, focal_length=160.0, size=SIZE),
+    "epipole inside": syn.epipole_inside_pair(1.0, focal_length=160.0, size=SIZE),
+}
+CASES = [*((name, SPHERE) for name in RENDERED), ("convergent", FRAME)]
+every_case = pytest.mark.parametrize(
+    ("name", "options"), CASES, ids=[f"{name} {options.rectification}" for name, options in CASES]
+)
+both_sides = pytest.mark.parametrize("side", ["left", "right"])
+property_test = settings(max_examples=30, deadline=None, derandomize=True)
+
+
+# ---- triangulation -----------------------------------------------------------------------------------------
+
+
+def triangulate_pixel(view, pair, side, column, row, disparity, options=OPTIONS):
+    """Depth and sigma of one pixel for a disparity in float64.
+
+    The disparity map holds float32: what rounding takes away goes to the pair's origin.
+    """
+    K = view.K - np.array([[0, 0, column], [0, 0, row], [0, 0, 0]])
+    rounded = np.float32(disparity)
+    exact = replace(pair, left_origin=pair.left_origin + (disparity - float(rounded)))
+    flat = np.full((pair.height, pair.width(side)), rounded)
+    depth, sigma = depth_candidates(replace(view, K=K, width=1, height=1), flat, exact, side, options)
+    return float(depth[0, 0]), float(sigma[0, 0])
+
+
+@every_case
+@both_sides
+def test_exact_disparity_gives_exact_depth(name, options, side):
+    """Relative error below 1e-6 at COLMAP's pixel origin, all over the image and for either side."""
+    synthetic = RENDERED[name]
+    scene, left, right = scene_of_pair(synthetic)
+    pair = rectify_pair(scene, left, right, options)
+    view = left if side == "left" else right
+    truth, _, _ = syn.exact_geometry(synthetic.surfaces, getattr(synthetic, side), origin=0.0)
+    exact = disparities(pair, left, right, surface_points(view, truth, 0.0).reshape(-1, 3))[0]
+    exact = exact.reshape(truth.shape)
+    checked = 0
+    for row in range(0, view.height, 8):
+        for column in range(0, view.width, 8):
+            depth, sigma = triangulate_pixel(view, pair, side, column, row, exact[row, column])
+            if truth[row, column] > 0 and depth > 0:
+                assert abs(depth / truth[row, column] - 1) < 1e-6
+                assert sigma > 0
+                checked += 1
+    assert checked > 0.9 * (truth[::8, ::8] > 0).sum()
+
+
+@every_case
+@both_sides
+def test_sigma_is_the_slope_of_depth_over_disparity(name, options, side):
+    synthetic = RENDERED[name]
+    scene, left, right = scene_of_pair(synthetic)
+    pair = rectify_pair(scene, left, right, options)
+    view = left if side == "left" else right
+    truth, _, _ = syn.exact_geometry(synthetic.surfaces, getattr(synthetic, side), origin=0.0)
+    exact = disparities(pair, left, right, surface_points(view, truth, 0.0).reshape(-1, 3))[0]
+    for column, row in ((20, 20), (130, 40), (60, 100)):
+        disparity = exact.reshape(truth.shape)[row, column]
+        _, sigma = triangulate_pixel(view, pair, side, column, row, disparity)
+        step = 0.01
+        nearer, _ = triangulate_pixel(view, pair, side, column, row, disparity + step)
+        farther, _ = triangulate_pixel(view, pair, side, column, row, disparity - step)
+        assert sigma == pytest.approx(OPTIONS.disparity_sigma * (farther - nearer) / (2 * step), rel=1e-3)
+
+
+@every_case
+@both_sides
+def test_a_map_of_exact_disparities_gives_the_depth_map(name, options, side):
+    """Read between rectified pixels: only the interpolation's error is left, and no shift of the grid."""
+    synthetic = RENDERED[name]
+    scene, left, right = scene_of_pair(synthetic)
+    pair = rectify_pair(scene, left, right, options)
+    view = left if side == "left" else right
+    disparity, _ = exact_disparity(synthetic.surfaces, left, right, pair, side)
+    depth, sigma = depth_candidates(view, disparity.astype(np.float32), pair, side, OPTIONS)
+    truth, _, _ = syn.exact_geometry(synthetic.surfaces, getattr(synthetic, side), origin=0.0)
+    found = (depth > 0) & (truth > 0)
+    assert found.mean() > 0.9
+    error = np.abs(depth[found] / truth[found] - 1)
+    assert np.median(error) < 2e-5
+    assert np.quantile(error, 0.9) < 1e-3
+    assert not sigma[~(depth > 0)].any()
+
+
+@pytest.mark.parametrize("scale", [100.0, 10_000.0])
+def test_rays_are_found_in_the_map_to_a_millionth_of_a_pixel(scale):
+    """Angles come from an approximation of the arc tangent: where a ray reads the map shows its error."""
+    rng = np.random.default_rng(0)
+    rays = np.concatenate([rng.standard_normal((300, 3)), rng.standard_normal((60, 3)) * [1, 1e-3, 1]])
+    rays = np.concatenate([rays, [[0, 0, 1], [0, 1, 0], [0, 0, -1], [0, -1, 0], [1, 0, 0.1], [0, 1, 1]]])
+    for along_rows in (False, True):
+        # The map's value is 1 at its first pixel and grows by 1 a pixel along one axis.
+        ramp = np.array([[1, 2], [1, 2]], dtype=np.float32)
+        ramp = np.ascontiguousarray(ramp.T) if along_rows else ramp
+        for x, y, z in rays:
+            across = np.hypot(y, z)
+            u, v = np.arctan2(x, across) * scale, np.arctan2(y, z) * scale
+            matrix = np.zeros((3, 3))
+            matrix[:, 2] = x, y, z
+            depth, sigma = np.empty((1, 1), np.float32), np.empty((1, 1), np.float32)
+            origins = (u - 0.3, v - 0.6)
+            _native.depth_candidates(
+                ramp, matrix, (scale, scale), origins, 0.0, 1.0, 1.0, 5.0, True, True, 0, depth, sigma
+            )
+            norm = np.sqrt(x * x + across**2)
+            tangent = across / (float(depth[0, 0]) * norm**2 - x)
+            read = np.arctan(tangent) * scale - 1
+            assert read == pytest.approx(0.6 if along_rows else 0.3, abs=1e-6)
+
+
+def test_disparities_without_a_point_in_front_give_none():
+    synthetic = RENDERED["convergent"]
+    scene, left, right = scene_of_pair(synthetic)
+    for options in (SPHERE, FRAME):
+        pair = rectify_pair(scene, left, right, options)
+        for side, view in (("left", left), ("right", right)):
+            for value in (np.nan, -pair.disparity_origin, -pair.disparity_origin - 5):
+                flat = np.full((pair.height, pair.width(side)), value, dtype=np.float32)
+                depth, sigma = depth_candidates(view, np.nextafter(flat, np.float32(-1e9)), pair, side, OPTIONS)
+                assert not depth.any() and not sigma.any()
+
+
+def test_surfaces_are_not_mixed_across_a_step():
+    """Bilinear within a surface; at a step of more than the limit the nearest pixel's side alone counts."""
+    view = View(1, "a", 200, 8, np.array([[100, 0, 0.0], [0, 100, 0], [0, 0, 1]]), np.eye(3), np.zeros(3), None)
+    pair = RectifiedPair("frame", np.eye(3), 1.0, 100.0, 100.0, 0.25, 0.25, 0.25, 8, 200, 200, 0.0, 50.0)
+    left, right = 10.0, 13.0
+    disparity = np.full((8, 200), left, dtype=np.float32)
+    disparity[:, 50:] = right
+    for step, expected in ((2.0, right), (4.0, 0.25 * left + 0.75 * right)):
+        # Ray 50 reads column 49.75: nearer to column 50.
+        depth, _ = depth_candidates(view, disparity, pair, "left", replace(OPTIONS, max_disparity_step=step))
+        assert 100 / depth[4, 50] == pytest.approx(expected, rel=1e-6)
+        assert 100 / depth[4, 49] == pytest.approx(left, rel=1e-6)
+    disparity[:, 50:] = np.nan
+    depth, _ = depth_candidates(view, disparity, pair, "left", OPTIONS)
+    assert 100 / depth[4, 49] == pytest.approx(left, rel=1e-6) and depth[4, 50] == 0
+
+
+# ---- from the left image to the right ----------------------------------------------------------------------
+
+
+@property_test
+@given(
+    height=st.integers(1, 3),
+    widths=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    spread=st.sampled_from([0, 100, 700, 5000]),
+    quantum=st.sampled_from([1, 128, 256]),
+    holes=st.sampled_from([0.0, 0.2, 1.0]),
+    max_step=st.sampled_from([0.0, 1.0, 2.0, 1000.0]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_transfer_is_the_oracles(height, widths, spread, quantum, holes, max_step, seed):
+    rng = np.random.default_rng(seed)
+    left = rng.integers(-spread, spread + 1, (height, widths[0])) // quantum * (quantum / 256)
+    left = left.astype(np.float32)
+    left[rng.random(left.shape) < holes] = np.nan
+    right = np.zeros((height, widths[1]), dtype=np.float32)
+    _native.transfer_disparity(left, max_step, right)
+    np.testing.assert_allclose(right, oracle.transfer_disparity(left, max_step, widths[1]), atol=1e-4)
+
+
+@pytest.mark.parametrize("name", RENDERED)
+def test_transfer_agrees_with_exact_geometry(name):
+    """The left image's exact map, carried over, is the right image's, where both see the surface."""
+    synthetic = RENDERED[name]
+    scene, left, right = scene_of_pair(synthetic)
+    pair = rectify_pair(scene, left, right, SPHERE)
+    source, seen_by_right = exact_disparity(synthetic.surfaces, left, right, pair, "left")
+    expected, seen_by_left = exact_disparity(synthetic.surfaces, left, right, pair, "right")
+    source[~seen_by_right] = np.nan
+    carried = right_disparity(PairDisparity("a", "b", pair, source.astype(np.float32)), 2.0)
+    assert carried.shape == (pair.height, pair.right_width)
+    both = seen_by_left & ~np.isnan(carried)
+    # Widely convergent: some surfaces take more than three columns on the right for one on the left.
+    assert both.sum() > (0.88 if "widely" in name else 0.95) * seen_by_left.sum()
+    error = np.abs(carried - expected)[both]
+    assert np.median(error) < 0.002
+    assert (error < 0.05).mean() > 0.95
+    assert (~np.isnan(carried) & ~seen_by_left & ~np.isnan(expected)).sum() < 0.05 * both.sum()
+
+
+# ---- the vote ----------------------------------------------------------------------------------------------
+
+
+def vote(depths, sigmas, tolerance):
+    shape = depths.shape[1:]
+    depth, sigma = np.full(shape, 9, np.float32), np.full(shape, 9, np.float32)
+    support = np.full(shape, 9, np.uint8)
+    _native.vote_depth(depths, sigmas, tolerance, depth, sigma, support)
+    return depth, sigma, support
+
+
+@property_test
+@given(
+    count=st.integers(1, 12),
+    surfaces=st.integers(1, 4),
+    holes=st.sampled_from([0.0, 0.4, 1.0]),
+    tolerance=st.sampled_from([0.5, 3.0]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_vote_is_the_oracles(count, surfaces, holes, tolerance, seed):
+    rng = np.random.default_rng(seed)
+    shape = (count, 3, 17)
+    places = rng.uniform(5, 20, (surfaces, *shape[1:]))
+    chosen = np.take_along_axis(places, rng.integers(0, surfaces, shape), axis=0)
+    sigmas = rng.uniform(0.01, 0.5, shape).astype(np.float32)
+    depths = (chosen + sigmas * rng.standard_normal(shape)).astype(np.float32)
+    none = rng.random(shape) < holes
+    depths[none] = rng.choice([0, -1, np.nan], none.sum())
+    depth, sigma, support = vote(depths, sigmas, tolerance)
+    expected_depth, expected_sigma, expected_support, clearance = oracle.vote_depth(depths, sigmas, tolerance)
+    clear = clearance > 1e-4
+    assert clear.mean() > 0.9
+    np.testing.assert_array_equal(support[clear], expected_support[clear])
+    np.testing.assert_allclose(depth[clear], expected_depth[clear], rtol=1e-5)
+    np.testing.assert_allclose(sigma[clear], expected_sigma[clear], rtol=1e-5)
+
+
+def test_the_larger_cluster_wins_and_is_averaged():
+    depths = np.array([7.0, 10.0, 10.2, 9.9, 7.01], dtype=np.float32).reshape(5, 1, 1)
+    sigmas = np.array([0.01, 0.1, 0.2, 0.1, 0.01], dtype=np.float32).reshape(5, 1, 1)
+    depth, sigma, support = vote(depths, sigmas, 3.0)
+    weights = 1 / sigmas[1:4, 0, 0].astype(float) ** 2
+    assert support[0, 0] == 3
+    assert depth[0, 0] == pytest.approx((depths[1:4, 0, 0] * weights).sum() / weights.sum(), rel=1e-6)
+    assert sigma[0, 0] == pytest.approx(weights.sum() ** -0.5, rel=1e-6)
+
+
+def test_more_than_255_candidates_do_not_overflow():
+    depths = np.full((300, 1, 2), 5, dtype=np.float32)
+    depth, _, support = vote(depths, np.full_like(depths, 0.1), 3.0)
+    np.testing.assert_allclose(depth, 5)
+    assert support[0, 0] == 255
+
+
+# ---- consistency between views -----------------------------------------------------------------------------
+
+
+def wall_views(count=5, depth=10.0):
+    """Views side by side that look at the plane z = depth, with exact depth at COLMAP's pixel origin."""
+    K = np.array([[60.0, 0, 32], [0, 60, 24], [0, 0, 1]])
+    views = []
+    for k in range(count):
+        R, t = syn.look_at((0.8 * (k - count // 2), 0.1 * k, 0), (0, 0, depth), up=(0, -1, 0))
+        views.append(View(k + 1, f"{k}", 64, 48, K, R, t, np.zeros(0, dtype=np.int64)))
+    return views, [plane_depth(view, depth) for view in views]
+
+
+def plane_depth(view, depth):
+    column, row = np.meshgrid(np.arange(view.width), np.arange(view.height))
+    rays = pixel_rays(view, column, row)
+    return ((depth - view.center[2]) / rays[:, 2]).reshape(column.shape).astype(np.float32)
+
+
+def estimate(depth, sigma=0.02):
+    depth = depth.astype(np.float32)
+    return DepthEstimate(
+        depth, np.where(depth > 0, np.float32(sigma), np.float32(0)), np.ones(depth.shape, np.uint8)
+    )
+
+
+def check(views, maps, options=OPTIONS):
+    partners = zip(views[1:], maps[1:], strict=True)
+    return check_depth(views[0], estimate(maps[0]), [(v, estimate(m)) for v, m in partners], options)
+
+
+@pytest.mark.parametrize("max_error", [1.0, 0.1])
+@pytest.mark.parametrize("counted", [3, 255])
+@pytest.mark.parametrize("seed", range(2))
+def test_consistency_is_the_oracles(seed, counted, max_error):
+    """Verdicts and weighted sums on noisy, holed depth maps of views that turn and differ."""
+    rng = np.random.default_rng(seed)
+    views, maps = wall_views(3)
+    views[1] = replace(views[1], width=50, height=60, K=np.array([[70.0, 0, 24], [0, 65, 31], [0, 0, 1]]))
+    maps[1] = plane_depth(views[1], 10.0)
+    sigmas = [rng.uniform(0.02, 0.2, depth.shape).astype(np.float32) for depth in maps]
+    for depth, sigma in zip(maps, sigmas, strict=True):
+        depth += (sigma * rng.standard_normal(depth.shape) * rng.choice([1, 5], depth.shape)).astype(np.float32)
+        depth[rng.random(depth.shape) < 0.1] = 0
+        depth[rng.random(depth.shape) < 0.1] *= 0.6
+    reference, partner = views[0], views[1]
+    shape = maps[0].shape
+    agreeing, contradicting = np.full(shape, counted, np.uint8), np.full(shape, counted, np.uint8)
+    weighted, weight = np.full(shape, 0.5, np.float32), np.full(shape, 2, np.float32)
+    forward = np.hstack([partner.R @ reference.R.T @ np.linalg.inv(reference.K), np.zeros((3, 1))])
+    forward[:, 3] = partner.t - partner.R @ reference.R.T @ reference.t
+    back = np.hstack([reference.R @ partner.R.T @ np.linalg.inv(partner.K), np.zeros((3, 1))])
+    back[:, 3] = reference.t - reference.R @ partner.R.T @ partner.t
+    _native.check_consistency(
+        maps[0],
+        sigmas[0],
+        maps[1],
+        sigmas[1],
+        partner.K @ forward,
+        reference.K @ back,
+        max_error,
+        4.0,
+        agreeing,
+        contradicting,
+        weighted,
+        weight,
+    )
+    verdict, carried, spread, clearance = oracle.check_consistency(
+        reference, maps[0], sigmas[0], partner, maps[1], sigmas[1], max_error, 4.0
+    )
+    clear = clearance > 1e-4
+    assert clear.mean() > 0.95 and (verdict > 0).mean() > 0.1 and (verdict < 0).mean() > 0.01
+    # Counts stay at 255 rather than wrap around.
+    np.testing.assert_array_equal(agreeing[clear], np.minimum(counted + (verdict > 0)[clear], 255))
+    np.testing.assert_array_equal(contradicting[clear], np.minimum(counted + (verdict < 0)[clear], 255))
+    agreed = clear & (verdict > 0)
+    np.testing.assert_allclose(weight[agreed] - 2, 1 / spread[agreed] ** 2, rtol=1e-4)
+    sums = (carried - maps[0])[agreed] / spread[agreed] ** 2
+    np.testing.assert_allclose(weighted[agreed] - 0.5, sums, rtol=1e-3, atol=2e-3)
+    assert (weight[verdict <= 0] == 2).all() and (weighted[verdict <= 0] == 0.5).all()
+
+
+def test_exact_maps_confirm_each_other_and_stay_as_they_are():
+    views, maps = wall_views()
+    checked = check(views, maps)
+    kept = checked.depth > 0
+    assert kept.mean() > 0.6
+    np.testing.assert_allclose(checked.depth[kept], maps[0][kept], rtol=1e-4)
+    assert (checked.sigma[kept] < 0.02).all() and not checked.sigma[~kept].any()
+    assert checked.support.max() == 4 and (checked.support[kept] >= OPTIONS.min_consistent).all()
+
+
+def test_averaging_with_partners_reduces_noise():
+    rng = np.random.default_rng(0)
+    views, maps = wall_views()
+    noisy = [depth + np.float32(0.02) * rng.standard_normal(depth.shape).astype(np.float32) for depth in maps]
+    checked = check(views, noisy)
+    kept = checked.support >= 4
+    before, after = (noisy[0] - maps[0])[kept].std(), (checked.depth - maps[0])[kept].std()
+    assert after < 0.6 * before
+    assert checked.sigma[kept].mean() == pytest.approx(0.02 / np.sqrt(5), rel=1e-3)
+
+
+def test_what_too_few_views_confirm_is_dropped():
+    views, maps = wall_views(3)
+    maps[2][:] = 0
+    assert not check(views, maps).depth.any()
+    assert check(views, maps, replace(OPTIONS, min_consistent=1)).depth.any()
+    assert (check(views, maps, replace(OPTIONS, min_consistent=0)).depth > 0).all()
+
+
+GHOST = (slice(18, 30), slice(26, 38))
+
+
+def with_ghost(views, maps, seen_by, depth=5.0):
+    """A patch that floats at z = depth, in the depth maps of some of the views."""
+    corners = surface_points(views[0], plane_depth(views[0], depth), 0.0)[GHOST].reshape(-1, 3)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    for k in seen_by:
+        nearer = plane_depth(views[k], depth)
+        place = surface_points(views[k], nearer, 0.0)
+        inside = ((place >= low - 1e-6) & (place <= high + 1e-6))[..., :2].all(axis=-1)
+        maps[k] = np.where(inside, nearer, maps[k])
+    return maps
+
+
+def test_a_ghost_that_others_see_through_is_dropped():
+    """Two views share the mistake, so it is confirmed twice, but more views see the wall behind it."""
+    views, maps = wall_views(7)
+    views = [views[3], *views[:3], *views[4:]]
+    maps = [maps[3], *maps[:3], *maps[4:]]
+    maps = with_ghost(views, maps, seen_by=(0, 1, 2))
+    inner = (slice(20, 28), slice(28, 36))
+    assert (maps[0][inner] < 6).all()
+    assert not check(views, maps).depth[inner].any()
+    lenient = check(views, maps, replace(OPTIONS, max_contradiction=10.0))
+    assert (lenient.depth[inner] > 0).all() and (lenient.support[inner] == 2).all()
+
+
+def test_an_occluded_point_is_not_contradicted():
+    """A patch hides the wall from four views; the two others confirm it, and nobody looks through it."""
+    views, maps = wall_views(7)
+    views = [views[3], *views[:3], *views[4:]]
+    maps = [maps[3], *maps[:3], *maps[4:]]
+    hidden = with_ghost(views, [m.copy() for m in maps], seen_by=(1, 2, 3, 4))
+    strict = replace(OPTIONS, max_contradiction=0.0)
+    before, after = check(views, maps, strict), check(views, hidden, strict)
+    assert (after.support < before.support).sum() > 50
+    enough = before.support >= 6
+    np.testing.assert_array_equal(after.depth[enough] > 0, before.depth[enough] > 0)
+
+
+# ---- whole views -------------------------------------------------------------------------------------------
+
+
+def exact_pairs(synthetic, views, scene, indices):
+    pairs = []
+    for a, b in indices:
+        geometry = rectify_pair(scene, views[a], views[b], SPHERE)
+        disparity, seen = exact_disparity(synthetic, views[a], views[b], geometry, "left")
+        disparity[~seen] = np.nan
+        pairs.append(PairDisparity(views[a].name, views[b].name, geometry, disparity.astype(np.float32)))
+    return pairs
+
+
+def test_a_view_takes_depth_from_pairs_in_which_it_is_left_or_right():
+    first, second = RENDERED["convergent"], RENDERED["widely convergent"]
+    cameras = (first.left, first.right, second.right)
+    scene = scene_of(first.surfaces, cameras)
+    pairs = exact_pairs(first.surfaces, scene.views, scene, [(0, 1), (1, 2)])
+    view = scene.views[1]
+    truth, _, _ = syn.exact_geometry(first.surfaces, first.right, origin=0.0)
+    result = estimate_depth(view, pairs, OPTIONS)
+    for field, dtype in (("depth", np.float32), ("sigma", np.float32), ("support", np.uint8)):
+        assert getattr(result, field).shape == truth.shape and getattr(result, field).dtype == dtype
+    found = result.depth > 0
+    assert found.mean() > 0.7
+    assert np.median(np.abs(result.depth / truth - 1)[found]) < 1e-4
+    assert (np.abs(result.depth / truth - 1)[found] < 0.005).mean() > 0.97
+    assert (result.support == 2).mean() > 0.4 and result.support.max() == 2
+    stricter = estimate_depth(view, pairs, replace(OPTIONS, min_support=2))
+    np.testing.assert_array_equal(stricter.depth > 0, found & (result.support == 2))
+
+
+def test_a_view_without_pairs_has_no_depth():
+    view = wall_views(1)[0][0]
+    result = estimate_depth(view, [], OPTIONS)
+    assert result.depth.shape == (48, 64)
+    assert not result.depth.any() and not result.support.any()
+    assert not check_depth(view, result, [], OPTIONS).depth.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[
+            (name, value)
+            for name in ("disparity_sigma", "max_disparity_step", "vote_tolerance")
+            for value in (0, -1, np.nan)
+        ],
+        *[(name, np.nan) for name in ("max_reprojection_error", "consistency_tolerance", "max_contradiction")],
+        *[("min_support", value) for value in (0, 256)],
+        *[("min_consistent", value) for value in (-1, 256)],
+        ("max_contradiction", -0.1),
+    ],
+)
+def test_options_out_of_bounds_are_refused(name, value):
+    DepthOptions().check()
+    with pytest.raises(OptionError, match=name):
+        DepthOptions(**{name: value}).check()

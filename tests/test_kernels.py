@@ -1,0 +1,294 @@
+"""The matching kernels against the slow oracle, to the bit, and their boundary against wrong arguments."""
+
+import numpy as np
+import oracle
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from colmap_sph import _native
+
+INT32 = np.iinfo(np.int32)
+BACKENDS = _native.backends()
+DEPTHS = [32, 64, 96, 160]
+SIZES = [(1, 1), (1, 31), (3, 33), (5, 7), (2, 65), (7, 32), (4, 50)]
+PENALTIES = {
+    "default": (10, 30, 120),
+    "none": (0, 0, 0),
+    "free steps": (0, 193, 193),
+    "largest": (193, 193, 193),
+}
+
+property_test = settings(max_examples=40, deadline=None, derandomize=True)
+every_backend = pytest.mark.parametrize("backend", BACKENDS)
+
+
+# ---- input -------------------------------------------------------------------------------------------------
+
+
+def words(rng, shape, invalid):
+    """Random census words, a share of them without content."""
+    census = rng.integers(0, 1 << 62, shape, dtype=np.uint64)
+    census[rng.random(shape) < invalid] = oracle.CENSUS_INVALID
+    return census
+
+
+BASES = {
+    "zero": lambda rng, shape: np.zeros(shape),
+    "left": lambda rng, shape: np.full(shape, -40),
+    "smooth": lambda rng, shape: rng.integers(-2, 3, shape).cumsum(axis=1) - 16,
+    "rough": lambda rng, shape: rng.integers(-70, 40, shape),
+    "jumps": lambda rng, shape: rng.choice([-1000, -33, 0, 31, 1000], shape),
+    "outside": lambda rng, shape: rng.choice([-(10**6), 10**6], shape),
+    "extreme": lambda rng, shape: rng.choice([INT32.min, INT32.min + 1, -16, 0, INT32.max - 1, INT32.max], shape),
+}
+
+
+def bases(rng, shape, kind):
+    return BASES[kind](rng, shape).astype(np.int32)
+
+
+def images(rng, shape, kind):
+    if kind == "flat":
+        return np.full(shape, 77, dtype=np.uint8)
+    values = [0, 255] if kind == "contrast" else [10, 11, 12] if kind == "dull" else np.arange(256)
+    return rng.choice(np.array(values, dtype=np.uint8), shape)
+
+
+def p2_table(rng, p1, least, most):
+    table = rng.integers(least, most + 1, 256).astype(np.uint8)
+    table[0] = most
+    assert p1 <= table.min()
+    return table
+
+
+def run_census(backend, padded, valid):
+    census = np.full(valid.shape, 7, dtype=np.uint64)
+    _native.census(backend, padded, valid, census)
+    return census
+
+
+def run_cost(backend, reference, target, base, depth):
+    cost = np.full((*base.shape, depth), 99, dtype=np.uint8)
+    _native.matching_cost(backend, reference, target, base, cost)
+    return cost
+
+
+def run_aggregation(backend, cost, base, image, p1, p2, max_slant=0):
+    aggregated = np.full(cost.shape, 9999, dtype=np.uint16)
+    _native.aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)
+    return aggregated
+
+
+def run_selection(backend, aggregated, base, reference, target, max_difference):
+    offset = np.full(base.shape, 5, dtype=np.int32)
+    _native.selection(backend, aggregated, base, reference, target, max_difference, offset)
+    return offset
+
+
+sizes = st.tuples(st.integers(1, 4), st.integers(1, 70))
+seeds = st.integers(0, 2**32 - 1)
+shares = st.sampled_from([0.0, 0.3, 1.0])
+
+
+def test_scalar_kernels_are_always_there():
+    assert BACKENDS[-1] == "scalar"
+    assert set(BACKENDS) <= {"avx2", "scalar"}
+
+
+# ---- census ------------------------------------------------------------------------------------------------
+
+
+@every_backend
+@property_test
+@given(size=sizes, kind=st.sampled_from(["flat", "contrast", "dull", "full"]), invalid=shares, seed=seeds)
+def test_census_is_the_oracles(backend, size, kind, invalid, seed):
+    rng = np.random.default_rng(seed)
+    padded = images(rng, (size[0] + 6, size[1] + 8), kind)
+    valid = np.where(rng.random(size) < invalid, 0, rng.integers(1, 256, size)).astype(np.uint8)
+    np.testing.assert_array_equal(run_census(backend, padded, valid), oracle.census(padded, valid))
+
+
+@every_backend
+@pytest.mark.parametrize("value", [0, 127, 128, 255])
+def test_census_compares_as_unsigned_numbers(backend, value):
+    """127 and 128 differ in sign as signed bytes: darker must still mean darker."""
+    padded = np.full((7, 8 + 40), value, dtype=np.uint8)
+    padded[0, :] = 127
+    census = run_census(backend, padded, np.ones((1, 40), dtype=np.uint8))
+    np.testing.assert_array_equal(census, 0b111111111 if value > 127 else 0)
+
+
+# ---- matching cost -----------------------------------------------------------------------------------------
+
+
+@every_backend
+@property_test
+@given(
+    size=sizes,
+    target_width=st.integers(1, 80),
+    depth=st.sampled_from(DEPTHS),
+    kind=st.sampled_from(list(BASES)),
+    invalid=shares,
+    seed=seeds,
+)
+def test_cost_is_the_oracles(backend, size, target_width, depth, kind, invalid, seed):
+    rng = np.random.default_rng(seed)
+    reference, target = words(rng, size, invalid), words(rng, (size[0], target_width), invalid)
+    base = bases(rng, size, kind)
+    np.testing.assert_array_equal(
+        run_cost(backend, reference, target, base, depth),
+        oracle.matching_cost(reference, target, base, depth),
+    )
+
+
+@every_backend
+def test_cost_counts_every_bit(backend):
+    reference = np.zeros((1, 1), dtype=np.uint64)
+    target = np.array([[(1 << k) - 1 for k in range(63)] + [1 << k for k in range(62)]], dtype=np.uint64)
+    cost = run_cost(backend, reference, target, np.zeros((1, 1), dtype=np.int32), 128)
+    np.testing.assert_array_equal(cost[0, 0], [*range(63), *[1] * 62, *[oracle.COST_UNSEEN] * 3])
+
+
+@every_backend
+def test_cost_of_a_shifted_image_vanishes_at_the_shift(backend):
+    rng = np.random.default_rng(0)
+    reference = words(rng, (6, 90), 0)
+    target = np.roll(reference, 9, axis=1)
+    cost = run_cost(backend, reference, target, np.full((6, 90), -3, dtype=np.int32), 32)
+    assert not cost[:, :81, 12].any()
+    assert (np.delete(cost, 12, axis=2) > 0).all()
+
+
+# ---- aggregation -------------------------------------------------------------------------------------------
+
+
+def check_aggregation(backend, rng, cost, base, image, penalties, max_slant=0):
+    p1, least, most = penalties
+    p2 = p2_table(rng, p1, least, most)
+    expected = oracle.aggregation(cost, base, image, p1, p2, max_slant)
+    assert expected.max(initial=0) <= np.iinfo(np.uint16).max
+    aggregated = run_aggregation(backend, cost, base, image, p1, p2, max_slant)
+    np.testing.assert_array_equal(aggregated, expected)
+
+
+@every_backend
+@property_test
+@given(
+    size=sizes,
+    depth=st.sampled_from(DEPTHS),
+    kind=st.sampled_from(list(BASES)),
+    costs=st.sampled_from([(0, 62), (0, 1), (62, 62), (20, 40)]),
+    image=st.sampled_from(["flat", "contrast", "dull", "full"]),
+    penalties=st.sampled_from(list(PENALTIES)),
+    max_slant=st.sampled_from([0, 1, 3, 2**31 - 1]),
+    seed=seeds,
+)
+def test_aggregation_is_the_oracles(backend, size, depth, kind, costs, image, penalties, max_slant, seed):
+    rng = np.random.default_rng(seed)
+    cost = rng.integers(costs[0], costs[1] + 1, (*size, depth)).astype(np.uint8)
+    check_aggregation(
+        backend, rng, cost, bases(rng, size, kind), images(rng, size, image), PENALTIES[penalties], max_slant
+    )
+
+
+@every_backend
+@pytest.mark.parametrize("penalties", PENALTIES.values(), ids=PENALTIES)
+@pytest.mark.parametrize("shift", [0, 1, 30, 31, 32, 33, 34, 1024, 1025, 1026])
+def test_aggregation_at_shifts_about_the_range(backend, shift, penalties):
+    """Neighbours' ranges that overlap by many, one, or no disparity, in both directions."""
+    rng = np.random.default_rng(shift)
+    cost = rng.integers(0, 63, (3, 6, 32)).astype(np.uint8)
+    base = (shift * rng.integers(-1, 2, (3, 6))).astype(np.int32)
+    check_aggregation(backend, rng, cost, base, images(rng, (3, 6), "contrast"), penalties)
+
+
+@every_backend
+def test_aggregation_saturates_where_ranges_keep_jumping(backend):
+    """Without common disparities a path's least cost grows to 62 + P2: the next P2 must not wrap around."""
+    rng = np.random.default_rng(0)
+    base = (1000 * rng.integers(0, 4, (6, 40))).astype(np.int32)
+    cost = np.full((6, 40, 32), 62, dtype=np.uint8)
+    check_aggregation(backend, rng, cost, base, images(rng, (6, 40), "flat"), (10, 120, 120))
+
+
+@every_backend
+def test_aggregation_of_one_pixel_is_eight_times_its_cost(backend):
+    cost = np.arange(32, dtype=np.uint8).reshape(1, 1, 32)
+    zero = np.zeros((1, 1), dtype=np.int32)
+    aggregated = run_aggregation(backend, cost, zero, zero.astype(np.uint8), 3, np.full(256, 9, dtype=np.uint8))
+    np.testing.assert_array_equal(aggregated, 8 * cost.astype(np.uint16))
+
+
+# ---- selection ---------------------------------------------------------------------------------------------
+
+
+@every_backend
+@property_test
+@given(
+    size=sizes,
+    target_width=st.integers(1, 80),
+    depth=st.sampled_from(DEPTHS),
+    kind=st.sampled_from(list(BASES)),
+    sums=st.sampled_from([(0, 2040), (0, 3), (0, 65535), (65530, 65535), (65535, 65535)]),
+    invalid=st.sampled_from([0.0, 0.2]),
+    max_difference=st.sampled_from([0, 2, INT32.max]),
+    seed=seeds,
+)
+def test_selection_is_the_oracles(backend, size, target_width, depth, kind, sums, invalid, max_difference, seed):
+    rng = np.random.default_rng(seed)
+    aggregated = rng.integers(sums[0], sums[1] + 1, (*size, depth)).astype(np.uint16)
+    reference, target = words(rng, size, invalid), words(rng, (size[0], target_width), invalid)
+    base = bases(rng, size, kind)
+    np.testing.assert_array_equal(
+        run_selection(backend, aggregated, base, reference, target, max_difference),
+        oracle.selection(aggregated, base, reference, target, max_difference),
+    )
+
+
+@every_backend
+def test_selection_finds_a_planted_match(backend):
+    """A cost valley at target column x - 7 + 0.25: found, within the fit's rounding, wherever it is seen."""
+    width, depth = 60, 32
+    slot = np.arange(depth)
+    valley = (100 + 64 * np.abs(slot - 12.25)).astype(np.uint16)
+    aggregated = np.broadcast_to(valley, (2, width, depth)).copy()
+    base = np.full((2, width), -19, dtype=np.int32)
+    content = np.zeros((2, width), dtype=np.uint64)
+    offset = run_selection(backend, aggregated, base, content, content, 2)
+    np.testing.assert_array_equal(offset[:, :7], oracle.OFFSET_INVALID)
+    np.testing.assert_array_equal(offset[:, 7:], -7 * 256 + 64)
+
+
+@every_backend
+@pytest.mark.parametrize("width", [65535])
+def test_selection_reaches_the_widest_row(backend, width):
+    """Columns are kept in 16 bits: the last of 65535 must still be told from the first."""
+    aggregated = np.full((1, width, 32), 50, dtype=np.uint16)
+    aggregated[..., 16] = 7
+    base = np.full((1, width), -16, dtype=np.int32)
+    content = np.zeros((1, width), dtype=np.uint64)
+    offset = run_selection(backend, aggregated, base, content, content, 0)
+    np.testing.assert_array_equal(offset, 0)
+
+
+# ---- the whole chain ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("depth", DEPTHS)
+def test_the_chain_does_not_depend_on_the_backend(size, depth):
+    rng = np.random.default_rng(depth + size[1])
+    left, right = (images(rng, (size[0] + 6, width + 8), "full") for width in (size[1], size[1] + 5))
+    base = bases(rng, size, "rough")
+    results = []
+    for backend in BACKENDS:
+        a = run_census(backend, left, np.ones(size, dtype=np.uint8))
+        b = run_census(backend, right, np.ones((size[0], size[1] + 5), dtype=np.uint8))
+        cost = run_cost(backend, a, b, base, depth)
+        image = np.ascontiguousarray(left[3:-3, 4:-4])
+        sums = run_aggregation(backend, cost, base, image, 10, np.full(256, 60, dtype=np.uint8))
+        results.append((cost, sums, run_selection(backend, sums, base, a, b, 2)))
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(first, second)

@@ -1,0 +1,414 @@
+"""The boundary between Python and C: wrong arguments raise, odd ones are survived, nothing crashes."""
+
+import numpy as np
+import oracle
+import pytest
+
+from colmap_sph import _native
+
+BACKENDS = _native.backends()
+every_backend = pytest.mark.parametrize("backend", BACKENDS)
+
+H, W, TARGET, DEPTH = 4, 40, 45, 32
+
+
+def arguments(function):
+    """Valid arguments of every function, by name, outputs last."""
+    f32, f64, u8 = np.float32, np.float64, np.uint8
+    census_pair = {"reference": np.zeros((H, W), np.uint64), "target": np.zeros((H, TARGET), np.uint64)}
+    matrix = np.hstack([np.eye(3), np.zeros((3, 1))])
+    table = {
+        "census": {
+            "backend": "scalar",
+            "padded": np.zeros((H + 6, W + 8), u8),
+            "valid": np.ones((H, W), u8),
+            "out census": np.zeros((H, W), np.uint64),
+        },
+        "matching_cost": {
+            "backend": "scalar",
+            **census_pair,
+            "base": np.zeros((H, W), np.int32),
+            "out cost": np.zeros((H, W, DEPTH), u8),
+        },
+        "aggregation": {
+            "backend": "scalar",
+            "cost": np.zeros((H, W, DEPTH), u8),
+            "base": np.zeros((H, W), np.int32),
+            "image": np.zeros((H, W), u8),
+            "p1": 10,
+            "p2": np.full(256, 60, u8),
+            "max_slant": 2,
+            "out aggregated": np.zeros((H, W, DEPTH), np.uint16),
+        },
+        "selection": {
+            "backend": "scalar",
+            "aggregated": np.zeros((H, W, DEPTH), np.uint16),
+            "base": np.zeros((H, W), np.int32),
+            **census_pair,
+            "max_difference": 2,
+            "out offset": np.zeros((H, W), np.int32),
+        },
+        "transfer_disparity": {
+            "left": np.zeros((H, W), f32),
+            "max_step": 2.0,
+            "out right": np.zeros((H, TARGET), f32),
+        },
+        "depth_candidates": {
+            "disparity": np.zeros((H, W), f32),
+            "rectified_from_pixel": np.eye(3),
+            "scales": (100.0, 100.0),
+            "origins": (0.0, 0.0),
+            "disparity_origin": 3.0,
+            "baseline": 1.0,
+            "disparity_sigma": 0.3,
+            "max_disparity_step": 2.0,
+            "spherical": True,
+            "is_left": True,
+            "first_row": 0,
+            "out depth": np.zeros((5, 6), f32),
+            "out sigma": np.zeros((5, 6), f32),
+        },
+        "vote_depth": {
+            "depths": np.zeros((3, H, W), f32),
+            "sigmas": np.zeros((3, H, W), f32),
+            "tolerance": 3.0,
+            "out depth": np.zeros((H, W), f32),
+            "out sigma": np.zeros((H, W), f32),
+            "out support": np.zeros((H, W), u8),
+        },
+        "check_consistency": {
+            "depth": np.ones((H, W), f32),
+            "sigma": np.ones((H, W), f32),
+            "partner_depth": np.ones((5, 6), f32),
+            "partner_sigma": np.ones((5, 6), f32),
+            "partner_from_reference": matrix,
+            "reference_from_partner": matrix.copy(),
+            "max_error": 1.0,
+            "tolerance": 4.0,
+            "out agreeing": np.zeros((H, W), u8),
+            "out contradicting": np.zeros((H, W), u8),
+            "out weighted_depth": np.zeros((H, W), f32),
+            "out weight": np.zeros((H, W), f32),
+        },
+        "fit_planes": {
+            "inverse_depth": np.ones((H, W), f32),
+            "inverse_sigma": np.ones((H, W), f32),
+            "K": np.eye(3, dtype=f64),
+            "radius": 4,
+            "tolerance": 3.0,
+            "out normals": np.zeros((H, W, 3), f32),
+            "out fitted_depth": np.zeros((H, W), f32),
+        },
+    }
+    return table[function]
+
+
+FUNCTIONS = [
+    "census",
+    "matching_cost",
+    "aggregation",
+    "selection",
+    "transfer_disparity",
+    "depth_candidates",
+    "vote_depth",
+    "check_consistency",
+    "fit_planes",
+]
+MATCHING = FUNCTIONS[:4]
+
+
+def call(function, values):
+    return getattr(_native, function)(*values.values())
+
+
+def each_array(function):
+    return [name for name, value in arguments(function).items() if isinstance(value, np.ndarray)]
+
+
+ARRAYS = [(function, name) for function in FUNCTIONS for name in each_array(function)]
+OUTPUTS = [(function, name) for function, name in ARRAYS if name.startswith("out ")]
+# Axes whose length no other argument fixes, so that any size is right.
+FREE = {
+    ("matching_cost", "target"): {1},
+    ("selection", "target"): {1},
+    ("transfer_disparity", "left"): {1},
+    ("transfer_disparity", "out right"): {1},
+    ("depth_candidates", "disparity"): {0, 1},
+}
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_valid_arguments_are_accepted(function):
+    assert call(function, arguments(function)) is None
+
+
+@pytest.mark.parametrize(("function", "name"), ARRAYS)
+def test_wrong_item_type_is_refused(function, name):
+    right = arguments(function)[name]
+    wrong_types = {np.uint8, np.int8, np.int32, np.uint32, np.int64, np.float32, np.float64, np.complex64}
+    for dtype in wrong_types - {right.dtype.type}:
+        values = {**arguments(function), name: right.astype(dtype)}
+        with pytest.raises(TypeError, match=r"items of type"):
+            call(function, values)
+    for odd in (
+        right.astype(right.dtype.newbyteorder(">")),
+        np.zeros(right.shape, dtype="O"),
+        None,
+        "text",
+        [1],
+    ):
+        if isinstance(odd, np.ndarray) and odd.dtype == right.dtype:
+            continue  # single bytes have no order
+        with pytest.raises(TypeError):
+            call(function, {**arguments(function), name: odd})
+
+
+@pytest.mark.parametrize(("function", "name"), ARRAYS)
+def test_wrong_shape_is_refused(function, name):
+    right = arguments(function)[name]
+    for axis in range(right.ndim):
+        if axis in FREE.get((function, name), ()):
+            continue
+        for shape in (right.shape[axis] + 1, right.shape[axis] - 1, 0):
+            wrong = np.zeros((*right.shape[:axis], shape, *right.shape[axis + 1 :]), right.dtype)
+            with pytest.raises(ValueError, match=r"size|dimensions|disparities"):
+                call(function, {**arguments(function), name: wrong})
+
+
+@pytest.mark.parametrize(("function", "name"), ARRAYS)
+def test_wrong_number_of_dimensions_is_refused(function, name):
+    right = arguments(function)[name]
+    for wrong in (
+        right[..., None],
+        right.ravel() if right.ndim > 1 else right[None],
+        np.zeros((), right.dtype),
+    ):
+        with pytest.raises(ValueError, match="dimensions"):
+            call(function, {**arguments(function), name: np.ascontiguousarray(wrong).reshape(wrong.shape)})
+
+
+@pytest.mark.parametrize(("function", "name"), ARRAYS)
+def test_memory_that_is_not_contiguous_is_refused(function, name):
+    right = arguments(function)[name]
+    strided = np.zeros((*right.shape[:-1], 2 * right.shape[-1]), right.dtype)[..., ::2]
+    backwards = np.zeros_like(right)[..., ::-1]
+    fortran = np.asfortranarray(np.zeros_like(right)) if right.ndim > 1 else strided
+    for wrong in (strided, backwards, fortran):
+        assert wrong.shape == right.shape
+        with pytest.raises(TypeError, match="contiguous"):
+            call(function, {**arguments(function), name: wrong})
+
+
+@pytest.mark.parametrize(("function", "name"), ARRAYS)
+def test_misaligned_memory_is_refused(function, name):
+    right = arguments(function)[name]
+    if right.itemsize == 1:
+        return
+    memory = np.zeros(right.nbytes + 1, dtype=np.uint8)
+    wrong = memory[1:].view(right.dtype).reshape(right.shape)
+    with pytest.raises((TypeError, ValueError)):
+        call(function, {**arguments(function), name: wrong})
+
+
+@pytest.mark.parametrize(("function", "name"), OUTPUTS)
+def test_read_only_output_is_refused(function, name):
+    values = arguments(function)
+    values[name].flags.writeable = False
+    with pytest.raises(TypeError, match="writable"):
+        call(function, values)
+
+
+@pytest.mark.parametrize(("function", "name"), [pair for pair in ARRAYS if pair not in OUTPUTS])
+def test_read_only_input_is_accepted(function, name):
+    values = arguments(function)
+    values[name].flags.writeable = False
+    call(function, values)
+
+
+@pytest.mark.parametrize(("function", "name"), OUTPUTS)
+def test_output_that_overlaps_another_array_is_refused(function, name):
+    for other in each_array(function):
+        if other == name:
+            continue
+        values = arguments(function)
+        first, second = values[name], values[other]
+        # Both in one block of memory, the last item of one under the first of the other.
+        memory = np.full(first.nbytes + second.nbytes, 60, dtype=np.uint8)
+        start = (first.nbytes - 1) // second.itemsize * second.itemsize
+        values[name] = memory[: first.nbytes].view(first.dtype).reshape(first.shape)
+        values[other] = memory[start : start + second.nbytes].view(second.dtype).reshape(second.shape)
+        with pytest.raises(ValueError, match="overlaps"):
+            call(function, values)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_wrong_number_of_arguments_is_refused(function):
+    values = list(arguments(function).values())
+    for wrong in (values[:-1], [*values, None], []):
+        with pytest.raises(TypeError):
+            getattr(_native, function)(*wrong)
+
+
+@pytest.mark.parametrize("function", MATCHING)
+@pytest.mark.parametrize("backend", ["", "AVX2", "avx512", "scalar ", "scälar"])
+def test_unknown_backend_is_refused(function, backend):
+    with pytest.raises(ValueError, match="no kernels named"):
+        call(function, {**arguments(function), "backend": backend})
+
+
+@pytest.mark.parametrize("function", MATCHING)
+def test_backend_must_be_text(function):
+    for backend in (None, 1, b"scalar"):
+        with pytest.raises(TypeError):
+            call(function, {**arguments(function), "backend": backend})
+    with pytest.raises(ValueError, match="null character"):
+        call(function, {**arguments(function), "backend": "scalar\0"})
+
+
+@pytest.mark.parametrize("depth", [0, 1, 31, 33, 48, 1056, 2048])
+def test_number_of_disparities_out_of_bounds_is_refused(depth):
+    volumes = {
+        "matching_cost": ["out cost"],
+        "selection": ["aggregated"],
+        "aggregation": ["cost", "out aggregated"],
+    }
+    for function, names in volumes.items():
+        values = arguments(function)
+        for name in names:
+            values[name] = np.zeros((H, W, depth), values[name].dtype)
+        with pytest.raises(ValueError, match="multiple of 32"):
+            call(function, values)
+
+
+@pytest.mark.parametrize(
+    ("p1", "p2"), [(-1, 60), (256, 60), (266, 60), (10, 194), (10, 255), (61, 60), (194, 194), (-246, 60)]
+)
+def test_penalties_out_of_bounds_are_refused(p1, p2):
+    table = np.full(256, 60, np.uint8)
+    table[255] = p2
+    with pytest.raises(ValueError, match="penalties"):
+        call("aggregation", {**arguments("aggregation"), "p1": p1, "p2": table})
+
+
+@pytest.mark.parametrize("p1", [2**31, -(2**31) - 1, 2**70])
+def test_penalty_beyond_32_bits_is_refused(p1):
+    with pytest.raises(OverflowError):
+        call("aggregation", {**arguments("aggregation"), "p1": p1})
+
+
+def test_negative_left_right_difference_is_refused():
+    with pytest.raises(ValueError, match="left-right"):
+        call("selection", {**arguments("selection"), "max_difference": -1})
+
+
+@pytest.mark.parametrize("radius", [-1, 0, 17, 2**31 - 1])
+def test_window_radius_out_of_bounds_is_refused(radius):
+    with pytest.raises(ValueError, match="radius"):
+        call("fit_planes", {**arguments("fit_planes"), "radius": radius})
+
+
+def test_rows_beyond_16_bits_are_refused():
+    values = arguments("selection")
+    values["target"] = np.zeros((H, 65536), np.uint64)
+    with pytest.raises(ValueError, match="65535"):
+        call("selection", values)
+    wide = {
+        name: np.zeros((1, 65536, *value.shape[2:]), value.dtype)
+        for name, value in values.items()
+        if name in ("aggregated", "base", "reference", "out offset")
+    }
+    with pytest.raises(ValueError, match="65535"):
+        call("selection", {**arguments("selection"), **wide, "target": np.zeros((1, 8), np.uint64)})
+
+
+@every_backend
+@pytest.mark.parametrize("size", [(0, 0), (0, 40), (3, 0)])
+@pytest.mark.parametrize("target_width", [0, 9])
+def test_empty_images_are_no_work(backend, size, target_width):
+    image, base, words = np.zeros(size, np.uint8), np.zeros(size, np.int32), np.zeros(size, np.uint64)
+    target = np.zeros((size[0], target_width), np.uint64)
+    volume, sums = np.zeros((*size, 32), np.uint8), np.zeros((*size, 32), np.uint16)
+    _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.uint8), image, words)
+    _native.matching_cost(backend, words, target, base, volume)
+    _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, sums)
+    _native.selection(backend, sums, base, words, target, 2, np.zeros(size, np.int32))
+
+
+@every_backend
+def test_target_without_columns_is_never_matched(backend):
+    target = np.zeros((H, 0), np.uint64)
+    base, reference = np.zeros((H, W), np.int32), np.zeros((H, W), np.uint64)
+    cost, offset = np.zeros((H, W, DEPTH), np.uint8), np.zeros((H, W), np.int32)
+    _native.matching_cost(backend, reference, target, base, cost)
+    np.testing.assert_array_equal(cost, oracle.COST_UNSEEN)
+    _native.selection(backend, cost.astype(np.uint16), base, reference, target, 2, offset)
+    np.testing.assert_array_equal(offset, oracle.OFFSET_INVALID)
+
+
+@every_backend
+def test_empty_images_of_absurd_width_are_refused_or_no_work(backend):
+    """Sizes whose product overflows fit into no memory, but an array without rows can claim them."""
+    width = 2**56
+    base, p2 = np.empty((0, width), np.int32), np.full(256, 60, np.uint8)
+    volume, image = np.empty((0, width, 32), np.uint8), np.empty((0, width), np.uint8)
+    words = np.empty((0, width), np.uint64)
+    for function, values in {
+        "aggregation": (volume, base, image, 10, p2, 2, volume.astype(np.uint16)),
+        "matching_cost": (words, words, base, volume),
+        "selection": (volume.astype(np.uint16), base, words, words, 2, np.empty((0, width), np.int32)),
+    }.items():
+        with pytest.raises((ValueError, MemoryError)):
+            getattr(_native, function)(backend, *values)
+
+
+@pytest.mark.parametrize("shape", [(0, 0), (0, 7), (7, 0)])
+def test_empty_maps_are_no_work(shape):
+    empty, bytes_ = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)
+    matrix = np.hstack([np.eye(3), np.zeros((3, 1))])
+    partner = np.ones((5, 6), np.float32)
+    right = np.ones((shape[0], 4), np.float32)
+    _native.transfer_disparity(empty, 2.0, right)
+    assert np.isnan(right).all()
+    _native.transfer_disparity(np.ones((shape[0], 4), np.float32), 2.0, empty)
+    geometry = (np.eye(3), (9.0, 9.0), (0.0, 0.0), 1.0, 1.0, 0.3, 2.0, True, True, 0)
+    depth = np.ones((5, 6), np.float32)
+    _native.depth_candidates(empty, *geometry, depth, np.ones_like(depth))
+    assert not depth.any()
+    _native.depth_candidates(partner, *geometry, empty, empty.copy())
+    _native.vote_depth(
+        np.ones((3, *shape), np.float32), np.ones((3, *shape), np.float32), 3.0, empty, empty.copy(), bytes_
+    )
+    for reference, other in ((empty, partner), (partner, empty)):
+        counts = [np.zeros(reference.shape, dtype) for dtype in (np.uint8, np.uint8, np.float32, np.float32)]
+        _native.check_consistency(reference, reference, other, other, matrix, matrix, 1.0, 4.0, *counts)
+        assert not any(count.any() for count in counts)
+    _native.fit_planes(empty, empty, np.eye(3), 4, 3.0, np.zeros((*shape, 3), np.float32), empty.copy())
+
+
+def test_vote_of_no_pairs_is_no_depth():
+    depth, sigma, support = (
+        np.ones((2, 3), np.float32),
+        np.ones((2, 3), np.float32),
+        np.ones((2, 3), np.uint8),
+    )
+    none = np.zeros((0, 2, 3), np.float32)
+    _native.vote_depth(none, none, 3.0, depth, sigma, support)
+    assert not depth.any() and not sigma.any() and not support.any()
+
+
+@pytest.mark.parametrize("odd", [np.nan, np.inf, -np.inf, 0.0, -1.0, 1e30, -1e30, 1e-40])
+def test_numbers_out_of_this_world_do_not_crash(odd):
+    """NaN, infinities and magnitudes beyond any image, everywhere a float goes in."""
+    rng = np.random.default_rng(0)
+    for function in FUNCTIONS[4:]:
+        for mixed in (False, True):
+            values = arguments(function)
+            for name, value in values.items():
+                if isinstance(value, float):
+                    values[name] = odd
+                elif isinstance(value, np.ndarray) and value.dtype.kind == "f" and not name.startswith("out "):
+                    chosen = rng.random(value.shape) < 0.5 if mixed else np.ones(value.shape, bool)
+                    value[chosen] = odd
+            if function == "depth_candidates":
+                values["scales"], values["origins"] = (odd, 100.0), (odd, 0.0)
+            call(function, values)

@@ -1,0 +1,294 @@
+"""Pairs against counts and angles known by construction, and against COLMAP's own on a real block."""
+
+import itertools
+import logging
+import sqlite3
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from colmap_sph.errors import InputError, NoResultError, OptionError
+from colmap_sph.pairs import PairOptions, PairSelection, select_pairs, triangulation_angles
+from colmap_sph.scene import Scene, View, read_scene
+
+K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
+FEW = PairOptions(min_shared_points=1)
+
+
+def view_at(center: Sequence[float], name: str, indices: Sequence[int] = (), R: np.ndarray | None = None) -> View:
+    """A view that looks along +z unless told otherwise."""
+    R = np.eye(3) if R is None else R
+    return View(1, name, 1000, 800, K, R, -R @ np.asarray(center, float), np.array(indices, dtype=np.int64))
+
+
+def partners(selection: PairSelection, name: str) -> list[str]:
+    return [pair.partner for pair in selection.pairs[name]]
+
+
+def without_tracks(scene: Scene, keep_points: bool = False) -> Scene:
+    views = tuple(replace(view, point_indices=np.empty(0, np.int64)) for view in scene.views)
+    return Scene(views, scene.points if keep_points else np.empty((0, 3)))
+
+
+@pytest.fixture
+def line() -> Scene:
+    """Five views a unit apart along x, 10 units from 60 points; view i sees the points 10 i to 10 i + 29.
+
+    Neighbours share 20 points, next but one 10.
+    """
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(-2, 6, (60, 2)), np.full(60, 10.0)])
+    views = [view_at([i, 0, 0], f"{i}.jpg", range(10 * i, min(10 * i + 30, 60))) for i in range(5)]
+    return Scene(tuple(views), points)
+
+
+def test_ranked_by_shared_points(line: Scene) -> None:
+    selection = select_pairs(line, FEW)
+    assert selection.source == "tracks"
+    assert [(p.partner, p.shared_points) for p in selection.pairs["0.jpg"]] == [("1.jpg", 20), ("2.jpg", 10)]
+    expected = [("1.jpg", 20), ("3.jpg", 20), ("0.jpg", 10), ("4.jpg", 10)]
+    assert [(p.partner, p.shared_points) for p in selection.pairs["2.jpg"]] == expected
+    assert selection.without_partner == ()
+
+
+def test_angle_is_the_75th_percentile(line: Scene) -> None:
+    pair = select_pairs(line, FEW).pairs["1.jpg"][0]
+    assert pair.partner == "0.jpg"
+    points = line.points[10:30]
+    to0, to1 = points - [0, 0, 0], points - [1, 0, 0]
+    cosines = (to0 * to1).sum(1) / np.linalg.norm(to0, axis=1) / np.linalg.norm(to1, axis=1)
+    assert pair.angle == pytest.approx(np.percentile(np.degrees(np.arccos(cosines)), 75), rel=1e-9)
+
+
+def test_triangulation_angle_of_known_triangles() -> None:
+    points = np.array([[0.0, 0, 1], [0, 0, 1e6], [0, 0, 0.5]])
+    angles = triangulation_angles(points, np.array([-1.0, 0, 0]), np.array([1.0, 0, 0]))
+    np.testing.assert_allclose(angles, np.degrees(2 * np.arctan(1 / points[:, 2])), rtol=1e-9)
+
+
+def test_number_of_pairs_and_bounds(line: Scene) -> None:
+    assert partners(select_pairs(line, PairOptions(num_pairs=1)), "2.jpg") == ["1.jpg"]
+    assert partners(select_pairs(line, PairOptions(min_shared_points=11)), "2.jpg") == ["1.jpg", "3.jpg"]
+
+
+def test_unique_pairs(line: Scene) -> None:
+    unique = select_pairs(line, FEW).unique_pairs()
+    names = [f"{i}.jpg" for i in range(5)]
+    assert unique == [(a, b) for a in names for b in names if 0 < int(b[0]) - int(a[0]) <= 2]
+
+
+def test_no_parallax_no_pair(line: Scene, caplog: pytest.LogCaptureFixture) -> None:
+    # 1.jpg was taken from the same place as 0.jpg, 4.jpg sees nothing.
+    views = list(line.views)
+    views[1] = view_at([1e-3, 0, 0], "1.jpg", views[1].point_indices.tolist())
+    views[4] = view_at([4, 0, 0], "4.jpg")
+    selection = select_pairs(Scene(tuple(views), line.points), FEW)
+    assert partners(selection, "0.jpg") == ["2.jpg"]
+    assert selection.without_partner == ("4.jpg",)
+    assert "4.jpg has no partner" in caplog.text
+
+
+def test_wide_angles_come_last(line: Scene) -> None:
+    everything = [view_at([x, 0, 0], f"{x}.jpg", range(60)) for x in (0, 8, 3)]
+    far = view_at([30, 0, 0], "30.jpg", range(60))
+    views = tuple(sorted([*everything, far], key=lambda view: view.name))
+    views = tuple(replace(v, point_indices=np.arange(50)) if v.name == "3.jpg" else v for v in views)
+    selection = select_pairs(Scene(views, line.points), PairOptions(num_pairs=3))
+    # 30.jpg shares all points but under more than 60°, 3.jpg only fifty.
+    assert partners(selection, "0.jpg") == ["8.jpg", "3.jpg", "30.jpg"]
+    assert selection.pairs["0.jpg"][2].angle > 60
+    assert partners(select_pairs(Scene(views, line.points), PairOptions(num_pairs=2)), "0.jpg") == [
+        "8.jpg",
+        "3.jpg",
+    ]
+
+
+def test_values_that_are_not_finite(line: Scene) -> None:
+    points = line.points.copy()
+    points[12] = np.nan
+    views = list(line.views)
+    views[3] = view_at([np.nan, 0, 0], "3.jpg", views[3].point_indices.tolist())
+    for scene in (Scene(tuple(views), points), without_tracks(Scene(tuple(views), points))):
+        selection = select_pairs(scene, FEW)
+        assert selection.without_partner == ("3.jpg",)
+        assert all("3.jpg" not in pair for pair in selection.unique_pairs())
+        assert all(np.isfinite(pair.angle) for pairs in selection.pairs.values() for pair in pairs)
+    assert select_pairs(Scene(tuple(views), points), FEW).pairs["0.jpg"][0].shared_points == 19
+
+
+def test_no_pair_at_all(line: Scene) -> None:
+    with pytest.raises(NoResultError, match="shared points"):
+        select_pairs(line, PairOptions(min_shared_points=1000))
+    with pytest.raises(NoResultError):
+        select_pairs(Scene(line.views[:1], line.points), FEW)
+    apart = (view_at([0, 0, 0], "a"), view_at([1, 0, 0], "b", R=np.diag([-1.0, 1, -1])))
+    with pytest.raises(NoResultError, match="frusta"):
+        select_pairs(Scene(apart, np.empty((0, 3))), FEW)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        PairOptions(num_pairs=0),
+        PairOptions(min_triangulation_angle=-1),
+        PairOptions(min_triangulation_angle=61),
+        PairOptions(max_triangulation_angle=181),
+        PairOptions(min_shared_points=0),
+    ],
+)
+def test_options_out_of_bounds(line: Scene, options: PairOptions) -> None:
+    with pytest.raises(OptionError):
+        select_pairs(line, options)
+
+
+def test_patch_match_cfg_is_obeyed(line: Scene, caplog: pytest.LogCaptureFixture) -> None:
+    explicit = {"4.jpg": ["0.jpg", "gone.jpg"], "2.jpg": 20, "1.jpg": "__all__", "lost.jpg": 20}
+    selection = select_pairs(line, PairOptions(num_pairs=2), explicit=explicit)  # type: ignore[arg-type]
+    assert selection.source == "patch-match.cfg"
+    assert list(selection.pairs) == ["1.jpg", "2.jpg", "4.jpg"]
+    # No gate for what the user wrote; "__auto__" means our choice of our number.
+    assert [(p.partner, p.shared_points) for p in selection.pairs["4.jpg"]] == [("0.jpg", 0)]
+    assert np.isnan(selection.pairs["4.jpg"][0].angle)
+    assert partners(selection, "2.jpg") == ["1.jpg", "3.jpg"]
+    assert partners(selection, "1.jpg") == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
+    assert "gone.jpg" in caplog.text and "lost.jpg" in caplog.text
+
+
+def test_patch_match_cfg_of_colmap_is_no_choice(line: Scene) -> None:
+    automatic = {view.name: 20 for view in line.views}
+    assert select_pairs(line, FEW, explicit=automatic) == select_pairs(line, FEW)
+
+
+def write_database(path: Path, names: Sequence[str], inliers: dict[tuple[int, int], int]) -> None:
+    database = pycolmap.Database.open(path)
+    camera_id = database.write_camera(pycolmap.Camera.create_from_model_name(1, "PINHOLE", 1000.0, 1000, 800))
+    # Ids differ from those of the model.
+    ids = [database.write_image(pycolmap.Image(name, np.empty((0, 2)), camera_id, 0)) for name in names]
+    for (i, j), count in inliers.items():
+        geometry = pycolmap.TwoViewGeometry()
+        geometry.inlier_matches = np.column_stack([np.arange(count)] * 2).astype(np.uint32)
+        database.write_two_view_geometry(ids[i], ids[j], geometry)
+    database.close()
+
+
+def test_database_stands_in_for_tracks(line: Scene, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = tmp_path / "database.db"
+    names = ["unregistered.jpg", *(f"{i}.jpg" for i in reversed(range(5)))]  # index k is view 5 - k
+    write_database(path, names, {(5, 4): 50, (2, 5): 70, (3, 5): 60, (1, 5): 9, (0, 5): 500, (2, 1): 30})
+    before = path.read_bytes()
+    with caplog.at_level(logging.INFO):
+        selection = select_pairs(without_tracks(line), PairOptions(), database=path)
+    assert selection.source == "database"
+    found = [(p.partner, p.shared_points) for p in selection.pairs["0.jpg"]]
+    assert found == [("3.jpg", 70), ("2.jpg", 60), ("1.jpg", 50)]
+    assert partners(selection, "4.jpg") == ["3.jpg"]
+    assert "verified matches in the database" in caplog.text
+    assert path.read_bytes() == before
+    assert select_pairs(line, PairOptions(), database=path).source == "tracks"
+
+
+def test_database_that_cannot_be_read(line: Scene, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"none\.db"):
+        select_pairs(without_tracks(line), FEW, database=tmp_path / "none.db")
+    assert not (tmp_path / "none.db").exists()
+    (tmp_path / "text.db").write_text("no database" * 100)
+    with pytest.raises(InputError, match=r"text\.db"):
+        select_pairs(without_tracks(line), FEW, database=tmp_path / "text.db")
+    sqlite3.connect(tmp_path / "empty.db").close()
+    with pytest.raises(InputError, match=r"empty\.db"):
+        select_pairs(without_tracks(line), FEW, database=tmp_path / "empty.db")
+
+
+def test_real_database(data_dir: Path) -> None:
+    model = pycolmap.Reconstruction(data_dir / "brighton" / "sparse" / "0")
+    for camera in model.cameras.values():
+        camera.params = [*camera.params[:4], 0, 0, 0, 0]
+    views = tuple(
+        View(
+            image.image_id,
+            image.name,
+            2000,
+            1125,
+            model.camera(image.camera_id).calibration_matrix(),
+            image.cam_from_world().rotation.matrix(),
+            image.cam_from_world().translation,
+            np.empty(0, np.int64),
+        )
+        for image in sorted(model.images.values(), key=lambda image: image.name)
+    )
+    database = data_dir / "brighton" / "database.db"
+    selection = select_pairs(Scene(views, np.empty((0, 3))), PairOptions(), database=database)
+    assert selection.source == "database" and selection.without_partner == ()
+    reader = pycolmap.Database.open(database)
+    for pair in selection.pairs["DJI_0024.jpg"]:
+        ids = [
+            image.image_id for image in reader.read_all_images() if image.name in {pair.reference, pair.partner}
+        ]
+        assert pair.shared_points == len(reader.read_two_view_geometry(ids[0], ids[1]).inlier_matches)
+    reader.close()
+
+
+def test_frusta_of_a_regular_strip(caplog: pytest.LogCaptureFixture) -> None:
+    views = tuple(view_at([i, 0, 0], f"{i:02d}.jpg") for i in range(12))
+    with caplog.at_level(logging.INFO):
+        selection = select_pairs(Scene(views, np.empty((0, 3))), PairOptions(num_pairs=4))
+    assert selection.source == "frusta" and "overlap of the viewing frusta" in caplog.text
+    # By symmetry the nearest overlap most.
+    assert set(partners(selection, "05.jpg")) == {"03.jpg", "04.jpg", "06.jpg", "07.jpg"}
+
+
+def test_real_tracks_agree_with_colmap(data_dir: Path) -> None:
+    root = data_dir / "penta"
+    scene, model = read_scene(root / "sparse" / "0"), pycolmap.Reconstruction(root / "sparse" / "0")
+    shared: Counter[tuple[str, str]] = Counter()
+    for point in model.points3D.values():
+        names = sorted({model.image(element.image_id).name for element in point.track.elements})
+        shared.update(itertools.permutations(names, 2))
+    theirs = pycolmap.MVSModel()
+    theirs.read_from_colmap(root, "sparse/0", "images")
+    radians, index = theirs.compute_triangulation_angles(75), theirs.get_image_idx
+    selection = select_pairs(scene, PairOptions())
+    assert all(len(pairs) == 10 for pairs in selection.pairs.values())
+    for name, pairs in selection.pairs.items():
+        for pair in pairs:
+            assert pair.shared_points == shared[name, pair.partner]
+            angle = np.degrees(radians[index(name)][index(pair.partner)])
+            assert pair.angle == pytest.approx(angle, rel=0.05)
+        # Whoever was passed over shares less, or is seen under too wide an angle.
+        for other in model.images.values():
+            if other.name not in partners(selection, name) and shared[name, other.name] > pairs[-1].shared_points:
+                assert np.degrees(radians[index(name)][index(other.name)]) > 59
+
+
+@pytest.mark.parametrize(("keep_points", "share"), [(True, 0.9), (False, 0.8)])
+def test_frusta_agree_with_tracks(data_dir: Path, keep_points: bool, share: float) -> None:
+    scene = read_scene(data_dir / "penta" / "sparse" / "0")
+    best = select_pairs(scene, replace(FEW, num_pairs=20))
+    selection = select_pairs(without_tracks(scene, keep_points), PairOptions())
+    assert selection.source == "frusta"
+    hits = [set(partners(selection, name)) & set(partners(best, name)) for name in selection.pairs]
+    assert np.mean([len(hit) for hit in hits]) / 10 >= share
+
+
+def test_large_block_is_fast() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform([0, 0, 100], [400, 400, 101], (200_000, 3))
+    # 400 views, each of which sees what lies within 30 units.
+    order = np.argsort(points[:, 0])
+    points = points[order]
+    views = []
+    for i in range(400):
+        x, y = 20 * (i % 20) + 10, 20 * (i // 20) + 10
+        first, last = np.searchsorted(points[:, 0], [x - 30, x + 30])
+        near = first + np.flatnonzero(np.abs(points[first:last, 1] - y) < 30)
+        views.append(view_at([x, y, 0], f"{i:03d}.jpg", near.tolist()))
+    start = time.perf_counter()
+    selection = select_pairs(Scene(tuple(views), points), PairOptions())
+    assert time.perf_counter() - start < 10
+    assert set(partners(selection, "210.jpg")[:4]) == {"209.jpg", "211.jpg", "190.jpg", "230.jpg"}
