@@ -17,9 +17,11 @@ from rich.table import Table
 import colmap_sph
 from colmap_sph.demo import run_demo
 from colmap_sph.depth import DepthOptions
-from colmap_sph.errors import ColmapSphError, OutputError
+from colmap_sph.errors import ColmapSphError
+from colmap_sph.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.fusion import FusionOptions
+from colmap_sph.log_file import workspace_log
 from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 from colmap_sph.options import RunOptions
@@ -28,9 +30,7 @@ from colmap_sph.pipeline import run, workspace_root
 from colmap_sph.rectification import RectificationOptions
 from colmap_sph.report import RunReport
 from colmap_sph.undistortion import UndistortionOptions
-from colmap_sph.workspace import MapKind, Workspace, make_dir
-
-logger = logging.getLogger(__name__)
+from colmap_sph.workspace import MapKind, Workspace
 
 PARTIAL_EXIT_CODE = 5
 """The run finished, but some images of the model have no depth map."""
@@ -91,6 +91,7 @@ def main(arguments: list[str] | None = None) -> int:
     commands: dict[str, tuple[type, Callable[..., int]]] = {
         "run": (RunCommand, run_command),
         "demo": (DemoCommand, demo_command),
+        "evaluate": (EvaluateCommand, evaluate_command),
     }
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments and arguments[0] in ("--version", "-V"):
@@ -108,7 +109,6 @@ def main(arguments: list[str] | None = None) -> int:
         try:
             return handler(command, console)
         except ColmapSphError as error:
-            logger.debug("stopped", exc_info=True)
             console.print(f"[bold red]error:[/] {_escaped(error)}", highlight=False, soft_wrap=True)
             return error.exit_code
         except KeyboardInterrupt:
@@ -121,7 +121,7 @@ def run_command(command: RunCommand, console: Console) -> int:
     root = workspace_root(command.model, images=command.images, output=command.output, workspace=command.workspace)
     options = command.options()
     options.check()
-    with _log_file(root, creates=command.model is not None), _Display(console) as display:
+    with workspace_log(Workspace(root), _header(command)), _Display(console) as display:
         report = run(
             command.model,
             images=command.images,
@@ -161,7 +161,7 @@ def print_summary(report: RunReport, workspace: Workspace, console: Console) -> 
 
 def demo_command(command: DemoCommand, console: Console) -> int:
     """`colmap_sph demo`."""
-    with _log_file(command.output / "dense", creates=False), _Display(console) as display:
+    with workspace_log(Workspace(command.output / "dense"), _header(command)), _Display(console) as display:
         result = run_demo(command.output, options=RunOptions(threads=command.threads), progress=display)
     print_summary(result.report, result.workspace, console)
     console.print("\n[bold]Against exact depth[/], in pixels on the ground (GSD)", highlight=False)
@@ -200,6 +200,10 @@ class _Display:
             self._bars.advance(self._task)
 
 
+def _header(command: object) -> str:
+    return f"colmap_sph {colmap_sph.__version__}: {command}"
+
+
 def _escaped(text: object) -> str:
     return str(text).replace("[", r"\[")
 
@@ -209,35 +213,14 @@ def _console_logging(console: Console) -> Iterator[None]:
     """Warnings of the package on the console."""
     package = logging.getLogger("colmap_sph")
     handler = rich.logging.RichHandler(logging.WARNING, console, show_time=False, show_path=False, markup=False)
+    level = package.level
     package.setLevel(logging.INFO)
     package.addHandler(handler)
     try:
         yield
     finally:
         package.removeHandler(handler)
-
-
-@contextmanager
-def _log_file(root: Path, *, creates: bool) -> Iterator[None]:
-    """Everything the package logs, appended to ``colmap_sph/log.txt`` in the workspace."""
-    if not creates and not root.is_dir():
-        yield  # a workspace that does not exist: the run says so
-        return
-    folder = Workspace(root).state_dir
-    make_dir(folder)
-    try:
-        handler = logging.FileHandler(folder / "log.txt", encoding="utf-8")
-    except OSError as error:
-        raise OutputError(f"{folder / 'log.txt'} cannot be written ({error.strerror}).") from error
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    package = logging.getLogger("colmap_sph")
-    package.addHandler(handler)
-    logger.info("colmap_sph %s, arguments %s", colmap_sph.__version__, sys.argv[1:])
-    try:
-        yield
-    finally:
-        package.removeHandler(handler)
-        handler.close()
+        package.setLevel(level)
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.errors import OutputError
 from colmap_sph.evaluation import (
     CloudScores,
     DepthMapScores,
@@ -69,10 +70,12 @@ def run_demo(
     Raises
     ------
     OutputError
-        The folder cannot be written.
+        The folder cannot be written, or holds something else than an earlier demo.
     """
-    options, progress = options or RunOptions(), progress or Silent()
+    options = options or RunOptions()
+    progress = Silent() if progress is None else progress
     shown = progress
+    _make_room(output)
 
     def rendered(done: int, total: int) -> None:
         if done == 1:
@@ -80,7 +83,6 @@ def run_demo(
         shown.advance()
 
     demo = make_demo_block(output, block, threads=options.num_threads, progress=rendered)
-    shutil.rmtree(output / "dense", ignore_errors=True)
     report = run(
         demo.sparse_dir, images=demo.images_dir, output=output / "dense", options=options, progress=progress
     )
@@ -91,6 +93,21 @@ def run_demo(
     cloud = _score_cloud(demo, workspace)
     progress.advance()
     return DemoResult(workspace, report, depth_maps, cloud)
+
+
+def _make_room(output: Path) -> None:
+    """Remove an earlier demo's dense workspace; refuse a folder of any other content."""
+    if not output.exists():
+        return
+    try:
+        if any(output.iterdir()) and not (output / "truth").is_dir():
+            raise OutputError(f"{output} already holds other files; choose another --output for the demo.")
+        if (output / "dense").exists():
+            shutil.rmtree(output / "dense")
+    except OSError as error:
+        raise OutputError(
+            f"The folder {output} cannot be used ({error.strerror or error}); choose another --output."
+        ) from error
 
 
 def score_depth_maps(demo: DemoBlock, workspace: Workspace) -> dict[str, DepthMapScores]:

@@ -25,7 +25,8 @@ class DepthOptions:
     """How a view's pairs become its depth map."""
 
     disparity_sigma: float = 0.35
-    """Standard deviation of a matched disparity, pixels: the scale of every tolerance below."""
+    """Standard deviation, pixels, of a disparity on a smooth surface; where disparities are rough it is larger.
+    The scale of every tolerance below."""
     max_disparity_step: float = 2.0
     """Neighbouring disparities that differ by more than this (pixels) belong to different surfaces."""
     vote_tolerance: float = 3.0
@@ -34,12 +35,10 @@ class DepthOptions:
     """Pairs that must agree on a photometric depth."""
     max_reprojection_error: float = 2.0
     """Two views' depths agree when the point, seen by the other view, projects back within this many pixels."""
-    consistency_tolerance: float = 5.0
+    consistency_tolerance: float = 4.5
     """… and when they differ by less than this many standard deviations."""
     min_consistent: int = 2
     """Views, of those that share a pair with the image, that must confirm a geometric depth."""
-    min_support_alone: int = 2
-    """A depth that only one view confirms is kept where at least this many pairs agree on it."""
     max_contradiction: float = 1.0
     """A depth is dropped when more views look through it than this share of those that confirm it."""
 
@@ -54,9 +53,8 @@ class DepthOptions:
         ):
             if not getattr(self, name) > 0:
                 raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
-        for name in ("min_support", "min_support_alone"):
-            if not 1 <= getattr(self, name) <= 255:
-                raise OptionError(f"{name} must lie in 1..255, not {getattr(self, name)}.")
+        if not 1 <= self.min_support <= 255:
+            raise OptionError(f"min_support must lie in 1..255, not {self.min_support}.")
         if not 0 <= self.min_consistent <= 255:
             raise OptionError(f"min_consistent must lie in 0..255, not {self.min_consistent}.")
         if not self.max_contradiction >= 0:
@@ -227,9 +225,7 @@ def check_depth(
             weight,
         )
     found = estimate.depth > 0
-    enough = agreeing >= options.min_consistent
-    enough |= (agreeing >= 1) & (estimate.support >= options.min_support_alone)
-    kept = found & enough
+    kept = found & (agreeing >= options.min_consistent)
     kept &= contradicting <= options.max_contradiction * agreeing
     with np.errstate(divide="ignore", invalid="ignore"):
         own = 1 / np.square(estimate.sigma)

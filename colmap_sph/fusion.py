@@ -4,7 +4,7 @@ COLMAP's default gates suit its own patch match; ours keep one point per surface
 neighbours two pixels away, which thins a cloud several times.
 """
 
-import logging
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,11 +13,15 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.colmap_log import quiet_colmap
-from colmap_sph.errors import OptionError, OutputError
-from colmap_sph.scene import Scene, View
-from colmap_sph.workspace import MapKind, Workspace, read_depth_map, read_normal_map
+from colmap_sph.errors import InputError, OptionError, OutputError
+from colmap_sph.load_cache import LoadCache
+from colmap_sph.scene import Scene, View, load_model
+from colmap_sph.staging import scratch_folder
+from colmap_sph.workspace import MapKind, Workspace, make_dir, read_depth_map, read_normal_map
 
-logger = logging.getLogger(__name__)
+# What `explain_losses` looks at: partners of a view, and bytes of maps kept in memory.
+_EXPLAINED_PARTNERS = 20
+_CACHE_BYTES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -90,14 +94,24 @@ class GateLosses:
             "max_normal_error": self.normal,
         }
         worst = max(gates, key=lambda name: gates[name])
+        remedy = f"loosen {worst} or min_num_pixels first"
+        if self.unseen > sum(gates.values()):
+            remedy = "check the poses, or fuse the photometric maps, which cover more"
         return (
             f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
             f"by no other depth map, and the rest fail the gates of depth ({self.depth:.0%}), reprojection "
-            f"({self.reprojection:.0%}) and normal ({self.normal:.0%}); loosen {worst} or min_num_pixels first."
+            f"({self.reprojection:.0%}) and normal ({self.normal:.0%}); {remedy}."
         )
 
 
-def fuse(workspace: Workspace, options: FusionOptions, *, threads: int = -1, kind: MapKind = "geometric") -> int:
+def fuse(
+    workspace: Workspace,
+    options: FusionOptions,
+    *,
+    threads: int = -1,
+    kind: MapKind = "geometric",
+    partners: Mapping[str, Sequence[str]] | None = None,
+) -> int:
     """Fuse the workspace's maps with COLMAP's `stereo_fusion` into ``fused.ply`` and ``fused.ply.vis``.
 
     Parameters
@@ -109,6 +123,9 @@ def fuse(workspace: Workspace, options: FusionOptions, *, threads: int = -1, kin
         Threads of COLMAP's fusion; -1: all cores.
     kind : {"geometric", "photometric"}
         Which maps to fuse.
+    partners : mapping of str to sequence of str, optional
+        For each image the images to look for agreement in; without it those that share tracks with it, as in
+        COLMAP, where a model without tracks fuses to nothing.
 
     Returns
     -------
@@ -117,30 +134,87 @@ def fuse(workspace: Workspace, options: FusionOptions, *, threads: int = -1, kin
 
     Raises
     ------
+    InputError
+        A map is missing, or ``fusion.cfg`` is missing or names images that the model does not have.
     OutputError
         The cloud cannot be written.
     """
+    options.check()
     colmap_options = pycolmap.StereoFusionOptions()
     for name in FusionOptions.__dataclass_fields__:
         value = getattr(options, name)
         if name != "mask_path" or value is not None:
             setattr(colmap_options, name, value)
     colmap_options.num_threads = threads
+    _check_maps(workspace, kind)
+    targets = [workspace.root / name for name in ("fused.ply", "fused.ply.vis")]
+    for target in targets:
+        if target.is_dir():
+            raise OutputError(f"{target} is a folder; remove it, the cloud goes there.")
     # COLMAP derives the name of the visibility file from the cloud's: both go to temporary names first.
-    temporary = workspace.state_dir / "fused.ply"
-    visibility = temporary.with_name(temporary.name + ".vis")
-    try:
-        with quiet_colmap():
-            cloud = pycolmap.stereo_fusion(
-                temporary, workspace.root, input_type=kind, options=colmap_options, output_type="PLY"
-            )
-        temporary.replace(workspace.fused_path)
-        visibility.replace(workspace.fused_path.with_name(workspace.fused_path.name + ".vis"))
-    except (OSError, RuntimeError, ValueError) as error:
-        raise OutputError(
-            f"COLMAP's fusion of {workspace.root} failed ({error}); check space and permissions."
-        ) from error
+    scratch = workspace.state_dir / "fusion"
+    with scratch_folder(scratch):
+        try:
+            source = workspace.root if partners is None else _link_with_tracks(workspace, partners, scratch)
+            with quiet_colmap():
+                cloud = pycolmap.stereo_fusion(
+                    scratch / "fused.ply", source, input_type=kind, options=colmap_options, output_type="PLY"
+                )
+            for target in targets:
+                (scratch / target.name).replace(target)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise OutputError(
+                f"COLMAP's fusion cannot write {workspace.fused_path} ({error}); check space and permissions."
+            ) from error
     return int(cloud.num_points3D())
+
+
+def _check_maps(workspace: Workspace, kind: MapKind) -> None:
+    """Raise `InputError` unless every image of ``fusion.cfg`` is in the model and has both maps."""
+    try:
+        names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{workspace.fusion_cfg_path} cannot be read ({error}); list the images in it."
+        ) from error
+    model = load_model(workspace.sparse_dir)
+    registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    for name in filter(None, map(str.strip, names)):
+        if name not in registered:
+            raise InputError(f"{workspace.fusion_cfg_path} names {name!r}, which is not in the model; remove it.")
+        for path in (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)):
+            if not path.is_file():
+                raise InputError(f"The map {path} is missing; compute it, or remove {name!r} from fusion.cfg.")
+
+
+def _link_with_tracks(workspace: Workspace, partners: Mapping[str, Sequence[str]], folder: Path) -> Path:
+    """Make a workspace of links whose model has a track for every pair of `partners`; return `folder`.
+
+    COLMAP's fusion asks the tracks alone which images overlap, and nothing else.
+    """
+    source, model = load_model(workspace.sparse_dir), pycolmap.Reconstruction()
+    pairs = sorted({(min(a, b), max(a, b)) for a, others in partners.items() for b in others})
+    tracks = [pycolmap.Track() for _ in pairs]
+    for camera in source.cameras.values():
+        model.add_camera_with_trivial_rig(camera)
+    for image in (source.image(image_id) for image_id in sorted(source.reg_image_ids())):
+        mine = [track for pair, track in zip(pairs, tracks, strict=True) if image.name in pair]
+        for place, track in enumerate(mine):
+            track.add_element(image.image_id, place)
+        keypoints = np.zeros((len(mine), 2))
+        copy = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
+        model.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for track in tracks:
+        first, second = (model.image(element.image_id) for element in track.elements)
+        # Between the two centres, where a triangulation angle is defined.
+        middle = (first.projection_center() + second.projection_center()) / 2
+        model.add_point3D(middle, track, np.zeros(3, dtype=np.uint8))
+    linked = Workspace(folder)
+    make_dir(linked.sparse_dir)
+    model.write_binary(linked.sparse_dir)
+    linked.images_dir.symlink_to(workspace.images_dir.resolve())
+    linked.stereo_dir.symlink_to(workspace.stereo_dir.resolve())
+    return folder
 
 
 def explain_losses(
@@ -150,17 +224,19 @@ def explain_losses(
     *,
     kind: MapKind = "geometric",
     samples: int = 2000,
-    max_views: int = 30,
+    max_views: int = 10,
 ) -> GateLosses:
     """Find which of fusion's gates stops a sample of depth map pixels.
 
-    Every sampled pixel is projected into the other views, as COLMAP's fusion does for the first pixel of a
-    point; a pixel that too few others confirm is charged to the gate that most of its comparisons failed.
+    Every sampled pixel is projected into the views that share most points with its own, as COLMAP's fusion does
+    for the first pixel of a point; a pixel that too few others confirm is charged to the gate that most of its
+    comparisons failed.
 
     Parameters
     ----------
     workspace : Workspace
     scene : Scene
+        Views with maps.
     options : FusionOptions
     kind : {"geometric", "photometric"}
     samples : int
@@ -172,25 +248,30 @@ def explain_losses(
     -------
     GateLosses
     """
-    maps = {
-        view.name: (
-            read_depth_map(workspace.depth_map_path(view.name, kind)),
-            read_normal_map(workspace.normal_map_path(view.name, kind)),
-        )
-        for view in scene.views[:: max(1, len(scene.views) // max_views)]
-    }
-    views = [view for view in scene.views if view.name in maps]
+
+    def load(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        depth_path, normal_path = workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)
+        return read_depth_map(depth_path), read_normal_map(normal_path)
+
+    maps = LoadCache(load, lambda pair: pair[0].nbytes + pair[1].nbytes, _CACHE_BYTES)
     counts = np.zeros(5)
-    for view in views:
-        points, normals = _sample_points(view, *maps[view.name], samples)
-        verdicts = np.stack(
-            [_verdicts(points, normals, other, *maps[other.name], options) for other in views if other is not view]
-            or [np.zeros((len(points), 4), dtype=bool)]
-        ).sum(axis=0)
+    for view in scene.views[:: -(-len(scene.views) // max_views)]:
+        points, normals = _sample_points(view, *maps.get(view.name), samples)
+        verdicts = np.zeros((len(points), 4), dtype=int)
+        for other in _overlapping(scene, view, min(options.check_num_images, _EXPLAINED_PARTNERS)):
+            verdicts += _verdicts(points, normals, other, *maps.get(other.name), options)
         enough = 1 + verdicts[:, 3] >= options.min_num_pixels
         failed = np.where(verdicts[:, :3].any(axis=1), verdicts[:, :3].argmax(axis=1) + 1, 0)
         counts += np.bincount(np.where(enough, 4, failed), minlength=5)
     return GateLosses(*(counts / max(counts.sum(), 1)))
+
+
+def _overlapping(scene: Scene, view: View, most: int) -> list[View]:
+    """Up to `most` other views, those which share most sparse points with `view` first."""
+    seen = np.zeros(len(scene.points), dtype=bool)
+    seen[view.point_indices] = True
+    others = [other for other in scene.views if other is not view]
+    return sorted(others, key=lambda other: -int(np.count_nonzero(seen[other.point_indices])))[:most]
 
 
 def _sample_points(

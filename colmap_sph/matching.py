@@ -277,4 +277,4 @@ def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDAr
     )
     of_label = np.zeros(int(labels.max()) + 1, dtype=np.float32)
     of_label[labels[valid]] = values[valid]
-    return of_label[labels]
+    return np.asarray(of_label[labels], dtype=np.float32)

@@ -21,7 +21,7 @@ class NormalOptions:
 
     radius: int = 4
     """Radius of the window, pixels."""
-    tolerance: float = 6.0
+    tolerance: float = 3.0
     """Neighbours further from the plane than this many standard deviations hardly count."""
 
     def check(self) -> None:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import OptionError
 from colmap_sph.fusion import FusionOptions
-from colmap_sph.matching import MatchingOptions
+from colmap_sph.matching import MatchingOptions, backend
 from colmap_sph.normals import NormalOptions
 from colmap_sph.pairs import PairOptions
 from colmap_sph.rectification import RectificationOptions
@@ -46,6 +46,7 @@ class RunOptions:
             self.fusion,
         ):
             stage.check()
+        backend()  # what COLMAP_SPH_KERNELS asks for must be there, too
 
     @property
     def num_threads(self) -> int:

@@ -3,10 +3,13 @@
 Disparities are stored in 16 bits, 1/64 pixel apart or as fine as the pair's range allows; 0 = none.
 """
 
+import zipfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_sph.depth import PairDisparity
 from colmap_sph.errors import InputError
@@ -15,6 +18,8 @@ from colmap_sph.workspace import atomic_file
 
 _FINEST_STEP = 1 / 64
 _CODES = 65535
+# What NumPy raises for files that are cut off, garbage, or of other content.
+_DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, TypeError, MemoryError, zipfile.BadZipFile)
 
 
 def write_pair(path: Path, pair: PairDisparity) -> None:
@@ -39,16 +44,20 @@ def write_pair(path: Path, pair: PairDisparity) -> None:
 
 def read_pair(path: Path) -> PairDisparity:
     """Read a pair's disparity map; `InputError` where the file is missing or damaged."""
+    names = tuple(RectifiedPair.__dataclass_fields__)
+    data = read_arrays(path, (*names, "left", "right", "codes", "scale"))
+    fields: dict[str, Any] = {name: data[name] if data[name].ndim else data[name].item() for name in names}
+    (least, step), codes = data["scale"], data["codes"]
+    disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
+    disparity[codes == 0] = np.nan
+    return PairDisparity(str(data["left"]), str(data["right"]), RectifiedPair(**fields), disparity)
+
+
+def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Read the arrays called `names` of an ``.npz`` file; `InputError` where one is missing or damaged."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            fields = {
-                name: data[name] if data[name].ndim else data[name].item()
-                for name in RectifiedPair.__dataclass_fields__
-            }
-            least, step = data["scale"]
-            codes = data["codes"]
-            disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
-            disparity[codes == 0] = np.nan
-            return PairDisparity(str(data["left"]), str(data["right"]), RectifiedPair(**fields), disparity)
-    except (OSError, ValueError, KeyError, EOFError) as error:
+        # Opened here, as NumPy leaves a damaged file open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            return {name: data[name] for name in names}
+    except _DAMAGED as error:
         raise InputError(f"{path} cannot be read ({error}); delete it and run again.") from error

@@ -4,6 +4,7 @@ Stages talk through files in the workspace: disparity maps of pairs, photometric
 deviations, geometric maps, the cloud.
 """
 
+import itertools
 import json
 import logging
 import resource
@@ -13,7 +14,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -28,12 +29,12 @@ from colmap_sph.load_cache import LoadCache
 from colmap_sph.matching import RectifiedImage, match_pair
 from colmap_sph.normals import fit_normals
 from colmap_sph.options import RunOptions
-from colmap_sph.pair_files import read_pair, write_pair
+from colmap_sph.pair_files import read_arrays, read_pair, write_pair
 from colmap_sph.pairs import select_pairs
 from colmap_sph.rectification import rectify_pair, resample
 from colmap_sph.report import Progress, RunReport, Silent
-from colmap_sph.scene import Scene, View, read_scene
-from colmap_sph.undistortion import leave_out_bad_images, open_workspace, prepare_workspace
+from colmap_sph.scene import Scene, View, load_model, read_scene
+from colmap_sph.undistortion import UndistortionOptions, leave_out_bad_images, open_workspace, prepare_workspace
 from colmap_sph.workspace import (
     MapKind,
     SourceImages,
@@ -53,14 +54,16 @@ T = TypeVar("T")
 # Fewer points than this share of the pixels with a geometric depth calls for an explanation.
 _FEW_POINTS = 0.02
 _CACHE_BYTES = 512 << 20
+# Errors that no other item of a stage would be spared.
+_FATAL = (OptionError, OutputError)
 
 
 def run(
-    model: Path | None = None,
+    model: Path | str | None = None,
     *,
-    images: Path | None = None,
-    output: Path | None = None,
-    workspace: Path | None = None,
+    images: Path | str | None = None,
+    output: Path | str | None = None,
+    workspace: Path | str | None = None,
     options: RunOptions | None = None,
     progress: Progress | None = None,
 ) -> RunReport:
@@ -88,20 +91,34 @@ def run(
     ColmapSphError
         Bad input or options, unwritable output, or nothing to reconstruct.
     """
-    options, progress, report = options or RunOptions(), progress or Silent(), RunReport()
+    options, report = options or RunOptions(), RunReport()
+    progress = Silent() if progress is None else progress
     options.check()
     root = workspace_root(model, images=images, output=output, workspace=workspace)
+    if model is None:
+        if options.undistortion != UndistortionOptions():
+            raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
+        with _stage(report, progress, "undistort", 1):
+            dense = open_workspace(root)
+            progress.advance()
+        return reconstruct(dense, options, progress=progress, report=report)
+    model = Path(model)
     with _stage(report, progress, "undistort", 1):
-        dense = (
-            prepare_workspace(Path(model), images, root, options.undistortion) if model else open_workspace(root)
-        )
+        dense = prepare_workspace(model, None if images is None else Path(images), root, options.undistortion)
+        registered = load_model(model)
+        names = [registered.image(image_id).name for image_id in registered.reg_image_ids()]
         progress.advance()
-    database = find_database(Path(model)) if model else None
-    return reconstruct(dense, options, progress=progress, report=report, database=database)
+    return reconstruct(
+        dense, options, progress=progress, report=report, database=find_database(model), expected=names
+    )
 
 
 def workspace_root(
-    model: Path | None, *, images: Path | None, output: Path | None, workspace: Path | None
+    model: Path | str | None,
+    *,
+    images: Path | str | None,
+    output: Path | str | None,
+    workspace: Path | str | None,
 ) -> Path:
     """Folder of the dense workspace that `run` with these arguments works in; `OptionError` for contradictions."""
     if (model is None) == (workspace is None):
@@ -114,7 +131,9 @@ def workspace_root(
     if output is not None:
         return Path(output)
     project = Path(model).resolve()
-    while project.name.isdigit() or project.name == "sparse":
+    if project.name.isdigit():  # sparse/0, but not a project that is called 2024
+        project = project.parent
+    if project.name == "sparse":
         project = project.parent
     return project / "dense"
 
@@ -132,16 +151,19 @@ def reconstruct(
     progress: Progress | None = None,
     report: RunReport | None = None,
     database: Path | None = None,
+    expected: Iterable[str] = (),
 ) -> RunReport:
-    """Match, fuse and check everything in a dense workspace; see `run`."""
-    progress, report = progress or Silent(), report or RunReport()
+    """Match, fuse and check everything in a dense workspace; see `run`.
+
+    Images whose names are `expected` and which the workspace does not have are reported as skipped.
+    """
+    progress, report = Silent() if progress is None else progress, report or RunReport()
     make_dir(workspace.state_dir)
     with _one_opencv_thread():
         whole = read_scene(workspace.sparse_dir)
         scene = leave_out_bad_images(whole, workspace)
-        for view in whole.views:
-            if view.name not in scene.index_of:
-                report.skipped_images[view.name] = "its undistorted image is missing or damaged"
+        for name in sorted({*expected, *whole.index_of} - scene.index_of.keys()):
+            report.skipped_images[name] = "its image is missing, damaged or not of its camera's size; see the log"
         with _stage(report, progress, "select pairs", 1):
             selection = select_pairs(
                 scene,
@@ -151,11 +173,13 @@ def reconstruct(
             )
             report.pair_source = selection.source
             progress.advance()
+        wanted = {*selection.pairs, *itertools.chain(*selection.unique_pairs())}
+        scene = replace(scene, views=tuple(view for view in scene.views if view.name in wanted))
         pairs = match_pairs(workspace, scene, selection.unique_pairs(), options, progress, report)
         partners = _partners(pairs)
         estimate_views(workspace, scene, partners, options, progress, report)
         check_views(workspace, scene, partners, options, progress, report)
-    return fuse_views(workspace, scene, options, progress, report)
+    return fuse_views(workspace, scene, partners, options, progress, report)
 
 
 # ---- stages -------------------------------------------------------------------------------------------------
@@ -192,6 +216,7 @@ def match_pairs(
 
     def skip(pair: tuple[str, str], error: ColmapSphError) -> None:
         report.skipped_pairs[" - ".join(pair)] = str(error)
+        logger.warning("%s - %s skipped: %s", *pair, error)
 
     with _stage(report, progress, "match pairs", len(pairs)):
         matched = _for_all(work, pairs, options.num_threads, progress, skip)
@@ -238,8 +263,11 @@ def check_views(
     estimates = LoadCache(lambda name: _read_estimate(workspace, name), lambda e: 9 * e.depth.size, _CACHE_BYTES)
 
     def work(view: View) -> None:
-        others = ((scene.view(name), estimates.get(name)) for name in partners.get(view.name, []))
-        checked = check_depth(view, estimates.get(view.name), others, options.depth)
+        names = partners.get(view.name, [])
+        others = ((scene.view(name), estimates.get(name)) for name in names)
+        # As in COLMAP, no more views need to confirm a depth than there are.
+        depth_options = replace(options.depth, min_consistent=min(options.depth.min_consistent, len(names)))
+        checked = check_depth(view, estimates.get(view.name), others, depth_options)
         depth = _write_maps(workspace, view, checked, "geometric", options)
         report.coverage[view.name] = float((depth > 0).mean())
 
@@ -249,7 +277,8 @@ def check_views(
     report.images = sum(share > 0 for share in report.coverage.values())
     for view in scene.views:
         if report.coverage[view.name] == 0:
-            report.skipped_images[view.name] = "no depth of it is confirmed by another image"
+            known = "no depth of it is confirmed by another image"
+            report.skipped_images[view.name] = known if view.name in partners else "no pair of it could be matched"
     if not report.images:
         raise NoResultError(
             "No depth was confirmed by a second image; are the model's poses right for these images?"
@@ -257,14 +286,26 @@ def check_views(
 
 
 def fuse_views(
-    workspace: Workspace, scene: Scene, options: RunOptions, progress: Progress, report: RunReport
+    workspace: Workspace,
+    scene: Scene,
+    partners: dict[str, list[str]],
+    options: RunOptions,
+    progress: Progress,
+    report: RunReport,
 ) -> RunReport:
     """Fuse the maps into the cloud; writes ``fused.ply``, ``fused.ply.vis`` and the report."""
     names = [view.name for view in scene.views if report.coverage.get(view.name, 0) > 0]
     write_fusion_cfg(workspace.fusion_cfg_path, names)
     kind = options.fusion_input
+    tracked = any(len(view.point_indices) for view in scene.views)
     with _stage(report, progress, "fuse", 1):
-        report.points = fuse(workspace, options.fusion, threads=options.num_threads, kind=kind)
+        report.points = fuse(
+            workspace,
+            options.fusion,
+            threads=options.num_threads,
+            kind=kind,
+            partners=None if tracked else partners,
+        )
         progress.advance()
     pixels = sum(report.coverage[view.name] * view.width * view.height for view in scene.views)
     if report.points < _FEW_POINTS * pixels:
@@ -275,6 +316,8 @@ def fuse_views(
     )
     with atomic_file(workspace.state_dir / "report.json") as file:
         file.write(json.dumps({"options": asdict(options), **asdict(report)}, indent=1, default=str).encode())
+    if not report.points:
+        raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
 
 
@@ -311,8 +354,8 @@ def _for_all(
 ) -> list:  # type: ignore[type-arg]
     """`work` on all items in worker threads; results in the items' order.
 
-    An item that raises a `ColmapSphError` is handed to `skip` and has no result; any other error, and an output
-    that cannot be written, ends the stage.
+    An item that raises a `ColmapSphError` is handed to `skip` and has no result; any other error, a wrong option
+    and an output that cannot be written end the stage.
     """
     lock = threading.Lock()
     with ThreadPoolExecutor(threads) as pool:
@@ -321,11 +364,10 @@ def _for_all(
             for future in as_completed(futures):
                 error = future.exception()
                 if error is not None:
-                    if skip is None or not isinstance(error, ColmapSphError) or isinstance(error, OutputError):
+                    if skip is None or not isinstance(error, ColmapSphError) or isinstance(error, _FATAL):
                         raise error
                     with lock:
                         skip(futures[future], error)
-                    logger.warning("Skipped: %s", error)
                 progress.advance()
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
@@ -370,12 +412,7 @@ def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:
 
 
 def _read_estimate(workspace: Workspace, name: str) -> DepthEstimate:
-    path = _sigma_path(workspace, name)
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return DepthEstimate(data["depth"], data["sigma"], data["support"])
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"{path} cannot be read ({error}); delete it and run again.") from error
+    return DepthEstimate(**read_arrays(_sigma_path(workspace, name), ("depth", "sigma", "support")))
 
 
 def _write_maps(

@@ -43,8 +43,11 @@ class RectificationOptions:
     """Rectified pixels per pixel of the finer image."""
     min_cosine: float = 0.1
     """Rays closer to the baseline than acos of this (about 6° off the epipole) are left out."""
-    range_margin: float = 1.35
-    """Factor by which the parallaxes of the sparse points are extended on both sides of their range."""
+    near_margin: float = 2.0
+    """Surfaces are looked for down to the distance of the nearest sparse points divided by this: treetops and
+    roofs often carry no sparse point."""
+    far_margin: float = 1.5
+    """… and up to the distance of the farthest sparse points times this."""
     max_pixels_ratio: float = 8.0
     """A pair is given up when its rectified images have more pixels than this times the originals."""
 
@@ -56,8 +59,9 @@ class RectificationOptions:
             raise OptionError(f"sampling must lie in 0.05..4, not {self.sampling}.")
         if not 0.01 <= self.min_cosine <= 0.9:
             raise OptionError(f"min_cosine must lie in 0.01..0.9, not {self.min_cosine}.")
-        if not 1 <= self.range_margin <= 10:
-            raise OptionError(f"range_margin must lie in 1..10, not {self.range_margin}.")
+        for name in ("near_margin", "far_margin"):
+            if not 1 <= getattr(self, name) <= 20:
+                raise OptionError(f"{name} must lie in 1..20, not {getattr(self, name)}.")
         if not 1 <= self.max_pixels_ratio <= 100:
             raise OptionError(f"max_pixels_ratio must lie in 1..100, not {self.max_pixels_ratio}.")
 
@@ -316,7 +320,7 @@ def _lay_out_sphere(
     for view in (left, right):
         low, high = _column_extent(view, rotation, -half, half)
         extents.append((max(low, -limit), min(high, limit)))
-    least, most = _parallax_range(_parallax_angles(left, right, rotation, points), options.range_margin)
+    least, most = _parallax_range(_parallax_angles(left, right, rotation, points), options)
     (left_low, left_high), (right_low, right_high) = _crop(extents, least, most)
     scale = _finest_scale(left, right, points) * options.sampling
     nearest = max(0.0, left_low, -left_high), max(0.0, right_low, -right_high)
@@ -359,7 +363,7 @@ def _lay_out_plane(
     high = min(float(t[:, 1].max()) for t in tangents)
     if high <= low:
         raise RectificationError("the two images share no epipolar plane")
-    least, most = _parallax_range(_parallax_tangents(left, rotation, points, baseline), options.range_margin)
+    least, most = _parallax_range(_parallax_tangents(left, rotation, points, baseline), options)
     extents = [(float(t[:, 0].min()), float(t[:, 0].max())) for t in tangents]
     (left_low, left_high), (right_low, right_high) = _crop(extents, least, most)
     scale = _finest_scale(left, right, points) * options.sampling
@@ -396,13 +400,13 @@ def _parallax_tangents(left: View, rotation: Float, points: Float, baseline: flo
     return np.asarray(baseline / depth[depth > 0])
 
 
-def _parallax_range(parallax: Float, margin: float) -> tuple[float, float]:
+def _parallax_range(parallax: Float, options: RectificationOptions) -> tuple[float, float]:
     """Range to search: robust extremes of the sparse points' parallaxes with a generous margin."""
     if len(parallax) < _MIN_RANGE_POINTS:
         return np.radians(0.3), np.radians(60)
     least, most = np.percentile(parallax, [1, 99])
     least, most = max(float(least), 1e-4), max(float(most), 1e-4)
-    return least / margin, most * margin
+    return least / options.far_margin, most * options.near_margin
 
 
 def _crop(

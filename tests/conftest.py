@@ -1,9 +1,19 @@
 """Fixtures shared by all tests."""
 
 import os
+import shutil
+from dataclasses import dataclass
 from pathlib import Path
 
+import pycolmap
 import pytest
+
+import colmap_sph
+from colmap_sph.synthetic import BlockOptions, DemoBlock, make_demo_block
+
+SMALL_BLOCK = BlockOptions(
+    width=320, height=240, nadir_gsd=0.2, oblique_gsd=0.22, strip_images=3, oblique_images=1, points=1500
+)
 
 
 @pytest.fixture(scope="session")
@@ -14,3 +24,42 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real data not found at {folder}; set COLMAP_SPH_DATA to their folder")
     return folder
+
+
+@pytest.fixture(scope="session")
+def block(tmp_path_factory: pytest.TempPathFactory) -> DemoBlock:
+    """A small rendered block of six vertical and four oblique pictures; not to be changed."""
+    return make_demo_block(tmp_path_factory.mktemp("block"), SMALL_BLOCK, threads=2)
+
+
+@pytest.fixture
+def project(block: DemoBlock, tmp_path: Path) -> Path:
+    """A copy of the block's images and model, to do with as a test likes."""
+    shutil.copytree(block.images_dir, tmp_path / "images")
+    shutil.copytree(block.root / "sparse", tmp_path / "sparse")
+    return tmp_path
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run with default options: its workspace, and its report."""
+
+    dense: Path
+    report: colmap_sph.RunReport
+
+
+@pytest.fixture(scope="session")
+def finished(block: DemoBlock, tmp_path_factory: pytest.TempPathFactory) -> FinishedRun:
+    """The small block reconstructed with default options; not to be changed."""
+    dense = tmp_path_factory.mktemp("finished") / "dense"
+    return FinishedRun(dense, colmap_sph.run(block.sparse_dir, output=dense))
+
+
+def keep_images(project: Path, names: list[str]) -> None:
+    """Leave only images `names` registered in a project's model."""
+    model = pycolmap.Reconstruction(project / "sparse" / "0")
+    for image_id in list(model.reg_image_ids()):
+        image = model.image(image_id)
+        if image.name not in names:
+            model.deregister_frame(image.frame_id)
+    model.write(project / "sparse" / "0")

@@ -70,9 +70,9 @@ def aggregation(cost, base, image, p1, p2, max_slant):
 
 
 def subpixel_offset(before, best, after):
-    """Equiangular fit in 1/256 pixel, rounded towards zero."""
+    """Equiangular fit in 1/256 pixel, rounded towards zero; a cost of zero is a match at the whole pixel."""
     rise = max(before, after) - best
-    return 0 if rise <= 0 else int(np.trunc((before - after) * 128 / rise))
+    return 0 if rise <= 0 or best == 0 else int(np.trunc((before - after) * 128 / rise))
 
 
 def selection(aggregated, base, reference, target, max_difference):

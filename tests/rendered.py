@@ -94,15 +94,15 @@ def exact_disparity(surfaces, left, right, pair, side):
     x, y, depth = source_pixels(view, pair, side)
     inside = (depth > 0) & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
     camera = syn.Camera(view.K, view.R, view.t, view.width, view.height)
-    image = np.column_stack([x[inside], y[inside]])
-    distance = syn.trace_points(surfaces, camera, image).distance
-    points = view.center + distance[:, None] * pixel_rays(view, *image.T)
+    distance = np.full(x.shape, np.inf)
+    distance[inside] = syn.trace_points(surfaces, camera, np.column_stack([x[inside], y[inside]])).distance
+    met = np.isfinite(distance)
+    points = view.center + distance[met][:, None] * pixel_rays(view, x[met], y[met])
     disparity, seen = np.full(x.shape, np.nan), np.zeros(x.shape, dtype=bool)
-    disparity[inside] = np.where(np.isfinite(distance), disparities(pair, left, right, points)[0], np.nan)
+    disparity[met] = disparities(pair, left, right, points)[0]
     pixel, depth = project(other, points)
-    nearest = syn.trace_points(
-        surfaces, syn.Camera(other.K, other.R, other.t, other.width, other.height), pixel
-    ).distance
+    camera = syn.Camera(other.K, other.R, other.t, other.width, other.height)
+    nearest = syn.trace_points(surfaces, camera, pixel).distance
     in_view = (depth > 0) & (pixel > 0).all(axis=1) & (pixel < [other.width, other.height]).all(axis=1)
-    seen[inside] = in_view & (np.abs(nearest - depth) < 1e-6 * depth)
+    seen[met] = in_view & (np.abs(nearest - depth) < 1e-6 * depth)
     return disparity, seen

@@ -301,6 +301,11 @@ def test_negative_left_right_difference_is_refused():
         call("selection", {**arguments("selection"), "max_difference": -1})
 
 
+def test_negative_slant_is_refused():
+    with pytest.raises(ValueError, match="slant"):
+        call("aggregation", {**arguments("aggregation"), "max_slant": -1})
+
+
 @pytest.mark.parametrize("radius", [-1, 0, 17, 2**31 - 1])
 def test_window_radius_out_of_bounds_is_refused(radius):
     with pytest.raises(ValueError, match="radius"):
@@ -412,3 +417,17 @@ def test_numbers_out_of_this_world_do_not_crash(odd):
             if function == "depth_candidates":
                 values["scales"], values["origins"] = (odd, 100.0), (odd, 0.0)
             call(function, values)
+
+
+@pytest.mark.parametrize("u", [np.nextafter(0.5, 0), np.nextafter(-0.5, 0), 0.5, -0.5])
+@pytest.mark.parametrize("size", [(1, 1), (1, 2), (2, 1)])
+def test_rays_at_the_rim_of_a_map_stay_inside(u, size):
+    """The number before 0.5, plus 0.5, rounds to 1: beyond a map of one column or row."""
+    depth, sigma = np.ones((1, 1), np.float32), np.ones((1, 1), np.float32)
+    disparity = np.full(size, 4, np.float32)
+    for x, y in ((u, 0.0), (0.0, u), (u, u)):
+        matrix = np.array([[0, 0, x], [0, 0, y], [0, 0, 1.0]])
+        _native.depth_candidates(
+            disparity, matrix, (1.0, 1.0), (0.0, 0.0), 0.0, 1.0, 1.0, 9.0, False, True, 0, depth, sigma
+        )
+        assert depth[0, 0] in (0.0, 0.25)

@@ -20,6 +20,7 @@ from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError, RectificationError
 from colmap_sph.rectification import (
     RectificationOptions,
+    RectifiedPair,
     pixel_from_rectified_ray,
     rectified_ray_from_pixel,
     rectify_pair,
@@ -231,6 +232,20 @@ def test_valid_pixels_are_those_inside_the_image(name, model):
         np.testing.assert_array_equal((valid > 0)[clear], inside[clear])
 
 
+def test_the_back_of_the_sphere_shows_nothing():
+    """Rays behind the camera project into the image too, but are not seen."""
+    view = view_of(1, *camera((0, 0, 0)), POINTS)
+    scale = 40.0
+    pair = RectifiedPair(
+        "spherical", np.eye(3), 1.0, scale, scale, -np.pi * scale, -1.5 * scale, 0.0, 252, 121, 121, 0.0, 1.0
+    )
+    _, valid = resample(np.zeros((view.height, view.width), np.uint8), view, pair, "left")
+    x, y, depth = source_pixels(view, pair, "left")
+    in_rectangle = (x > 0) & (x < view.width) & (y > 0) & (y < view.height)
+    assert (in_rectangle & (depth < 0)).sum() > 100
+    np.testing.assert_array_equal(valid > 0, in_rectangle & (depth > 0))
+
+
 def test_rows_go_on_past_the_seam():
     """With the epipole inside both images all epipolar planes are there, a band of them twice."""
     left, _, pair, _ = rectified("epipole inside", "spherical")
@@ -329,7 +344,7 @@ def test_sides_beyond_what_can_be_resampled_are_refused():
         ("rectification", "cylindrical"),
         *[("sampling", value) for value in (0.0, 0.04, 4.1, np.nan, np.inf, -1.0)],
         *[("min_cosine", value) for value in (0.0, 0.95, np.nan)],
-        *[("range_margin", value) for value in (0.9, 11.0, np.nan)],
+        *[(name, value) for name in ("near_margin", "far_margin") for value in (0.9, 21.0, np.nan)],
         *[("max_pixels_ratio", value) for value in (0.5, 101.0, np.nan)],
     ],
 )

@@ -51,8 +51,8 @@ typedef struct {
     uint8_t *path;
 } step;
 
-static inline void begin_step(step *s, const uint8_t *slots, uint8_t least, ptrdiff_t difference,
-                              ptrdiff_t depth, uint8_t p2, uint8_t *path) {
+static inline void begin_step(step *s, const uint8_t *slots, uint8_t least, ptrdiff_t difference, ptrdiff_t depth,
+                              uint8_t p2, uint8_t *path) {
     const ptrdiff_t limit = depth + 1;
     s->before = slots + (difference > limit ? limit : difference < -limit ? -limit : difference);
     s->least = _mm256_set1_epi8((char)least);
@@ -122,7 +122,8 @@ static inline void sweep(const uint8_t *cost, const int32_t *base, const uint8_t
                 } else {
                     const ptrdiff_t difference = (ptrdiff_t)base[p] - base[q];
                     begin_step(&steps[k], from->slots + before_x * buffers->stride, from->minima[before_x],
-                               llabs(difference) <= max_slant ? 0 : difference, depth, p2[abs(image[p] - image[q])], path);
+                               llabs(difference) <= max_slant ? 0 : difference, depth,
+                               p2[abs(image[p] - image[q])], path);
                 }
             }
             for (ptrdiff_t i = 0; i < depth; i += DEPTH_STEP) {

@@ -3,10 +3,11 @@
  *     L(p, d) = C(p, d) + min(L(q, d), L(q, d - 1) + P1, L(q, d + 1) + P1, min_k L(q, k) + P2) - min_k L(q, k)
  *
  * q is the pixel before p on the path. d is a column offset into the target, so slot i of p meets slot
- * i + base(p) - base(q) of q; but where the bases differ by no more than `max_slant`, they follow a slanted surface,
- * and slot i meets slot i (an orientation prior as in Scharstein et al. 2017, doi:10.1109/3DV.2017.00033). Slots that q does not have count as 255. 8 bits are enough: with C <= 62 the minimum
- * of the four terms exceeds min_k L by at most P2, so L <= 62 + P2 <= 255. (min_k L itself exceeds 62 where the
- * slots that p and q share do not hold q's minimum.) */
+ * i + base(p) - base(q) of q; but where the bases differ by no more than `max_slant`, they follow a slanted
+ * surface, and slot i meets slot i (an orientation prior as in Scharstein et al. 2017,
+ * doi:10.1109/3DV.2017.00033). Slots that q does not have count as 255. 8 bits are enough: with C <= 62 the
+ * minimum of the four terms exceeds min_k L by at most P2, so L <= 62 + P2 <= 255. (min_k L itself exceeds 62
+ * where the slots that p and q share do not hold q's minimum.) */
 #include <stdlib.h>
 #include <string.h>
 

@@ -7,6 +7,8 @@
 
 #include "kernels.h"
 
+/* Of a disparity's roughness, what counts as its standard deviation (measured on rendered and real blocks). */
+static const double ROUGHNESS_SHARE = 0.5;
 static const double HALF_PI = 1.57079632679489661923;
 
 /* atan2 without branches or library calls, so that the compiler can vectorise it; absolute error < 1e-9. */
@@ -43,19 +45,24 @@ static inline vector ray_of_pixel(const double *m, double column, double row) {
                     m[6] * column + m[7] * row + m[8]};
 }
 
+/* Nearest whole number; not by truncating u + 0.5, which would round the number before 0.5 up to 1. */
+static inline ptrdiff_t nearest(double u) {
+    const double whole = floor(u);
+    return (ptrdiff_t)whole + (u - whole >= 0.5);
+}
+
 /* Interpolates only between disparities of the surface of the nearest pixel; NaN when that pixel has none. */
 static float sample_surface(const float *map, ptrdiff_t height, ptrdiff_t width, double u, double v,
                             double max_step) {
     if (!(u > -0.5 && v > -0.5 && u < (double)width - 0.5 && v < (double)height - 0.5)) {
         return NAN;
     }
-    const ptrdiff_t nearest_x = (ptrdiff_t)(u + 0.5), nearest_y = (ptrdiff_t)(v + 0.5);
-    const float centre = map[nearest_y * width + nearest_x];
+    const ptrdiff_t x0 = (ptrdiff_t)floor(u), y0 = (ptrdiff_t)floor(v);
+    const double fx = u - (double)x0, fy = v - (double)y0;
+    const float centre = map[nearest(v) * width + nearest(u)];
     if (isnan(centre)) {
         return NAN;
     }
-    const ptrdiff_t x0 = (ptrdiff_t)floor(u), y0 = (ptrdiff_t)floor(v);
-    const double fx = u - (double)x0, fy = v - (double)y0;
     double sum = 0, weights = 0;
     for (int k = 0; k < 4; k++) {
         const ptrdiff_t x = x0 + (k & 1), y = y0 + (k >> 1);
@@ -72,8 +79,19 @@ static float sample_surface(const float *map, ptrdiff_t height, ptrdiff_t width,
     return weights > 0 ? (float)(sum / weights) : NAN;
 }
 
+/* How far a disparity lies from the mean of its neighbours, along the axis where that is more: matches in foliage
+ * and at edges are less certain than those on smooth surfaces. A missing neighbour counts as a whole pixel. */
+static double roughness(const float *map, ptrdiff_t height, ptrdiff_t width, double u, double v) {
+    const ptrdiff_t x = nearest(u), y = nearest(v);
+    const float *centre = map + y * width + x;
+    const double across = x > 0 && x + 1 < width ? fabs(*centre - 0.5 * (centre[-1] + centre[1])) : NAN;
+    const double along = y > 0 && y + 1 < height ? fabs(*centre - 0.5 * (centre[-width] + centre[width])) : NAN;
+    return fmax(isnan(across) ? 1 : across, isnan(along) ? 1 : along);
+}
+
 /* Depth and its standard deviation for a ray whose camera z component is 1. */
-static void triangulate_sphere(const pair_geometry *g, vector ray, double disparity, float *depth, float *sigma) {
+static void triangulate_sphere(const pair_geometry *g, vector ray, double disparity, double disparity_sigma,
+                               float *depth, float *sigma) {
     const double delta = (disparity + g->disparity_origin) / g->columns_per_radian;
     if (!(delta > 0 && delta < HALF_PI)) {
         return;
@@ -86,24 +104,24 @@ static void triangulate_sphere(const pair_geometry *g, vector ray, double dispar
     const double slope = g->baseline * cosine * (1 + cotangent * cotangent);
     if (distance > 0) {
         *depth = (float)(distance / norm);
-        *sigma = (float)(slope * g->disparity_sigma / g->columns_per_radian / norm);
+        *sigma = (float)(slope * disparity_sigma / g->columns_per_radian / norm);
     }
 }
 
-static void triangulate_plane(const pair_geometry *g, vector ray, double disparity, float *depth, float *sigma) {
+static void triangulate_plane(const pair_geometry *g, vector ray, double disparity, double disparity_sigma,
+                              float *depth, float *sigma) {
     const double d = disparity + g->disparity_origin;
     if (d > 0 && ray.z > 0) {
         const double z = g->baseline * g->columns_per_radian / d;
         *depth = (float)(z / ray.z);
-        *sigma = (float)(z / d * g->disparity_sigma / ray.z);
+        *sigma = (float)(z / d * disparity_sigma / ray.z);
     }
 }
 
 enum { BLOCK = 256 };
 
-void depth_candidates(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width,
-                      const pair_geometry *g, ptrdiff_t first_row, ptrdiff_t rows, ptrdiff_t columns,
-                      float *depth, float *sigma) {
+void depth_candidates(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width, const pair_geometry *g,
+                      ptrdiff_t first_row, ptrdiff_t rows, ptrdiff_t columns, float *depth, float *sigma) {
     double u[BLOCK], v[BLOCK];
     for (ptrdiff_t n = 0; n < rows * columns; n++) {
         depth[n] = 0;
@@ -131,7 +149,11 @@ void depth_candidates(const float *disparity, ptrdiff_t map_height, ptrdiff_t ma
                 }
                 const ptrdiff_t n = y * columns + start + i;
                 const vector r = ray_of_pixel(g->rectified_from_pixel, (double)(start + i), row);
-                (g->spherical ? triangulate_sphere : triangulate_plane)(g, r, d, depth + n, sigma + n);
+                const double rough = fmin(
+                    roughness(disparity, map_height, map_width, u[i] - g->column_origin, v[i] - g->row_origin),
+                    g->max_disparity_step);
+                const double spread = hypot(g->disparity_sigma, ROUGHNESS_SHARE * rough);
+                (g->spherical ? triangulate_sphere : triangulate_plane)(g, r, d, spread, depth + n, sigma + n);
             }
         }
     }

@@ -63,8 +63,7 @@ void check_consistency(const float *depth, const float *sigma, ptrdiff_t height,
                 transform(transfer->reference_from_pixel, transfer->back_translation, u, v, partner);
             const double du = back.x / back.z - (double)column, dv = back.y / back.z - (double)row;
             const float difference = partner - (float)seen.z;
-            const float gate =
-                tolerance * __builtin_sqrtf(partner_spread * partner_spread + sigma[p] * sigma[p]);
+            const float gate = tolerance * __builtin_sqrtf(partner_spread * partner_spread + sigma[p] * sigma[p]);
             if (back.z > 0 && du * du + dv * dv <= max_error_squared && fabsf(difference) <= gate) {
                 const float w = 1 / (partner_spread * partner_spread);
                 weighted_depth[p] += w * ((float)back.z - depth[p]);

@@ -69,7 +69,7 @@ const kernel_table *kernels_by_name(const char *name);
 /* The fastest table this processor can run. */
 const kernel_table *kernels_best(void);
 
-/* ---- floating-point kernels: one version, so that the result never depends on the processor ------------------ */
+/* ---- floating-point kernels: one version, so that the result never depends on the processor ---------------- */
 
 /* Carry a disparity map from the left image's columns to the right image's, row by row (NaN = none). */
 void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
@@ -77,7 +77,7 @@ void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_widt
 
 /* How to read a rectified pair's disparity along the rays of one of its images. */
 typedef struct {
-    double rectified_from_pixel[9]; /* ray in the rectified frame of pixel (col, row, 1); its z row gives depth 1 */
+    double rectified_from_pixel[9]; /* pixel (col, row, 1) to its ray, of depth 1, in the rectified frame */
     double columns_per_radian, rows_per_radian; /* sphere; focal length in pixels for the planar model */
     double column_origin, row_origin;           /* angle (or tangent) times scale, at array coordinate 0 */
     double disparity_origin;                    /* added to a disparity before it is turned into a parallax */
@@ -90,8 +90,8 @@ typedef struct {
 
 /* z-depth and its standard deviation for rows [first_row, first_row + rows) of a depth map; 0 = none. */
 void depth_candidates(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width,
-                     const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows, ptrdiff_t columns,
-                     float *depth, float *sigma);
+                      const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows, ptrdiff_t columns,
+                      float *depth, float *sigma);
 
 /* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. */
 void vote_depth(const float *depths, const float *sigmas, ptrdiff_t count, ptrdiff_t pixels, float tolerance,
@@ -114,7 +114,7 @@ void check_consistency(const float *depth, const float *sigma, ptrdiff_t height,
 
 /* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
  * depth, and the depth of each plane at its centre; zeros where no plane fits. */
-void fit_planes(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height, ptrdiff_t width, const double *K,
-                int radius, float tolerance, float *normals, float *fitted_depth);
+void fit_planes(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height, ptrdiff_t width,
+                const double *K, int radius, float tolerance, float *normals, float *fitted_depth);
 
 #endif

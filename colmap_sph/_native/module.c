@@ -137,8 +137,7 @@ static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     const uint8_t *p2 = image ? array_get(&arrays, o[3], "p2", U8, 1, READ, lut_shape) : NULL;
     uint16_t *aggregated = p2 ? array_get(&arrays, o[4], "aggregated", U16, 3, WRITE, shape) : NULL;
     if (aggregated && check_depth(shape[2]) && check_width(shape[1]) && check_penalties(p1, p2) &&
-        check(max_slant >= 0, "the slant must not be negative") &&
-        arrays_disjoint(&arrays)) {
+        check(max_slant >= 0, "the slant must not be negative") && arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], 0, shape[2]};
         Py_BEGIN_ALLOW_THREADS;
         status = table->aggregation(cost, base, image, size, (uint8_t)p1, p2, max_slant, aggregated);
@@ -322,7 +321,8 @@ static PyMethodDef methods[] = {
     {"backends", py_backends, METH_NOARGS, "Names of the kernel versions this processor runs, fastest first."},
     {"census", py_census, METH_VARARGS, "census(backend, padded, valid, census)"},
     {"matching_cost", py_matching_cost, METH_VARARGS, "matching_cost(backend, reference, target, base, cost)"},
-    {"aggregation", py_aggregation, METH_VARARGS, "aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)"},
+    {"aggregation", py_aggregation, METH_VARARGS,
+     "aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)"},
     {"selection", py_selection, METH_VARARGS,
      "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},
@@ -333,15 +333,15 @@ static PyMethodDef methods[] = {
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
     {"check_consistency", py_check_consistency, METH_VARARGS,
      "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
-     "reference_from_partner, max_reprojection_error, tolerance, agreeing, contradicting, weighted_depth, weight)"},
+     "reference_from_partner, max_reprojection_error, tolerance, agreeing, contradicting, weighted_depth, "
+     "weight)"},
     {"fit_planes", py_fit_planes, METH_VARARGS,
      "fit_planes(inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
     {NULL, NULL, 0, NULL}};
 
 static PyModuleDef_Slot slots[] = {{0, NULL}};
 
-static struct PyModuleDef definition = {
-    PyModuleDef_HEAD_INIT, .m_name = "_native", .m_doc = "Kernels of colmap_sph.", .m_methods = methods,
-    .m_slots = slots};
+static struct PyModuleDef definition = {PyModuleDef_HEAD_INIT, .m_name = "_native",
+                                        .m_doc = "Kernels of colmap_sph.", .m_methods = methods, .m_slots = slots};
 
 PyMODINIT_FUNC PyInit__native(void) { return PyModuleDef_Init(&definition); }

@@ -50,9 +50,8 @@ static inline int32_t select_pixel(const uint16_t *sums, ptrdiff_t x, int32_t ba
                                    int32_t max_difference) {
     const ptrdiff_t best = first_minimum(sums, size.depth);
     const ptrdiff_t r = x + base + best;
-    if (best == 0 || best == size.depth - 1 || r < 0 || r >= size.target_width ||
-        (target[r] & CENSUS_INVALID) || least[r] == UINT16_MAX ||
-        llabs((int32_t)best_column[r] - x) > max_difference) {
+    if (best == 0 || best == size.depth - 1 || r < 0 || r >= size.target_width || (target[r] & CENSUS_INVALID) ||
+        least[r] == UINT16_MAX || llabs((int32_t)best_column[r] - x) > max_difference) {
         return OFFSET_INVALID;
     }
     return (int32_t)(base + best) * 256 + subpixel_offset(sums[best - 1], sums[best], sums[best + 1]);

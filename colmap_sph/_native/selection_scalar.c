@@ -2,10 +2,11 @@
 
 #include "kernels.h"
 
-/* Equiangular ("V") fit through three costs, 1/256 pixel, within [-128, 128]. */
+/* Equiangular ("V") fit through three costs, 1/256 pixel, within [-128, 128]. Where every path matches to the bit
+ * the images differ by whole pixels: without motion the offset is exactly zero. */
 int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after) {
     const int32_t rise = (before > after ? before : after) - best;
-    if (rise <= 0) {
+    if (rise <= 0 || best == 0) {
         return 0;
     }
     return ((int32_t)before - after) * 128 / rise;
@@ -44,17 +45,15 @@ static int32_t select_pixel(const uint16_t *sums, ptrdiff_t x, int32_t base, con
     }
     const ptrdiff_t r = x + base + best;
     /* At the end of the range the true minimum may lie beyond it. */
-    if (best == 0 || best == size.depth - 1 || r < 0 || r >= size.target_width ||
-        (target[r] & CENSUS_INVALID) || least[r] == UINT16_MAX ||
-        llabs(best_column[r] - x) > max_difference) {
+    if (best == 0 || best == size.depth - 1 || r < 0 || r >= size.target_width || (target[r] & CENSUS_INVALID) ||
+        least[r] == UINT16_MAX || llabs(best_column[r] - x) > max_difference) {
         return OFFSET_INVALID;
     }
     return (int32_t)(base + best) * 256 + subpixel_offset(sums[best - 1], sums[best], sums[best + 1]);
 }
 
 int selection_scalar(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference,
-                     const uint64_t *target, match_size size, int32_t max_left_right_difference,
-                     int32_t *offset) {
+                     const uint64_t *target, match_size size, int32_t max_left_right_difference, int32_t *offset) {
     uint16_t *least = malloc((size_t)size.target_width * sizeof *least);
     int32_t *best_column = malloc((size_t)size.target_width * sizeof *best_column);
     const int failed = !least || !best_column;

@@ -12,12 +12,13 @@ static void put(float *row, ptrdiff_t width, ptrdiff_t column, float disparity) 
 /* Between two neighbouring left pixels of one surface, the right image's columns get interpolated disparities. */
 static void put_segment(float *row, ptrdiff_t width, ptrdiff_t x, float d0, float d1) {
     const float r0 = (float)x - d0, r1 = (float)(x + 1) - d1;
-    if (!(r1 > r0)) {
-        return; /* seen from behind: the left image's order is reversed in the right one */
+    if (!(r1 > r0 && r1 >= 0 && r0 < (float)width)) {
+        return; /* outside, or seen from behind: the left image's order is reversed in the right one */
     }
     const float slope = (d1 - d0) / (r1 - r0);
-    const ptrdiff_t first = (ptrdiff_t)ceilf(r0), last = (ptrdiff_t)floorf(r1);
-    for (ptrdiff_t r = first < 0 ? 0 : first; r <= last && r < width; r++) {
+    const ptrdiff_t first = r0 > 0 ? (ptrdiff_t)ceilf(r0) : 0;
+    const ptrdiff_t end = r1 < (float)width ? (ptrdiff_t)floorf(r1) + 1 : width;
+    for (ptrdiff_t r = first; r < end; r++) {
         put(row, width, r, d0 + ((float)r - r0) * slope);
     }
 }

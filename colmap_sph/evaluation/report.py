@@ -39,7 +39,7 @@ def format_depth_maps(scores: Mapping[str, DepthMapScores]) -> str:
     first = next(iter(scores.values()))
     header = ["image", "coverage", *(f"<= {bound:g} GSD" for bound in first.thresholds), "median [GSD]"]
     with_normals = first.median_normal_angle is not None
-    rows = [header + (["normals [deg]"] if with_normals else [])]
+    rows = [header + (["normals (deg)"] if with_normals else [])]
     means = mean_of_depth_maps(scores)
     for name, one in [*scores.items(), ("mean", means)]:
         row = [

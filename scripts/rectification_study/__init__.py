@@ -1,0 +1,1 @@
+"""Parts of `study_rectification.py`: runs, pairs, clouds, plots, tables."""

@@ -1,0 +1,190 @@
+"""What each pair's disparity map gives, in both rectification models, on the pixels of the original images."""
+
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache, lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.depth import PairDisparity, depth_candidates, right_disparity
+from colmap_sph.evaluation import DepthView, truth_at_pixel_origin, truth_normals_at_pixel_origin
+from colmap_sph.options import RunOptions
+from colmap_sph.pair_files import read_pair
+from colmap_sph.rectification import Model
+from colmap_sph.scene import Scene, View
+from rectification_study.runs import MODELS, Run
+
+CORRECT = 2.0
+"""A depth is correct up to this error, in GSD of its pixel."""
+ANGLE_EDGES = (0.0, 10.0, 25.0, 40.0, 55.0, 75.0, 180.0)
+SLOPE_EDGES = (0.0, 20.0, 45.0, 70.0, 90.0)
+"""Of surfaces against the plane that frame rectification uses, degrees."""
+
+PairScores = dict[str, Any]
+Map = NDArray[np.float32]
+
+
+class ExactMaps:
+    """Exact depth and normals at COLMAP's pixel origin, kept for a while; None for images without."""
+
+    def __init__(self, exact: Sequence[DepthView] | None) -> None:
+        self.views = {view.name: view for view in exact or ()}
+        self.depth = lru_cache(maxsize=40)(self._depth)
+        self.normals = lru_cache(maxsize=20)(self._normals)
+
+    def _depth(self, name: str) -> Map | None:
+        return truth_at_pixel_origin(self.views[name].read_depth()) if name in self.views else None
+
+    def _normals(self, name: str) -> Map | None:
+        view = self.views.get(name)
+        return None if view is None else truth_normals_at_pixel_origin(view.read_depth(), view.K)
+
+    def errors(self, view: View, depth: Map) -> Map:
+        """Error of every pixel in GSD (depth / focal length); NaN without a depth or without exact depth."""
+        error, truth = np.full(depth.shape, np.nan, np.float32), self.depth(view.name)
+        if truth is not None:
+            both = (depth > 0) & (truth > 0)
+            error[both] = np.abs(depth[both] / truth[both] - 1) * np.float32(view.K[0, 0])
+        return error
+
+    def slopes(self, view: View, normal: NDArray[np.float64]) -> Map:
+        """Angle in degrees of every pixel's surface against the plane with a world normal; NaN where none."""
+        normals = self.normals(view.name)
+        if normals is None:
+            return np.full((view.height, view.width), np.nan, np.float32)
+        cosine = np.abs(normals @ (view.R @ normal).astype(np.float32))
+        angle = np.degrees(np.arccos(np.minimum(cosine, np.float32(1))))
+        return np.where(normals.any(axis=2), angle, np.float32(np.nan))
+
+
+@cache
+def pair_files(run: Run) -> dict[tuple[str, str], Path]:
+    """File of every pair that a run matched, by the names of its images."""
+    found = {}
+    for file in sorted((run.workspace.state_dir / "pairs").glob("*.npz")):
+        with np.load(file) as data:
+            found[str(data["left"]), str(data["right"])] = file
+    return found
+
+
+def pair_depths(left: View, right: View, pair: PairDisparity, options: RunOptions) -> tuple[Map, Map]:
+    """Depth of both images' pixels from their pair alone; 0 = none."""
+    carried = right_disparity(pair, options.depth.max_disparity_step)
+    left_depth, _ = depth_candidates(left, pair.disparity, pair.geometry, "left", options.depth)
+    right_depth, _ = depth_candidates(right, carried, pair.geometry, "right", options.depth)
+    return left_depth, right_depth
+
+
+def score_pairs(
+    scene: Scene, runs: Mapping[Model, Run], exact: Sequence[DepthView] | None, options: RunOptions
+) -> list[PairScores]:
+    """Score every pair that either model matched.
+
+    Returns
+    -------
+    list of dict
+        ``left``, ``right``, ``view_angle_deg`` between the viewing directions, and per model either ``skipped``
+        (why), or: ``matched`` pixels of the two original images that the pair gives a depth; ``warped`` pixels,
+        those of the rectified images. With exact depth also ``correct`` pixels, those of every class of slopes
+        where both models matched the pair, ``median_error_gsd``, and that of the pixels which both models match,
+        ``median_error_common_gsd``.
+    """
+    maps = ExactMaps(exact)
+    names = sorted({pair for run in runs.values() for pair in pair_files(run)})
+
+    def score(pair: tuple[str, str]) -> PairScores:
+        views = scene.view(pair[0]), scene.view(pair[1])
+        cosine = float(np.clip(views[0].viewing_direction @ views[1].viewing_direction, -1, 1))
+        found = {m: read_pair(pair_files(run)[pair]) for m, run in runs.items() if pair in pair_files(run)}
+        scores: PairScores = {"left": pair[0], "right": pair[1], "view_angle_deg": np.degrees(np.arccos(cosine))}
+        for model, run in runs.items():
+            reason = run.report["skipped_pairs"].get(" - ".join(pair), "not matched")
+            scores[model] = {"skipped": reason} if model not in found else {}
+        depths = {model: pair_depths(*views, disparity, options) for model, disparity in found.items()}
+        for model, disparity in found.items():
+            geometry = disparity.geometry
+            scores[model]["warped"] = geometry.height * (geometry.left_width + geometry.right_width)
+            scores[model]["matched"] = sum(int((depth > 0).sum()) for depth in depths[model])
+        if maps.views:
+            plane = found["frame"].geometry.rectified_from_world[2] if len(found) == len(MODELS) else None
+            for model, of_model in _exact_scores(views, depths, maps, plane).items():
+                scores[model] |= of_model
+        return scores
+
+    with ThreadPoolExecutor(options.num_threads) as pool:
+        return list(pool.map(score, names))
+
+
+def _exact_scores(
+    views: tuple[View, View],
+    depths: Mapping[str, tuple[Map, Map]],
+    maps: ExactMaps,
+    plane: NDArray[np.float64] | None,
+) -> dict[str, dict[str, Any]]:
+    """Per model what exact depth says about a pair's depths; by slope against a plane where one is given."""
+
+    def flat(parts: Sequence[Map]) -> Map:
+        return np.concatenate([part.ravel() for part in parts])
+
+    errors = {
+        model: flat([maps.errors(view, depth) for view, depth in zip(views, of_model, strict=True)])
+        for model, of_model in depths.items()
+    }
+    common = np.logical_and.reduce([np.isfinite(error) for error in errors.values()])
+    slopes = None if plane is None else flat([maps.slopes(view, plane) for view in views])
+    scores: dict[str, dict[str, Any]] = {}
+    for model, error in errors.items():
+        scores[model] = {
+            "correct": int((error <= CORRECT).sum()),
+            "median_error_gsd": _median(error[np.isfinite(error)]),
+            "median_error_common_gsd": _median(error[common]),
+        }
+        if slopes is not None:
+            counts, _ = np.histogram(slopes[(error <= CORRECT) & np.isfinite(slopes)], SLOPE_EDGES)
+            scores[model]["correct_by_slope"] = counts.tolist()
+    return scores
+
+
+def by_angle(scored: Sequence[PairScores]) -> list[dict[str, Any]]:
+    """Sums over the pairs of each class of angles between the viewing directions, and over all."""
+    rows = []
+    for low, high in [*pairwise(ANGLE_EDGES), (ANGLE_EDGES[0], ANGLE_EDGES[-1])]:
+        inside = [pair for pair in scored if low <= pair["view_angle_deg"] < high]
+        if inside:
+            row: dict[str, Any] = {"from_deg": low, "to_deg": high, "pairs": len(inside)}
+            rows.append(row | {model: _summed([pair[model] for pair in inside]) for model in MODELS})
+    return rows
+
+
+def telling_pairs(scored: Sequence[PairScores], count: int) -> list[PairScores]:
+    """Pairs to look at: those in which the models differ most, each of another class of angles if possible."""
+    usable = [pair for pair in scored if all("matched" in pair[model] for model in MODELS)]
+    usable.sort(key=lambda pair: abs(pair["spherical"]["matched"] - pair["frame"]["matched"]), reverse=True)
+    chosen: dict[int, PairScores] = {}
+    for pair in usable:
+        chosen.setdefault(int(np.digitize(pair["view_angle_deg"], ANGLE_EDGES)), pair)
+    first = list(chosen.values())
+    return [*first, *(pair for pair in usable if pair not in first)][:count]
+
+
+def _summed(scores: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    done = [one for one in scores if "skipped" not in one]
+    total: dict[str, Any] = {"skipped": len(scores) - len(done)}
+    for key in ("matched", "correct", "warped"):
+        if all(key in one for one in done):
+            total[key] = sum(one[key] for one in done)
+    slopes = [one["correct_by_slope"] for one in done if "correct_by_slope" in one]
+    if slopes:
+        total["correct_by_slope"] = np.sum(slopes, axis=0).tolist()
+    for key in ("median_error_gsd", "median_error_common_gsd"):
+        known = [one[key] for one in done if one.get(key) is not None]
+        total[key] = float(np.median(known)) if known else None
+    return total
+
+
+def _median(values: Map) -> float | None:
+    return float(np.median(values)) if len(values) else None

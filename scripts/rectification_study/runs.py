@@ -1,0 +1,115 @@
+"""One reconstruction per rectification model, in a process of its own, with the cost of every stage."""
+
+import json
+import shutil
+import time
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import colmap_sph
+from colmap_sph.errors import InputError, OutputError
+from colmap_sph.evaluation import write_json
+from colmap_sph.options import RunOptions
+from colmap_sph.rectification import Model
+from colmap_sph.workspace import Workspace, read_depth_map
+
+MODELS: tuple[Model, ...] = ("frame", "spherical")
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A finished reconstruction.
+
+    Attributes
+    ----------
+    workspace : Workspace
+    report : dict
+        The pipeline's report.
+    cost : dict
+        Stage → seconds, cpu_seconds, peak_bytes (of that stage alone).
+    """
+
+    workspace: Workspace
+    report: dict[str, Any]
+    cost: dict[str, dict[str, float]]
+
+    def points(self) -> dict[str, Any]:
+        """What the paper counts as points: per image its pixels with a geometric depth; and the fused cloud."""
+        pixels = {}
+        for name in sorted(self.report["coverage"]):
+            pixels[name] = int((read_depth_map(self.workspace.depth_map_path(name, "geometric")) > 0).sum())
+        return {"pixels_per_image": pixels, "fused": int(self.report["points"])}
+
+
+class StageMeter:
+    """Progress of a run that notes every stage's time, processor time and peak memory."""
+
+    def __init__(self, label: str) -> None:
+        self.label = label
+        self.cost: dict[str, dict[str, float]] = {}
+        self._stage = ""
+
+    def start(self, stage: str, total: int) -> None:
+        """A stage begins: the one before it is done."""
+        self.finish()
+        print(f"{self.label}: {stage} ({total})", flush=True)
+        self._stage, self._started, self._cpu_started = stage, time.perf_counter(), time.process_time()
+        # Linux: forget the peak so far. Where that is not allowed peaks are those since the start.
+        with suppress(OSError):
+            Path("/proc/self/clear_refs").write_text("5")
+
+    def advance(self) -> None:
+        """Nothing: only whole stages are measured."""
+
+    def finish(self) -> None:
+        """The last stage is done."""
+        if self._stage:
+            status = Path("/proc/self/status").read_text().splitlines()
+            peak = next(int(line.split()[1]) * 1024 for line in status if line.startswith("VmHWM"))
+            seconds, cpu = time.perf_counter() - self._started, time.process_time() - self._cpu_started
+            self.cost[self._stage] = {"seconds": seconds, "cpu_seconds": cpu, "peak_bytes": peak}
+        self._stage = ""
+
+
+def reconstruct(model: Path, images: Path | None, folder: Path, options: RunOptions, rectification: Model) -> Run:
+    """Reconstruct in ``folder/dense``, or take what an earlier study with the same options left there.
+
+    Raises
+    ------
+    InputError
+        The folder holds a study of another model or with other options.
+    OutputError
+        The folder is not empty and not a study's.
+    """
+    options = replace(options, rectification=replace(options.rectification, rectification=rectification))
+    asked = {"model": str(Path(model).resolve()), "options": json.loads(json.dumps(asdict(options), default=str))}
+    record = folder / "run.json"
+    if not record.is_file():
+        _make_empty(folder)
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as child:
+            done = child.submit(_reconstruct, model, images, folder / "dense", options).result()
+        write_json(record, {**asked, **done})
+    content = json.loads(record.read_text(encoding="utf-8"))
+    if {key: content[key] for key in asked} != asked:
+        raise InputError(f"{folder} holds a study of another model or with other options; give another --output.")
+    return Run(Workspace(folder / "dense"), content["report"], content["cost"])
+
+
+def _make_empty(folder: Path) -> None:
+    """An interrupted run is begun anew: its times would mean nothing."""
+    if folder.is_dir() and {path.name for path in folder.iterdir()} - {"dense"}:
+        raise OutputError(f"{folder} holds other files; give another --output.")
+    shutil.rmtree(folder / "dense", ignore_errors=True)
+    folder.mkdir(exist_ok=True)
+
+
+def _reconstruct(model: Path, images: Path | None, root: Path, options: RunOptions) -> dict[str, Any]:
+    """In the child process: run and measure."""
+    meter = StageMeter(options.rectification.rectification)
+    report = colmap_sph.run(model, images=images, output=root, options=options, progress=meter)
+    meter.finish()
+    return {"report": json.loads(json.dumps(asdict(report), default=str)), "cost": meter.cost}

@@ -1,0 +1,374 @@
+"""The command: help, exit codes, summary, log and report; and every bad input, said in one sentence."""
+
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import fields
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from conftest import keep_images
+
+import colmap_sph
+from colmap_sph import cli
+from colmap_sph.depth import DepthOptions
+from colmap_sph.fusion import FusionOptions
+from colmap_sph.matching import MatchingOptions
+from colmap_sph.normals import NormalOptions
+from colmap_sph.pairs import PairOptions
+from colmap_sph.rectification import RectificationOptions
+from colmap_sph.undistortion import UndistortionOptions
+
+IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
+FAST = ["--threads", "2", "--num-pairs", "2"]
+
+
+@pytest.fixture
+def small(project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project of three images, which is also the current folder."""
+    keep_images(project, IMAGES)
+    monkeypatch.chdir(project)
+    return project
+
+
+def tree(folder: Path) -> list[str]:
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*"))
+
+
+def command(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
+    """Exit code, and what the command wrote to the terminal."""
+    try:
+        code = cli.main(list(arguments))
+    except SystemExit as stop:
+        assert isinstance(stop.code, int)
+        code = stop.code
+    captured = capsys.readouterr()
+    return code, captured.out + captured.err
+
+
+def error_sentence(code: int, output: str) -> str:
+    """The one line of an error, which comes last."""
+    assert code not in (0, 5)
+    assert "Traceback" not in output
+    lines = [line for line in output.splitlines() if line.startswith("error: ")]
+    assert len(lines) == 1, output
+    assert output.splitlines()[-1] == lines[0]
+    return lines[0].removeprefix("error: ")
+
+
+# ---- help --------------------------------------------------------------------------------------------------
+
+
+def test_help_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = command(capsys, "--help")
+    assert code == 0
+    for subcommand in ("run", "demo", "evaluate"):
+        assert re.search(rf"• {subcommand} +\w", output), output
+
+
+@pytest.mark.parametrize(
+    ("prefix", "options"),
+    [
+        ("", cli.RunCommand),
+        ("", UndistortionOptions),
+        ("", PairOptions),
+        ("", RectificationOptions),
+        ("matching.", MatchingOptions),
+        ("depth.", DepthOptions),
+        ("normals.", NormalOptions),
+        ("fusion.", FusionOptions),
+    ],
+)
+def test_help_of_run_explains_every_option(prefix: str, options: type, capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = command(capsys, "run", "--help")
+    assert code == 0
+    words = " ".join(output.replace("│", " ").split())
+    assert "--workspace for a dense workspace" in words
+    stages = {"undistortion", "pairs", "rectification", "matching", "depth", "normals", "fusion"}
+    for field in fields(options):
+        if options is cli.RunCommand and field.name in stages:
+            continue
+        name = f"--{prefix}{field.name.replace('_', '-')}"
+        # The option, what it takes, and some words about it.
+        assert re.search(rf" {re.escape(name)} \S+ (\S+ ){{3,}}?\(default: ", words), name
+
+
+def test_help_of_demo(capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = command(capsys, "demo", "--help")
+    assert code == 0
+    assert "--output PATH" in output
+    assert "exact depth" in output
+
+
+def test_version(capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(capsys, "--version") == (0, f"colmap_sph {colmap_sph.__version__}\n")
+
+
+# ---- a run -------------------------------------------------------------------------------------------------
+
+
+def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = command(capsys, "run", "--model", "sparse/0", *FAST, "--fusion.max-reproj-error", "1")
+    assert code == 0
+    report = json.loads((small / "dense/colmap_sph/report.json").read_text())
+    assert report["options"]["fusion"]["max_reproj_error"] == 1
+    assert report["options"]["pairs"]["num_pairs"] == report["options"]["threads"] == 2
+    assert list(report["coverage"]) == IMAGES
+    assert report["images"] == report["pairs"] == 3
+    # The closing summary.
+    words = " ".join(output.split())
+    for name in IMAGES:
+        assert f"{name} │ {report['coverage'][name]:.1%}" in words
+    assert "images 3 with depth maps, mean coverage" in words
+    assert "pairs 3 matched (tracks)" in words
+    assert f"{report['points']:,} points in" in words
+    for stage in ("undistort", "select pairs", "match pairs", "estimate depth", "check consistency", "fuse"):
+        assert f"{stage} {report['seconds'][stage]:.1f}" in words
+    assert re.search(r"peak memory \d+\.\d\d GiB", words)
+    # The log file.
+    log = (small / "dense/colmap_sph/log.txt").read_text().splitlines()
+    assert all(re.match(r"20\d\d-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} INFO colmap_sph\.\w+: ", line) for line in log)
+    assert f"colmap_sph {colmap_sph.__version__}: RunCommand(" in log[0]
+    assert "max_reproj_error=1" in log[0]
+    assert any("Undistorting 3 images" in line for line in log)
+    assert any("3 pairs of 3 images" in line for line in log)
+    assert "Fuse: " in log[-1]
+    # Nothing of ours stays behind in the logging of the process.
+    assert logging.getLogger("colmap_sph").handlers == []
+
+
+def test_the_log_of_a_second_run_follows_the_first(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert command(capsys, "run", "--model", "sparse/0", *FAST)[0] == 0
+    first = (small / "dense/colmap_sph/log.txt").read_text()
+    code, output = command(capsys, "run", "--workspace", "dense", "--min-shared-points", "100000")
+    assert "No pair of images overlaps" in error_sentence(code, output)
+    log = (small / "dense/colmap_sph/log.txt").read_text()
+    assert log.startswith(first)
+    added = log.removeprefix(first)
+    assert "workspace=" in added.splitlines()[0]
+    assert "Traceback" in added
+    assert "NoResultError" in added
+
+
+def test_as_a_program(small: Path) -> None:
+    """A process of its own, without a terminal, with Python's warnings as errors."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "-m", "colmap_sph.cli", "run", "--model", "sparse/0", *FAST],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env={**os.environ, "COLUMNS": "200"},
+    )
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"cloud +[\d,]+ points in \S", done.stderr)
+    assert done.stdout == ""
+    done = subprocess.run(
+        [sys.executable, "-m", "colmap_sph.cli", "run", "--model", "nowhere"], capture_output=True, text=True
+    )
+    assert done.returncode == 2
+    assert "nowhere does not exist" in error_sentence(done.returncode, done.stderr)
+
+
+def test_interruption(small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "run", interrupted)
+    code, output = command(capsys, "run", "--model", "sparse/0")
+    assert code == 130
+    assert "interrupted" in output
+    assert "Traceback" not in output
+
+
+# ---- images that are left out ------------------------------------------------------------------------------
+
+
+def remove(path: Path) -> None:
+    path.unlink()
+
+
+def shrink(path: Path) -> None:
+    cv2.imwrite(str(path), np.zeros((80, 100, 3), np.uint8))
+
+
+def cut_off(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:4000])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (remove, "is missing"),
+        (shrink, "has 100 x 80 pixels, but its camera 320 x 240"),
+        (cut_off, "is damaged or cut off"),
+    ],
+)
+@pytest.mark.parametrize("one", [True, False], ids=["one", "all"])
+def test_unusable_images(
+    spoil: Callable[[Path], None], words: str, one: bool, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One is reported and the rest go on; without any the run ends."""
+    for name in IMAGES[:1] if one else IMAGES:
+        spoil(small / "images" / name)
+    before = tree(small)
+    code, output = command(capsys, "run", "--model", "sparse/0", "--images", "images", *FAST)
+    assert f"{IMAGES[0]} {words}; left out" in " ".join(output.split())
+    if one:
+        assert code == cli.PARTIAL_EXIT_CODE == 5
+        assert f"image skipped: {IMAGES[0]}: " in output
+        report = json.loads((small / "dense/colmap_sph/report.json").read_text())
+        assert list(report["skipped_images"]) == IMAGES[:1]
+        assert list(report["coverage"]) == IMAGES[1:]
+        assert words in (small / "dense/colmap_sph/log.txt").read_text()
+    else:
+        assert code == 2
+        assert "None of the model's 3 images" in error_sentence(code, output)
+        assert tree(small) == before
+
+
+def test_names_that_look_like_markup(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = pycolmap.Reconstruction(small / "sparse/0")
+    for image in model.images.values():
+        if image.name in IMAGES[:2]:
+            (small / "images" / image.name).rename(small / "images" / f"[red]{image.name}")
+            image.name = f"[red]{image.name}"
+    model.write(small / "sparse/0")
+    (small / "images" / f"[red]{IMAGES[1]}").unlink()
+    code, output = command(capsys, "run", "--model", "sparse/0", *FAST)
+    assert code == 5
+    assert f"image skipped: [red]{IMAGES[1]}: " in output
+    assert f"│ [red]{IMAGES[0]} │" in output
+
+
+# ---- bad input ---------------------------------------------------------------------------------------------
+
+RUN = ["run", "--model", "sparse/0"]
+BAD = {
+    "neither": (["run"], 2, "--model"),
+    "both": ([*RUN, "--workspace", "dense"], 2, "not both"),
+    "workspace and images": (["run", "--workspace", "images", "--images", "images"], 2, "leave out --images"),
+    "workspace and output": (["run", "--workspace", "images", "--output", "x"], 2, "leave out"),
+    "workspace and size": (
+        ["run", "--workspace", "images", "--max-image-size", "900"],
+        2,
+        "leave out --max-image-size",
+    ),
+    "no folder": (["run", "--model", "no/sparse/0"], 2, "no/sparse/0 does not exist"),
+    "no model": (["run", "--model", "images"], 2, "No COLMAP model in images"),
+    "model above": (["run", "--model", "sparse"], 2, "did you mean sparse/0"),
+    "no images": ([*RUN, "--images", "none"], 2, "none does not exist"),
+    "wrong images": ([*RUN, "--images", "sparse"], 2, "None of the model's 3 images in sparse is usable"),
+    "no workspace": (["run", "--workspace", "none"], 2, "none does not exist"),
+    "not a workspace": (["run", "--workspace", "images"], 2, "not a dense workspace"),
+    "file in the way": ([*RUN, "--output", "sparse/0/cameras.bin"], 3, "cameras.bin"),
+    "file as parent": ([*RUN, "--output", "sparse/0/cameras.bin/dense"], 3, "cameras.bin"),
+    "unwritable": ([*RUN, "--output", "/proc/dense"], 3, "/proc/dense"),
+    "threads": ([*RUN, "--threads", "-1"], 2, "threads must lie in 0..1024, not -1"),
+    "pairs": ([*RUN, "--num-pairs", "0"], 2, "num_pairs must be at least 1, not 0"),
+    "p1": ([*RUN, "--matching.p1", "500"], 2, "not 500, 30, 120"),
+    "sampling": ([*RUN, "--sampling", "nan"], 2, "sampling"),
+    "depth": ([*RUN, "--depth.vote-tolerance", "0"], 2, "vote_tolerance"),
+    "normals": ([*RUN, "--normals.radius", "0"], 2, "radius"),
+    "fusion": ([*RUN, "--fusion.min-num-pixels", "0"], 2, "min_num_pixels"),
+    "masks": ([*RUN, "--fusion.mask-path", "none"], 2, "none does not exist"),
+    "size": ([*RUN, "--max-image-size", "3"], 2, "max_image_size"),
+    "demo threads": (["demo", "--threads", "-1"], 2, "threads"),
+    "demo in a project": (["demo", "--output", "."], 3, "already holds other files"),
+    "demo in a file": (["demo", "--output", "sparse/0/cameras.bin"], 3, "cameras.bin"),
+    "demo unwritable": (["demo", "--output", "/proc/demo"], 3, "/proc/demo"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input(case: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One sentence, an exit code, and not a file or folder more than before."""
+    arguments, expected, words = BAD[case]
+    before = tree(small)
+    code, output = command(capsys, *arguments)
+    assert words in error_sentence(code, output)
+    assert code == expected
+    assert tree(small) == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ([], "run, demo"),
+        (["fly"], "fly"),
+        ([*RUN, "--bogus", "3"], "--bogus"),
+        ([*RUN, "--threads", "many"], "--threads"),
+        ([*RUN, "--rectification", "cube"], "--rectification"),
+        ([*RUN, "--model"], "--model"),
+        (["demo", "--model", "sparse/0"], "--model"),
+    ],
+)
+def test_arguments_that_make_no_sense(
+    arguments: list[str], words: str, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = tree(small)
+    code, output = command(capsys, *arguments)
+    assert code == 2
+    assert words in output
+    assert "Traceback" not in output
+    assert tree(small) == before
+
+
+def test_no_pair_with_overlap(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = command(capsys, *RUN, "--min-shared-points", "100000")
+    assert code == 4
+    assert "No pair of images overlaps" in error_sentence(code, output)
+    # The dense workspace is whole, without maps and cloud, and serves the next run.
+    assert not list((small / "dense/stereo").rglob("*.bin"))
+    assert not list((small / "dense").glob("fused*"))
+    assert "No pair of images overlaps" in (small / "dense/colmap_sph/log.txt").read_text()
+    assert command(capsys, *RUN, *FAST)[0] == 0
+
+
+def test_damaged_model(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = small / "sparse/0/points3D.bin"
+    path.write_bytes(path.read_bytes()[:-5])
+    before = tree(small)
+    code, output = command(capsys, *RUN)
+    assert code == 2
+    assert "points3D.bin is truncated or damaged" in error_sentence(code, output)
+    assert tree(small) == before
+
+
+def test_output_that_is_not_ours(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (small / "dense/images").mkdir(parents=True)
+    (small / "dense/images/mine.txt").write_text("keep me")
+    before = tree(small)
+    code, output = command(capsys, *RUN)
+    assert code == 2
+    assert "which this program did not make" in error_sentence(code, output)
+    assert tree(small) == before
+
+
+@pytest.mark.parametrize("blocked", ["fused.ply", "colmap_sph/report.json", "colmap_sph/log.txt"])
+def test_output_files_that_cannot_be_written(
+    blocked: str, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command(capsys, *RUN, "--min-shared-points", "100000")[0] == 4
+    path = small / "dense" / blocked
+    path.unlink(missing_ok=True)
+    path.mkdir()
+    code, output = command(capsys, *RUN, *FAST)
+    assert code == 3
+    assert Path(blocked).name in error_sentence(code, output)
+    assert not list((small / "dense").rglob("*.tmp"))
+
+
+def test_wrong_kernels(small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLMAP_SPH_KERNELS", "sse9")
+    before = tree(small)
+    code, output = command(capsys, *RUN, *FAST)
+    assert code == 2
+    assert "COLMAP_SPH_KERNELS=sse9" in error_sentence(code, output)
+    assert tree(small) == before

@@ -1,0 +1,77 @@
+"""The built-in example on a small block: what it gives, and what it says."""
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import SMALL_BLOCK
+
+from colmap_sph import cli
+from colmap_sph.demo import DemoResult, run_demo
+from colmap_sph.errors import OutputError
+from colmap_sph.evaluation import mean_of_depth_maps
+from colmap_sph.options import RunOptions
+from colmap_sph.pairs import PairOptions
+
+TINY = replace(SMALL_BLOCK, strips=1, strip_images=3, oblique_images=0, supersample=1, width=240, height=180)
+TWO_PAIRS = RunOptions(threads=2, pairs=PairOptions(num_pairs=2))
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> DemoResult:
+    return run_demo(tmp_path_factory.mktemp("demo"), options=RunOptions(threads=2), block=SMALL_BLOCK)
+
+
+def test_depth_maps_against_exact_depth(result: DemoResult) -> None:
+    assert len(result.depth_maps) == result.report.images == 10
+    mean = mean_of_depth_maps(result.depth_maps)
+    assert mean.thresholds[:2] == (1.0, 2.0)
+    assert mean.coverage > 0.75
+    assert mean.within[0] > 0.87
+    assert mean.within[1] > 0.93
+    assert mean.median_error < 0.2
+    assert mean.median_normal_angle < 5
+    assert mean.normal_coverage > 0.99
+
+
+def test_cloud_against_exact_surface(result: DemoResult) -> None:
+    one, two = result.cloud.thresholds[:2]
+    assert (one.tau, two.tau) == pytest.approx((SMALL_BLOCK.nadir_gsd, 2 * SMALL_BLOCK.nadir_gsd))
+    assert one.accuracy > 0.85
+    assert one.completeness > 0.55
+    assert two.accuracy > 0.93
+    assert two.completeness > 0.7
+    assert result.workspace.fused_path.is_file()
+
+
+def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cli, "run_demo", partial(run_demo, block=TINY))
+    for _ in range(2):  # an earlier demo is replaced
+        assert cli.main(["demo", "--output", str(tmp_path / "demo"), "--threads", "2"]) == 0
+        captured = capsys.readouterr()
+        output = captured.out + captured.err
+        assert "Against exact depth" in output
+        for word in ("N_0_0.jpg", "coverage", "<= 1 GSD", "fused.ply", "acc 1 GSD", "comp 1 GSD"):
+            assert word in output
+    log = (tmp_path / "demo/dense/colmap_sph/log.txt").read_text()
+    assert log.count("DemoCommand(") == 1
+    assert "Match pairs" in log
+
+
+def test_the_result_can_be_repeated(tmp_path: Path) -> None:
+    first, second = (run_demo(tmp_path / name, options=TWO_PAIRS, block=TINY) for name in ("a", "b"))
+    assert first.depth_maps == second.depth_maps
+    assert first.report.points == pytest.approx(second.report.points, rel=0.01)
+    # The maps of the first are what it was scored by.
+    coverage = np.mean([scores.coverage for scores in first.depth_maps.values()])
+    assert coverage == pytest.approx(np.mean(list(first.report.coverage.values())), abs=0.01)
+
+
+def test_other_files_are_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "dense").mkdir()
+    (tmp_path / "dense" / "fused.ply").write_text("mine")
+    with pytest.raises(OutputError, match="already holds other files"):
+        run_demo(tmp_path, block=TINY)
+    assert (tmp_path / "dense" / "fused.ply").read_text() == "mine"

@@ -1,0 +1,116 @@
+"""The cache that workers share: each value loaded once, no more kept than allowed."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from colmap_sph.load_cache import LoadCache
+
+
+class Loader:
+    """Values of a given size, and a record of the keys asked for."""
+
+    def __init__(self, size: int = 10) -> None:
+        self.size, self.loaded = size, []
+
+    def __call__(self, key: str) -> bytes:
+        self.loaded.append(key)
+        return key.encode() * self.size
+
+
+def test_a_kept_value_is_loaded_once() -> None:
+    load = Loader()
+    cache = LoadCache(load, len, 100)
+    first = cache.get("a")
+    assert cache.get("a") is first
+    assert cache.get("b") == b"b" * 10
+    assert load.loaded == ["a", "b"]
+
+
+def test_the_least_recently_used_goes_first() -> None:
+    load = Loader()
+    cache = LoadCache(load, len, 30)
+    for key in "abcadabc":
+        # a b c; a again; d pushes out b; a; b pushes out c; c pushes out d
+        assert cache.get(key) == key.encode() * 10
+    assert load.loaded == [*"abcd", *"bc"]
+
+
+def test_capacity_counts_what_is_kept_alone() -> None:
+    """After many evictions and returns as much fits as at the start."""
+    load = Loader()
+    cache = LoadCache(load, len, 30)
+    for _ in range(20):
+        for key in "abcdefg":
+            cache.get(key)
+    load.loaded.clear()
+    for key in "efgefg":
+        cache.get(key)
+    assert load.loaded == []
+
+
+def test_a_value_larger_than_the_capacity() -> None:
+    load = Loader(1000)
+    cache = LoadCache(load, len, 30)
+    assert cache.get("a") is cache.get("a")
+    cache.get("b")
+    cache.get("a")
+    assert load.loaded == ["a", "b", "a"]
+
+
+def test_a_failure_is_not_kept() -> None:
+    answers = iter([OSError("disk"), b"value"])
+
+    def load(key: str) -> bytes:
+        answer = next(answers)
+        if isinstance(answer, OSError):
+            raise answer
+        return answer
+
+    cache = LoadCache(load, len, 30)
+    with pytest.raises(OSError, match="disk"):
+        cache.get("a")
+    assert cache.get("a") == b"value"
+
+
+def test_threads_that_want_one_value_load_it_once() -> None:
+    barrier, go, loaded = threading.Barrier(8), threading.Event(), []
+
+    def load(key: str) -> bytes:
+        go.wait(5)
+        loaded.append(key)
+        return b"value"
+
+    cache = LoadCache(load, len, 100)
+
+    def work(_: int) -> bytes:
+        barrier.wait(5)
+        return cache.get("a")
+
+    with ThreadPoolExecutor(8) as pool:
+        futures = [pool.submit(work, number) for number in range(8)]
+        go.set()
+        values = [future.result(5) for future in futures]
+    assert loaded == ["a"]
+    assert all(value is values[0] for value in values)
+
+
+def test_different_values_load_at_the_same_time() -> None:
+    both = threading.Barrier(2)
+
+    def load(key: str) -> bytes:
+        both.wait(5)  # breaks, and raises, unless both loads run at once
+        return key.encode()
+
+    cache = LoadCache(load, len, 100)
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(cache.get, "ab")) == [b"a", b"b"]
+
+
+def test_many_threads_in_a_small_cache() -> None:
+    load = Loader()
+    cache = LoadCache(load, len, 25)
+    keys = [chr(ord("a") + number % 7) for number in range(700)]
+    with ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(cache.get, keys)) == [key.encode() * 10 for key in keys]

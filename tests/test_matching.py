@@ -1,0 +1,288 @@
+"""Matching on rendered pairs against exact disparities."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rendered import exact_disparity, grey, scene_of_pair
+from scipy import ndimage
+
+from colmap_sph import _native
+from colmap_sph import synthetic as syn
+from colmap_sph.errors import OptionError
+from colmap_sph.matching import MatchingOptions, RectifiedImage, backend, match_pair
+from colmap_sph.rectification import RectificationOptions, rectify_pair, resample
+
+SIZE, FOCAL = (240, 180), 300.0
+OPTIONS = MatchingOptions()
+
+
+def rectified_images(synthetic, pair, left, right):
+    return [
+        RectifiedImage(*resample(grey(synthetic.render(side)), view, pair, side))
+        for side, view in (("left", left), ("right", right))
+    ]
+
+
+class Matched:
+    """A synthetic pair's disparity map and its truth."""
+
+    def __init__(self, synthetic, rectification="spherical"):
+        scene, left, right = scene_of_pair(synthetic)
+        self.pair = rectify_pair(scene, left, right, RectificationOptions(rectification=rectification))
+        self.images = rectified_images(synthetic, self.pair, left, right)
+        self.disparity = self.match(OPTIONS)
+        self.truth, self.seen = exact_disparity(synthetic.surfaces, left, right, self.pair, "left")
+        self.found = ~np.isnan(self.disparity)
+        self.error = (self.disparity - self.truth)[self.found & self.seen]
+        self.occluded = ~self.seen & ~np.isnan(self.truth)
+
+    def match(self, options):
+        return match_pair(*self.images, self.pair.min_disparity, self.pair.max_disparity, options)
+
+    @property
+    def completeness(self):
+        return self.error.size / self.seen.sum()
+
+
+@functools.cache
+def matched_scene(name):
+    return Matched(SCENES[name])
+
+
+def random_image(shape, seed=0):
+    """Texture of a few pixels' size, everywhere valid."""
+    rng = np.random.default_rng(seed)
+    values = ndimage.gaussian_filter(rng.standard_normal(shape), 1.0)
+    return whole(np.clip(128 + 200 * values, 0, 255).astype(np.uint8))
+
+
+def whole(image):
+    return RectifiedImage(image, np.full_like(image, 255))
+
+
+# ---- rendered scenes ---------------------------------------------------------------------------------------
+
+
+PLANES = [(0, 0), (25, 120), (45, 0), (45, 90), (60, 0), (60, 30), (60, 90)]
+
+
+@pytest.mark.parametrize(
+    ("slant", "tilt", "rectification"),
+    [*((*plane, "spherical") for plane in PLANES), (25, 120, "frame"), (45, 0, "frame"), (60, 30, "frame")],
+)
+def test_planes_are_matched_to_a_tenth_of_a_pixel(slant, tilt, rectification):
+    matched = Matched(syn.slanted_plane_pair(slant, tilt, focal_length=FOCAL, size=SIZE), rectification)
+    assert matched.completeness > 0.98
+    assert np.median(np.abs(matched.error)) < (0.1 if slant < 60 else 0.13)
+    assert abs(np.median(matched.error)) < 0.03
+    assert (np.abs(matched.error) > 1).mean() < 0.01
+
+
+@pytest.mark.parametrize("depth", [10.0, 9.8, 9.7, 9.6])
+def test_a_single_disparity_is_matched_between_whole_pixels(depth):
+    """One disparity all over: nothing averages out that the sub-pixel fit leans to whole pixels."""
+    matched = Matched(syn.slanted_plane_pair(0, depth=depth, focal_length=FOCAL, size=SIZE), "frame")
+    assert np.ptp(matched.truth[matched.seen]) < 1e-6
+    assert matched.completeness > 0.98
+    assert np.median(np.abs(matched.error)) < 0.25
+
+
+def test_a_steep_plane_is_matched():
+    matched = Matched(syn.slanted_plane_pair(75, 60, focal_length=FOCAL, size=SIZE))
+    assert matched.completeness > 0.6
+    assert np.median(np.abs(matched.error)) < 0.25
+    assert (np.abs(matched.error) > 1).mean() < 0.05
+
+
+SCENES = {
+    "convergent": syn.convergent_pair(10.0, focal_length=FOCAL, size=SIZE),
+    "forward": syn.forward_motion_pair(1.0, focal_length=240.0, size=SIZE),
+    "epipole inside": syn.epipole_inside_pair(1.0, focal_length=240.0, size=SIZE),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_scenes_with_occlusions_are_matched(name):
+    """Most of what both see is found and right; most of what one alone sees is left out."""
+    matched = matched_scene(name)
+    assert matched.completeness > 0.95
+    assert np.median(np.abs(matched.error)) < 0.2
+    assert abs(np.median(matched.error)) < 0.03
+    assert (np.abs(matched.error) > 1).mean() < 0.04
+    assert matched.found[matched.occluded].mean() < 0.2
+
+
+def test_what_a_step_hides_is_left_out():
+    """A board floats before a wall: a stripe beside it is seen by the left camera alone."""
+    wall = syn.slanted_plane_pair(0, depth=10.0, focal_length=FOCAL, size=SIZE)
+    material = syn.Mottled(syn.Noise(6.0 / FOCAL, seed=4), contrast=0.22)
+    board = syn.Plane((0.3, 0.0, 6.0), (0.0, 0.0, -1.0), material, half_size=(0.8, 0.7))
+    matched = Matched(replace(wall, surfaces=(*wall.surfaces, board)))
+    assert matched.occluded.sum() > 1000
+    assert matched.found[matched.occluded].mean() < 0.2
+    assert matched.completeness > 0.95
+    assert (np.abs(matched.error) > 1).mean() < 0.02
+    assert np.ptp(matched.truth[matched.seen]) > 15
+
+
+def test_wide_ranges_are_searched_through_the_pyramid():
+    """Nearly three times the range, as where sparse points say little: hardly anything changes."""
+    matched = matched_scene("convergent")
+    wide = match_pair(*matched.images, matched.pair.min_disparity - 90, matched.pair.max_disparity + 90, OPTIONS)
+    both = matched.found & ~np.isnan(wide)
+    assert both.sum() > 0.95 * matched.found.sum()
+    assert (np.abs(wide - matched.disparity)[both] < 0.5).mean() > 0.95
+
+
+# ---- exact answers -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("search", [(-20, 20), (0, 31), (-200, 10), (-0.5, 0.5)])
+def test_no_motion_is_exactly_zero(search):
+    image = random_image((90, 130))
+    disparity = match_pair(image, image, *search, OPTIONS)
+    found = ~np.isnan(disparity)
+    assert found.mean() > 0.95
+    np.testing.assert_array_equal(disparity[found], 0)
+
+
+@pytest.mark.parametrize("shift", [-37, -8, -1, 3, 20])
+@pytest.mark.parametrize("shape", [(64, 200), (71, 151), (300, 290)])
+def test_whole_pixels_are_found_exactly(shape, shift):
+    """Disparity is left column minus right column: content moved left by `shift` has disparity `shift`."""
+    scenery = random_image((shape[0], shape[1] + 80)).image
+    left = whole(np.ascontiguousarray(scenery[:, 40 : 40 + shape[1]]))
+    right = whole(np.ascontiguousarray(scenery[:, 40 + shift : 40 + shift + shape[1]]))
+    disparity = match_pair(left, right, -40, 40, OPTIONS)
+    column = np.arange(shape[1]) - shift
+    inner = (column > 12) & (column < shape[1] - 12)
+    assert (disparity[:, inner] == shift).mean() > 0.95
+    assert (np.abs(disparity[:, inner] - shift) <= 0.5).mean() > 0.99
+    # Elsewhere the right image has nothing to match.
+    outside = (column < -2) | (column > shape[1] + 1)
+    assert (~np.isnan(disparity[:, outside])).sum() <= 0.2 * outside.sum() * shape[0]
+
+
+def test_images_of_unlike_widths_are_matched():
+    scenery = random_image((80, 300)).image
+    left = whole(np.ascontiguousarray(scenery[:, 20:120]))
+    right = whole(scenery)
+    disparity = match_pair(left, right, -60, 10, OPTIONS)
+    assert (disparity[5:-5, 5:-5] == -20).mean() > 0.95
+    back = match_pair(right, left, -10, 60, OPTIONS)
+    assert (back[5:-5, 25:115] == 20).mean() > 0.95
+
+
+# ---- masks, ranges, sizes ----------------------------------------------------------------------------------
+
+
+def test_pixels_without_content_are_neither_matched_nor_matched_to():
+    scenery = random_image((90, 160))
+    left_valid, right_valid = np.full((90, 160), 255, np.uint8), np.full((90, 160), 255, np.uint8)
+    left_valid[20:40, 30:70] = 0
+    right_valid[50:80, 60:100] = 0
+    images = RectifiedImage(scenery.image, left_valid), RectifiedImage(scenery.image, right_valid)
+    disparity = match_pair(*images, -15, 15, OPTIONS)
+    assert np.isnan(disparity[20:40, 30:70]).all()
+    # No match lies further than the sub-pixel fit's half pixel inside the hole.
+    row, column = np.nonzero(~np.isnan(disparity))
+    matched = column - disparity[row, column]
+    inside = (row >= 50) & (row < 80) & (matched > 59.5) & (matched < 99.5)
+    assert not inside.any()
+    both = (left_valid > 0) & (right_valid > 0)
+    assert (disparity[both] == 0).mean() > 0.95
+
+
+def test_nothing_valid_gives_nothing():
+    image = random_image((64, 64))
+    empty = RectifiedImage(image.image, np.zeros_like(image.image))
+    for images in ((image, empty), (empty, image), (empty, empty)):
+        assert np.isnan(match_pair(*images, -10, 10, OPTIONS)).all()
+
+
+@pytest.mark.parametrize("search", [(500, 600), (-600, -500), (2000, 5000)])
+def test_a_range_beside_the_images_gives_nothing(search):
+    image = random_image((70, 90))
+    assert np.isnan(match_pair(image, image, *search, OPTIONS)).all()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_disparities_stay_within_the_range_and_the_images(seed):
+    """Also where there is nothing to find: two unrelated images of odd sizes."""
+    rng = np.random.default_rng(seed)
+    height, widths = rng.integers(16, 300), rng.integers(16, 300, 2)
+    low = rng.uniform(-100, 50)
+    high = low + rng.uniform(1, 300)
+    images = [random_image((height, width), seed + k) for k, width in enumerate(widths)]
+    disparity = match_pair(*images, low, high, replace(OPTIONS, min_segment=0))
+    assert disparity.shape == (height, widths[0]) and disparity.dtype == np.float32
+    found = ~np.isnan(disparity)
+    # Ranges are rounded up to a multiple of 32 disparities.
+    assert (disparity[found] >= low - 35).all() and (disparity[found] <= high + 3).all()
+    column = (np.arange(widths[0]) - disparity)[found]
+    assert (column >= -0.5).all() and (column <= widths[1] - 0.5).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 3), (5, 40), (16, 16), (33, 17), (257, 16)])
+def test_small_images_are_survived(shape):
+    image = random_image(shape)
+    disparity = match_pair(image, image, -8, 8, OPTIONS)
+    assert disparity.shape == shape
+    assert not disparity[~np.isnan(disparity)].any()
+
+
+def test_small_segments_are_removed():
+    images = [random_image((120, 160), seed) for seed in (1, 2)]
+    for least in (0, 30):
+        disparity = match_pair(*images, -15, 15, replace(OPTIONS, min_segment=least))
+        labels, count = ndimage.label(~np.isnan(disparity))
+        sizes = np.bincount(labels.ravel())[1:]
+        assert count > 0 or least > 0
+        assert (sizes >= least).all()
+        if least == 0:
+            assert (sizes < 30).any()
+
+
+# ---- backends and options ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["convergent", "epipole inside"])
+def test_the_result_does_not_depend_on_the_backend(name, monkeypatch):
+    matched = matched_scene(name)
+    for kernels in _native.backends():
+        monkeypatch.setenv("COLMAP_SPH_KERNELS", kernels)
+        assert backend() == kernels
+        np.testing.assert_array_equal(matched.match(OPTIONS), matched.disparity)
+
+
+def test_an_unknown_backend_is_refused(monkeypatch):
+    monkeypatch.setenv("COLMAP_SPH_KERNELS", "altivec")
+    with pytest.raises(OptionError, match="COLMAP_SPH_KERNELS=altivec"):
+        backend()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"p1": -1},
+        {"p1": 31, "p2_min": 30},
+        {"p2_min": 130, "p2": 120},
+        {"p2": 194},
+        {"p2_contrast": 0},
+        *[{"disparities": value} for value in (0, 16, 33, 1056, -32)],
+        *[{"coarse_disparities": value} for value in (0, 48)],
+        {"max_coarsest_disparities": 100},
+        {"range_radius": -1},
+        {"range_radius": 51},
+        {"max_left_right_difference": -1},
+        {"min_segment": -1},
+        {"max_slant": -1},
+    ],
+    ids=str,
+)
+def test_options_out_of_bounds_are_refused(wrong):
+    OPTIONS.check()
+    with pytest.raises(OptionError):
+        MatchingOptions(**wrong).check()

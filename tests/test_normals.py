@@ -1,0 +1,179 @@
+"""Normals of planes in closed form, with and without noise, and next to edges."""
+
+import numpy as np
+import pytest
+from rendered import pixel_rays
+
+from colmap_sph.depth import DepthEstimate
+from colmap_sph.errors import OptionError
+from colmap_sph.normals import NormalOptions, fit_normals
+from colmap_sph.scene import View
+
+OPTIONS = NormalOptions(radius=4, tolerance=6.0)
+# Two thousand pixels a radian of parallax: depth 10 with a baseline of 2 and a focal length of 400.
+PIXELS_PER_INVERSE_DEPTH = 800.0
+VIEW = View(
+    1,
+    "a",
+    120,
+    90,
+    np.array([[400.0, 0, 47.3], [0, 380, 51.9], [0, 0, 1]]),
+    np.eye(3),
+    np.zeros(3),
+    np.zeros(0, dtype=np.int64),
+)
+
+
+def plane_normal(slant, tilt):
+    s, t = np.radians(slant), np.radians(tilt)
+    return np.array([np.sin(s) * np.cos(t), np.sin(s) * np.sin(t), -np.cos(s)])
+
+
+def inverse_depth(normal, point=(0.0, 0.0, 10.0), view=VIEW):
+    """(H, W) inverse depth of a plane at COLMAP's pixel origin: 0 where it is behind the camera."""
+    column, row = np.meshgrid(np.arange(view.width), np.arange(view.height))
+    rays = pixel_rays(view, column, row).reshape(*column.shape, 3)
+    return np.maximum(rays @ normal / (np.asarray(point) @ normal), 0)
+
+
+def estimate(inverse, noise, seed=None):
+    """Depth map with a standard deviation of `noise` pixels of disparity; the noise itself with a seed."""
+    sigma = noise / PIXELS_PER_INVERSE_DEPTH
+    if seed is not None:
+        inverse = inverse + sigma * np.random.default_rng(seed).standard_normal(inverse.shape) * (inverse > 0)
+    with np.errstate(divide="ignore"):
+        depth = np.where(inverse > 0, 1 / inverse, 0).astype(np.float32)
+    return DepthEstimate(depth, sigma * depth**2, np.ones(depth.shape, np.uint8))
+
+
+def angles(normals, truth):
+    """Degrees between fitted and true normals, (H, W)."""
+    cross = np.linalg.norm(np.cross(normals, truth), axis=-1)
+    return np.degrees(np.arctan2(cross, (normals * truth).sum(axis=-1)))
+
+
+def assert_unit_and_towards_the_camera(normals, view=VIEW):
+    found = normals.any(axis=-1)
+    np.testing.assert_allclose(np.linalg.norm(normals[found], axis=-1), 1, atol=1e-6)
+    column, row = np.meshgrid(np.arange(view.width), np.arange(view.height))
+    rays = pixel_rays(view, column, row).reshape(*column.shape, 3)
+    assert ((normals * rays).sum(axis=-1)[found] < 0).all()
+
+
+SLANTS = [0, 15, 30, 45, 60, 75]
+
+
+@pytest.mark.parametrize("slant", SLANTS)
+@pytest.mark.parametrize("tilt", [0, 130, 270])
+def test_exact_planes_give_exact_normals(slant, tilt):
+    normal = plane_normal(slant, tilt)
+    exact = estimate(inverse_depth(normal), noise=0.3)
+    normals, depth = fit_normals(VIEW, exact, OPTIONS)
+    assert normals.shape == (90, 120, 3) and normals.dtype == np.float32 and depth.dtype == np.float32
+    found = exact.depth > 0
+    assert found.mean() > 0.8
+    assert angles(normals, normal)[found].max() < 0.1
+    np.testing.assert_allclose(depth[found], exact.depth[found], rtol=1e-4)
+    assert not normals[~found].any() and not depth[~found].any()
+    assert_unit_and_towards_the_camera(normals)
+
+
+@pytest.mark.parametrize("slant", SLANTS)
+@pytest.mark.parametrize("noise", [0.01, 0.05, 0.15])
+def test_noisy_planes_give_normals_within_ten_degrees(slant, noise):
+    normal = plane_normal(slant, 40)
+    exact = inverse_depth(normal)
+    noisy = estimate(exact, noise, seed=slant)
+    normals, depth = fit_normals(VIEW, noisy, OPTIONS)
+    found = noisy.depth > 0
+    assert (angles(normals, normal)[found] < 10).mean() >= 0.95
+    assert_unit_and_towards_the_camera(normals)
+    # The fitted depth is less noisy than what it was fitted to.
+    inner = (depth > 0) & (exact > 0)
+    before, after = (np.abs(1 / values[inner] - exact[inner]) for values in (noisy.depth, depth))
+    assert np.median(after) < 0.5 * np.median(before)
+
+
+@pytest.mark.parametrize("tilt", [0, 90, 45])
+def test_normals_at_a_ridge_belong_to_either_side(tilt):
+    """A roof of two planes of 40 degrees: two pixels beside the ridge a normal is its own plane's."""
+    sides = [plane_normal(40, tilt), plane_normal(-40, tilt)]
+    planes = np.stack([inverse_depth(normal) for normal in sides])
+    roof = estimate(planes.min(axis=0), noise=0.05, seed=1)
+    normals, _ = fit_normals(VIEW, roof, OPTIONS)
+    both = np.stack([angles(normals, normal) for normal in sides])
+    own = np.take_along_axis(both, planes.argmin(axis=0)[None], axis=0)[0]
+    gradient = np.hypot(*np.gradient(planes[0] - planes[1]))
+    beside = np.abs(planes[0] - planes[1]) > 2 * gradient
+    assert (own[beside] < 10).mean() > 0.9
+    assert (own < 10).mean() > 0.9
+
+
+def test_normals_beside_a_step_ignore_the_other_surface():
+    near, far = plane_normal(30, 0), plane_normal(20, 200)
+    column = np.broadcast_to(np.arange(VIEW.width) < 60, (VIEW.height, VIEW.width))
+    inverse = np.where(column, inverse_depth(near, (0, 0, 7)), inverse_depth(far))
+    step = estimate(inverse, noise=0.1, seed=2)
+    normals, _ = fit_normals(VIEW, step, OPTIONS)
+    error = np.where(column, angles(normals, near), angles(normals, far))
+    assert (error[:, 56:64] < 10).mean() > 0.9
+    assert (error < 10).mean() > 0.95
+
+
+def test_outliers_do_not_turn_normals():
+    normal = plane_normal(45, 70)
+    inverse = inverse_depth(normal)
+    rng = np.random.default_rng(0)
+    wild = rng.random(inverse.shape) < 0.1
+    inverse[wild] *= rng.uniform(1.3, 2, wild.sum())
+    normals, _ = fit_normals(VIEW, estimate(inverse, noise=0.1, seed=3), OPTIONS)
+    assert (angles(normals, normal)[~wild] < 10).mean() > 0.95
+
+
+def test_holes_have_no_normals_and_neighbours_keep_theirs():
+    normal = plane_normal(50, 10)
+    inverse = inverse_depth(normal)
+    hole = np.random.default_rng(0).random(inverse.shape) < 0.4
+    inverse[hole] = 0
+    normals, depth = fit_normals(VIEW, estimate(inverse, noise=0.3), OPTIONS)
+    assert not normals[hole].any() and not depth[hole].any()
+    assert angles(normals, normal)[~hole].max() < 0.1
+
+
+def test_too_few_neighbours_give_no_normal():
+    full = inverse_depth(plane_normal(20, 0))
+    for keep in ((slice(40, 41), slice(60, 61)), (slice(40, 41), slice(30, 90)), (slice(20, 80), slice(60, 61))):
+        lone = np.zeros_like(full)
+        lone[keep] = full[keep]
+        normals, depth = fit_normals(VIEW, estimate(lone, noise=0.3), OPTIONS)
+        assert not normals.any() and not depth.any()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 2), (3, 1), (5, 7)])
+def test_images_smaller_than_the_window_are_survived(size):
+    view = View(1, "a", *size, VIEW.K, VIEW.R, VIEW.t, VIEW.point_indices)
+    normal = plane_normal(30, 60)
+    normals, _ = fit_normals(view, estimate(inverse_depth(normal, view=view), noise=0.3), OPTIONS)
+    assert normals.shape == (size[1], size[0], 3)
+    found = normals.any(axis=-1)
+    assert found.all() == (min(size) > 1)
+    assert angles(normals, normal)[found].max(initial=0) < 0.1
+
+
+def test_a_larger_window_takes_more_noise():
+    normal = plane_normal(30, 0)
+    noisy = estimate(inverse_depth(normal), noise=0.3, seed=4)
+    errors = [
+        np.median(angles(fit_normals(VIEW, noisy, NormalOptions(radius, 6.0))[0], normal)) for radius in (2, 4, 8)
+    ]
+    assert errors[0] > 2 * errors[1] > 3 * errors[2]
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("radius", 0), ("radius", 17), ("tolerance", 0.0), ("tolerance", -1.0), ("tolerance", np.nan)],
+)
+def test_options_out_of_bounds_are_refused(name, value):
+    NormalOptions().check()
+    with pytest.raises(OptionError, match=name):
+        NormalOptions(**{name: value}).check()

@@ -1,0 +1,112 @@
+"""Real images end to end: bounds, with some margin, that a broken stage would miss. Skipped without the data."""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from clouds import read_fused
+from conftest import keep_images
+
+import colmap_sph
+from colmap_sph.evaluation import compare_depth_map, mean_of_depth_maps, truth_at_pixel_origin
+from colmap_sph.fusion import FusionOptions, fuse
+from colmap_sph.options import RunOptions
+from colmap_sph.undistortion import UndistortionOptions
+from colmap_sph.workspace import Workspace, read_depth_map
+
+# Six neighbouring vertical images of the aerial block and oblique ones, from all four sides, of the same place.
+PENTA = [
+    *("N_01_02.jpg", "N_01_03.jpg", "N_01_04.jpg", "N_02_02.jpg", "N_02_03.jpg", "N_02_04.jpg"),
+    *("B_01_05.jpg", "F_01_01.jpg", "F_02_01.jpg", "L_03_03.jpg", "R_00_03.jpg", "R_01_03.jpg"),
+]
+PENTA_GSD = 0.141
+PENTA_DEPTH_UNIT = 0.005
+BRIGHTON = [f"DJI_00{number}.jpg" for number in (25, 26, 27, 32, 33)]
+
+
+@dataclass(frozen=True)
+class Result:
+    """A run's workspace, report, and the folder its data come from."""
+
+    workspace: Workspace
+    report: colmap_sph.RunReport
+    source: Path
+
+
+def run_on(source: Path, root: Path, names: list[str] | None, options: RunOptions) -> Result:
+    """Run on some images of a data set, from a copy of its model with links to its images."""
+    if not source.is_dir():
+        pytest.skip(f"{source} is not among the real data")
+    shutil.copytree(source / "sparse", root / "sparse")
+    (root / "images").symlink_to(source / "images")
+    if names is not None:
+        keep_images(root, names)
+    report = colmap_sph.run(root / "sparse" / "0", options=options)
+    return Result(Workspace(root / "dense"), report, source)
+
+
+@pytest.fixture(scope="module")
+def penta(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
+    return run_on(data_dir / "penta", tmp_path_factory.mktemp("penta"), PENTA, RunOptions())
+
+
+@pytest.fixture(scope="module")
+def fountain(data_dir: Path, tmp_path_factory: pytest.TempPathFactory) -> Result:
+    options = RunOptions(undistortion=UndistortionOptions(max_image_size=768))
+    return run_on(data_dir / "fountain", tmp_path_factory.mktemp("fountain"), None, options)
+
+
+def test_penta_depth_maps(penta: Result) -> None:
+    """Share of the truth's pixels with a depth, and of these within 1, 2 and 4 GSD."""
+    scores = {}
+    for name in PENTA:
+        path = penta.source / "depth" / name.replace(".jpg", ".png")
+        centres = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) * PENTA_DEPTH_UNIT
+        depth = read_depth_map(penta.workspace.depth_map_path(name, "geometric"))
+        scores[name] = compare_depth_map(depth, truth_at_pixel_origin(centres), gsd=PENTA_GSD)
+    mean = mean_of_depth_maps(scores)
+    assert mean.coverage > 0.67
+    assert mean.within[0] > 0.9
+    assert mean.within[1] > 0.955
+    assert mean.within[2] > 0.97
+    assert mean.median_error < 0.2
+    for name, one in scores.items():
+        assert one.coverage > 0.45, name
+        assert one.within[0] > 0.85, name
+
+
+def test_penta_cloud(penta: Result) -> None:
+    assert penta.report.skipped_images == {}
+    cloud = read_fused(penta.workspace.fused_path)
+    assert len(cloud) == penta.report.points > 1_700_000
+    np.testing.assert_allclose(np.linalg.norm(cloud["normal"], axis=1), 1, atol=1e-3)
+    # A city seen from above: roofs and streets face the sky, and hardly anything the ground.
+    assert np.mean(cloud["normal"][:, 2] > 0.7) > 0.85
+    assert np.mean(cloud["normal"][:, 2] < -0.3) < 0.001
+
+
+def test_fountain(fountain: Result) -> None:
+    """Strongly convergent from end to end: every image gets maps, and COLMAP's own gates keep many points."""
+    assert fountain.report.images == 11
+    assert fountain.report.skipped_images == {}
+    assert np.mean(list(fountain.report.coverage.values())) > 0.75
+    assert min(fountain.report.coverage.values()) > 0.55
+    kept = fountain.report.points
+    colmaps = FusionOptions(min_num_pixels=5, max_reproj_error=2.0, max_normal_error=10.0)
+    assert kept > fuse(fountain.workspace, colmaps) > 90_000
+
+
+def test_brighton(data_dir: Path, tmp_path: Path) -> None:
+    """A distorted camera, and a model of incremental SfM with its own scale and orientation."""
+    options = RunOptions(undistortion=UndistortionOptions(max_image_size=1000))
+    result = run_on(data_dir / "brighton", tmp_path, BRIGHTON, options)
+    assert list(result.report.coverage) == BRIGHTON
+    # Five images overlap less than a whole block: the one in their middle tells.
+    assert np.mean(list(result.report.coverage.values())) > 0.3
+    assert result.report.coverage["DJI_0026.jpg"] > 0.4
+    assert result.report.points > 200_000
+    image = cv2.imread(str(result.workspace.image_path(BRIGHTON[0])))
+    assert max(image.shape) <= 1000

@@ -1,0 +1,38 @@
+#!/usr/bin/env bash
+# Dense reconstruction of many projects, one after the other.
+#
+#     workflows/batch.sh ROOT [options of `colmap_sph run`]
+#
+# A project is a folder, at any depth below ROOT, with a sparse model in sparse/0; its result goes to dense/ beside
+# sparse/. A failure does not stop the batch. The exit code is 1 where a project has no complete result.
+set -u
+root=${1:?usage: batch.sh ROOT [options of colmap_sph run]}
+shift
+
+mapfile -d '' models < <(find "$root" -type d -path '*/sparse/0' -print0 | sort -z)
+[ "${#models[@]}" -gt 0 ] || { echo "no folder with sparse/0 below $root" >&2; exit 2; }
+
+points() { sed -n 's/^ "points": \([0-9]*\).*/\1/p' "$1/dense/colmap_sph/report.json"; }
+
+failed=0 summary=()
+for model in "${models[@]}"; do
+    project=${model%/sparse/0}
+    echo "==== $project"
+    colmap_sph run --model "$model" --output "$project/dense" "$@"
+    code=$?
+    [ "$code" -eq 130 ] && { echo "interrupted at $project" >&2; exit 130; }
+    case $code in
+        0) result="$(points "$project") points" ;;
+        5) result="$(points "$project") points, but some images have no depth map" ;;
+        2) result="FAILED: input or options" ;;
+        3) result="FAILED: cannot write" ;;
+        4) result="FAILED: nothing to reconstruct" ;;
+        *) result="FAILED: exit code $code" ;;
+    esac
+    [ "$code" -eq 0 ] || failed=$((failed + 1))
+    summary+=("$(printf '%-40s %s' "$project" "$result")")
+done
+
+printf '\n==== %d projects, %d without a complete result\n' "${#models[@]}" "$failed"
+printf '%s\n' "${summary[@]}"
+[ "$failed" -eq 0 ]
