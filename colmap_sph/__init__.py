@@ -10,11 +10,30 @@ The stages are modules of their own: `scene`, `pairs`, `rectification`, `matchin
 # pycolmap brings a zlib of its own; the first one loaded serves every module of the process, and with
 # pycolmap's, Python's and OpenCV's PNG writers crash.
 import zlib  # noqa: F401
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
-from colmap_sph.errors import ColmapSphError
-from colmap_sph.options import RunOptions
-from colmap_sph.pipeline import reconstruct, run
-from colmap_sph.report import Progress, RunReport
+if TYPE_CHECKING:
+    from colmap_sph.errors import ColmapSphError
+    from colmap_sph.options import RunOptions
+    from colmap_sph.pipeline import reconstruct, run
+    from colmap_sph.report import Progress, RunReport
 
 __all__ = ["ColmapSphError", "Progress", "RunOptions", "RunReport", "reconstruct", "run"]
 __version__ = "0.1.0"
+
+_MODULE_OF = {
+    "ColmapSphError": "errors",
+    "Progress": "report",
+    "RunOptions": "options",
+    "RunReport": "report",
+    "reconstruct": "pipeline",
+    "run": "pipeline",
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Load a public name when it is first used: `colmap_sph.evaluation` alone must not load the pipeline."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULE_OF[name]}"), name)

@@ -64,7 +64,7 @@ def main(study: Study) -> None:
     if study.exact_depth is not None:
         exact = exact_depth_views(study.exact_depth, results["spherical"].workspace.sparse_dir, study.depth_scale)
 
-    print(f"measuring: pairs (GSD {gsd:.3f} m)", flush=True)
+    print(f"measuring: pairs (GSD {gsd:.3g})", flush=True)
     scored_pairs = pairs.score_pairs(scene, results, exact, study.run)
     content = {
         "model": str(study.model),
@@ -90,7 +90,7 @@ def main(study: Study) -> None:
     figures = [plots.points_per_image(content, study.output), plots.pairs_by_angle(content, study.output)]
     for pair in pairs.telling_pairs(scored_pairs, study.shown_pairs):
         figures.append(plots.depth_side_by_side(scene, results, pair, exact, study.run, study.output))
-    write_json(study.output / "study.json", {**content, "options": asdict(study.run) | {"threads": 0}})
+    write_json(study.output / "study.json", {**content, "options": runs.plain(study.run)})
     (study.output / "study.md").write_text(tables.markdown(content, figures), encoding="utf-8")
     print(f"{study.output / 'study.md'}\n")
 

@@ -50,7 +50,6 @@ def pairs_by_angle(content: Mapping[str, Any], folder: Path) -> Path:
         gains = [100 * (pair["spherical"][key] / max(pair["frame"][key], 1) - 1) for pair in usable]
         axes.scatter(angles, gains, s=12, alpha=0.6, color=COLOURS["spherical"])
         axes.axhline(0, color="black", linewidth=0.8)
-        axes.set_yscale("symlog", linthresh=10)
         axes.yaxis.set_major_formatter("{x:+g}")
         axes.set_ylabel("spherical against frame [%]")
         axes.set_title(f"{key} pixels of each pair")

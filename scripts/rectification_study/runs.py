@@ -86,7 +86,7 @@ def reconstruct(model: Path, images: Path | None, folder: Path, options: RunOpti
         The folder is not empty and not a study's.
     """
     options = replace(options, rectification=replace(options.rectification, rectification=rectification))
-    asked = {"model": str(Path(model).resolve()), "options": json.loads(json.dumps(asdict(options), default=str))}
+    asked = {"model": str(Path(model).resolve()), "options": plain(options)}
     record = folder / "run.json"
     if not record.is_file():
         _make_empty(folder)
@@ -97,6 +97,11 @@ def reconstruct(model: Path, images: Path | None, folder: Path, options: RunOpti
     if {key: content[key] for key in asked} != asked:
         raise InputError(f"{folder} holds a study of another model or with other options; give another --output.")
     return Run(Workspace(folder / "dense"), content["report"], content["cost"])
+
+
+def plain(record: Any) -> dict[str, Any]:
+    """A dataclass as values that JSON knows."""
+    return dict(json.loads(json.dumps(asdict(record), default=str)))
 
 
 def _make_empty(folder: Path) -> None:
@@ -112,4 +117,4 @@ def _reconstruct(model: Path, images: Path | None, root: Path, options: RunOptio
     meter = StageMeter(options.rectification.rectification)
     report = colmap_sph.run(model, images=images, output=root, options=options, progress=meter)
     meter.finish()
-    return {"report": json.loads(json.dumps(asdict(report), default=str)), "cost": meter.cost}
+    return {"report": plain(report), "cost": meter.cost}
