@@ -78,11 +78,11 @@ def read_geometry(path: Path) -> PointCloud | Mesh:
 
 
 def require(module: str) -> Any:
-    """Import a module of the `evaluation` extra, or say how to get it."""
+    """Import a module that only some evaluations need, or say how to get it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(f"this needs {module}: pip install 'colmap_sph[evaluation]' ({error})") from error
+        raise InputError(f"this needs {module}, which is missing: install colmap_sph again with pip ({error})") from error
 
 
 def _check_points(name: str, points: Points) -> None:

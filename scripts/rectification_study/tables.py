@@ -17,8 +17,8 @@ def markdown(content: Mapping[str, Any], figures: Sequence[Path]) -> str:
     """The whole report."""
     parts = [
         f"# Frame against spherical rectification: {content['model']}",
-        f"{content['images']} images, ground sampling distance {content['gsd_m']:.3g} (units of the model); the "
-        "same pairs, matcher and options. Differences are spherical against frame.",
+        f"{content['images']} images, ground sampling distance {content['gsd_m']:.3g} (units of the model). "
+        "The same pairs, matcher and options; differences are spherical against frame.",
         "## Points (the paper's Figure 5)",
         _points(content["points"]),
     ]
