@@ -82,7 +82,7 @@ def require(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(f"this needs {module}, which is missing: install colmap_sph again with pip ({error})") from error
+        raise InputError(f"this needs {module}: pip install {module} ({error})") from error
 
 
 def _check_points(name: str, points: Points) -> None:
