@@ -48,6 +48,12 @@ def arguments(function):
             "max_difference": 2,
             "out offset": np.zeros((H, W), np.int32),
         },
+        "refine_offsets": {
+            "backend": "scalar",
+            "offset": np.zeros((H, W), np.int32),
+            **census_pair,
+            "out refined": np.zeros((H, W), np.int32),
+        },
         "transfer_disparity": {
             "left": np.zeros((H, W), f32),
             "max_step": 2.0,

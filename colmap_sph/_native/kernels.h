@@ -18,7 +18,9 @@ enum {
     MAX_P2 = 255 - CENSUS_BITS,
     DEPTH_STEP = 32,
     MAX_DEPTH = 1024,
-    MAX_FIT_RADIUS = 16
+    MAX_FIT_RADIUS = 16,
+    MAX_OFFSET_STEP = 512, /* 1/256 pixel: neighbours whose offsets differ by more are not one surface */
+    MAX_REFINEMENT = 256   /* 1/256 pixel */
 };
 
 /* Bit 63 of a census word marks a pixel without image content. */
@@ -48,18 +50,24 @@ typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const 
                          const uint64_t *target, match_size size, int32_t max_left_right_difference,
                          int32_t *offset);
 
+/* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
+typedef void refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                               match_size size, int32_t *refined);
+
 typedef struct {
     const char *name;
     census_fn *census;
     cost_fn *cost;
     aggregation_fn *aggregation;
     selection_fn *selection;
+    refine_offsets_fn *refine_offsets;
 } kernel_table;
 
 census_fn census_scalar, census_avx2;
 cost_fn cost_scalar, cost_avx2;
 aggregation_fn aggregation_scalar, aggregation_avx2;
 selection_fn selection_scalar, selection_avx2;
+refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
 
 /* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
 int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);

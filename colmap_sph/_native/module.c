@@ -174,6 +174,30 @@ static PyObject *py_selection(PyObject *self, PyObject *args) {
     return finish(&arrays, status);
 }
 
+static PyObject *py_refine_offsets(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[4];
+    if (!PyArg_ParseTuple(args, "sOOOO", &backend, &o[0], &o[1], &o[2], &o[3])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[2] = {-1, -1};
+    const int32_t *offset = table ? array_get(&arrays, o[0], "offset", I32, 2, READ, shape) : NULL;
+    const uint64_t *reference = offset ? array_get(&arrays, o[1], "reference", U64, 2, READ, shape) : NULL;
+    Py_ssize_t target_shape[2] = {shape[0], -1};
+    const uint64_t *target = reference ? array_get(&arrays, o[2], "target", U64, 2, READ, target_shape) : NULL;
+    int32_t *refined = target ? array_get(&arrays, o[3], "refined", I32, 2, WRITE, shape) : NULL;
+    if (refined && check_width(shape[1]) && check_width(target_shape[1]) && arrays_disjoint(&arrays)) {
+        const match_size size = {shape[0], shape[1], target_shape[1], 0};
+        Py_BEGIN_ALLOW_THREADS;
+        table->refine_offsets(offset, reference, target, size, refined);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
 static PyObject *py_transfer_disparity(PyObject *self, PyObject *args) {
     (void)self;
     PyObject *o[2];
@@ -325,6 +349,8 @@ static PyMethodDef methods[] = {
      "aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)"},
     {"selection", py_selection, METH_VARARGS,
      "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
+    {"refine_offsets", py_refine_offsets, METH_VARARGS,
+     "refine_offsets(backend, offset, reference, target, refined)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},
     {"depth_candidates", py_depth_candidates, METH_VARARGS,
      "depth_candidates(disparity, rectified_from_pixel, (columns_per_radian, rows_per_radian), "
