@@ -127,7 +127,6 @@ def _offset_plane(differences, inside):
 
 def refine_offsets(offset, reference, target):
     """Offsets (H, W) int32 in 1/256 pixel, refined by the V of the raw costs in a 5 x 5 window along its plane."""
-    height, width = offset.shape
     given = np.pad(offset.astype(np.int64), 2, constant_values=OFFSET_INVALID)
     present = np.abs(given) <= 1 << 24
     ring = np.maximum(*np.abs(np.mgrid[-2:3, -2:3]))

@@ -285,7 +285,9 @@ OFFSETS = {
     "flat": lambda rng, shape: rng.integers(-200, 200, shape),
     "sloped": lambda rng, shape: 300 * np.arange(shape[1]) + 90 * np.arange(shape[0])[:, None] - 2000,
     "steps": lambda rng, shape: rng.choice([-2560, -2400, 0, 512, 513], shape),
-    "extreme": lambda rng, shape: rng.choice([INT32.min + 1, -(1 << 24), 1 << 24, (1 << 24) + 1, INT32.max], shape),
+    "extreme": lambda rng, shape: rng.choice(
+        [INT32.min + 1, -(1 << 24), 1 << 24, (1 << 24) + 1, INT32.max], shape
+    ),
 }
 
 
