@@ -60,6 +60,7 @@ def check_consistency(
     reference_from_partner: Array,
     max_reprojection_error: float,
     tolerance: float,
+    observing: Array,
     agreeing: Array,
     contradicting: Array,
     weighted_depth: Array,

@@ -51,7 +51,7 @@ class MatchingOptions:
     """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
-    min_segment: int = 40
+    min_segment: int = 200
     """Connected regions of fewer pixels than this are removed at full resolution."""
 
     def check(self) -> None:

@@ -265,9 +265,7 @@ def check_views(
     def work(view: View) -> None:
         names = partners.get(view.name, [])
         others = ((scene.view(name), estimates.get(name)) for name in names)
-        # As in COLMAP, no more views need to confirm a depth than there are.
-        depth_options = replace(options.depth, min_consistent=min(options.depth.min_consistent, len(names)))
-        checked = check_depth(view, estimates.get(view.name), others, depth_options)
+        checked = check_depth(view, estimates.get(view.name), others, options.depth)
         depth = _write_maps(workspace, view, checked, "geometric", options)
         report.coverage[view.name] = float((depth > 0).mean())
 

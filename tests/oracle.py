@@ -230,14 +230,15 @@ def _read_depth(depth, u, v):
 
 
 def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma, max_error, tolerance):
-    """Verdict (+1 agrees, -1 looks through, 0 none), the partner's depth and sigma, clearance.
+    """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner sees the point or would if it had a depth
+    there, the partner's depth and sigma, clearance.
 
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
     origin of depth maps. The clearance is the least relative distance from any gate or from a pixel's border.
     """
     shape = depth.shape
     verdict, clearance = np.zeros(shape, dtype=int), np.full(shape, np.inf)
-    carried, spread = np.zeros(shape), np.zeros(shape)
+    carried, spread, observing = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
     for row, col in np.ndindex(shape):
         z = float(depth[row, col])
         if not z > 0:
@@ -248,6 +249,9 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
         if not seen[2] > 0:
             continue
         u, v = pixel[:2] / pixel[2]
+        border = np.subtract(partner_depth.shape[::-1], 1)
+        clearance[row, col] = np.abs([u, v, *(border - (u, v))]).min()
+        observing[row, col] = (np.array([u, v]) >= 0).all() and ([u, v] <= border).all()
         found = _read_depth(partner_depth.astype(float), u, v)
         if not found > 0:
             continue
@@ -263,11 +267,13 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
             verdict[row, col] = 1
         elif difference > 2 * gate:
             verdict[row, col] = -1
+        observing[row, col] = difference >= -2 * gate
         clearance[row, col] = min(
+            clearance[row, col],
             abs(error / max_error - 1),
             abs(abs(difference) / gate - 1),
-            abs(difference / (2 * gate) - 1),
+            abs(abs(difference) / (2 * gate) - 1),
             abs(u % 1 - 0.5),
             abs(v % 1 - 0.5),
         )
-    return verdict, carried, spread, clearance
+    return verdict, observing, carried, spread, clearance

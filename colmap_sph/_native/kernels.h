@@ -112,13 +112,14 @@ typedef struct {
     double back_translation[3];
 } view_transfer;
 
-/* Adds to `agreeing` (and `contradicting`) the partner's verdict on every pixel of a depth map, and the
- * partner's depth, carried to the reference ray, to the running weighted sums. */
+/* Adds the partner's verdict on every pixel of a depth map: to `observing` if it has the point in view and sees
+ * nothing in front of it, to `agreeing` or `contradicting`; and the partner's depth, carried to the reference ray,
+ * to the running weighted sums. */
 void check_consistency(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                        const float *partner_depth, const float *partner_sigma, ptrdiff_t partner_height,
                        ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
-                       float tolerance, uint8_t *agreeing, uint8_t *contradicting, float *weighted_depth,
-                       float *weight);
+                       float tolerance, uint8_t *observing, uint8_t *agreeing, uint8_t *contradicting,
+                       float *weighted_depth, float *weight);
 
 /* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
  * depth, and the depth of each plane at its centre; zeros where no plane fits. */

@@ -288,10 +288,10 @@ static int copy_transfer(array_set *arrays, PyObject *forward, PyObject *back, v
 
 static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     (void)self;
-    PyObject *o[10];
+    PyObject *o[11];
     float max_error, tolerance;
-    if (!PyArg_ParseTuple(args, "OOOOOOffOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &max_error, &tolerance,
-                          &o[6], &o[7], &o[8], &o[9])) {
+    if (!PyArg_ParseTuple(args, "OOOOOOffOOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &max_error, &tolerance,
+                          &o[6], &o[7], &o[8], &o[9], &o[10])) {
         return NULL;
     }
     array_set arrays = {.count = 0};
@@ -303,15 +303,16 @@ static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     const float *partner_sigma =
         partner ? array_get(&arrays, o[3], "partner_sigma", F32, 2, READ, partner_shape) : NULL;
     const int ready = partner_sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
-    uint8_t *agreeing = ready ? array_get(&arrays, o[6], "agreeing", U8, 2, WRITE, shape) : NULL;
-    uint8_t *contradicting = agreeing ? array_get(&arrays, o[7], "contradicting", U8, 2, WRITE, shape) : NULL;
-    float *weighted = contradicting ? array_get(&arrays, o[8], "weighted_depth", F32, 2, WRITE, shape) : NULL;
-    float *weight = weighted ? array_get(&arrays, o[9], "weight", F32, 2, WRITE, shape) : NULL;
+    uint8_t *observing = ready ? array_get(&arrays, o[6], "observing", U8, 2, WRITE, shape) : NULL;
+    uint8_t *agreeing = observing ? array_get(&arrays, o[7], "agreeing", U8, 2, WRITE, shape) : NULL;
+    uint8_t *contradicting = agreeing ? array_get(&arrays, o[8], "contradicting", U8, 2, WRITE, shape) : NULL;
+    float *weighted = contradicting ? array_get(&arrays, o[9], "weighted_depth", F32, 2, WRITE, shape) : NULL;
+    float *weight = weighted ? array_get(&arrays, o[10], "weight", F32, 2, WRITE, shape) : NULL;
     if (weight && arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
         check_consistency(depth, sigma, shape[0], shape[1], partner, partner_sigma, partner_shape[0],
-                          partner_shape[1], &transfer, max_error, tolerance, agreeing, contradicting, weighted,
-                          weight);
+                          partner_shape[1], &transfer, max_error, tolerance, observing, agreeing, contradicting,
+                          weighted, weight);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -359,8 +360,8 @@ static PyMethodDef methods[] = {
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
     {"check_consistency", py_check_consistency, METH_VARARGS,
      "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
-     "reference_from_partner, max_reprojection_error, tolerance, agreeing, contradicting, weighted_depth, "
-     "weight)"},
+     "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
+     "weighted_depth, weight)"},
     {"fit_planes", py_fit_planes, METH_VARARGS,
      "fit_planes(inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
     {NULL, NULL, 0, NULL}};
