@@ -11,6 +11,7 @@ from rendered import (
     disparities,
     exact_disparity,
     pixel_rays,
+    project,
     scene_of,
     scene_of_pair,
     surface_points,
