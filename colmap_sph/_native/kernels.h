@@ -40,10 +40,17 @@ typedef void census_fn(const uint8_t *padded, const uint8_t *valid, ptrdiff_t he
 typedef int cost_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
                     uint8_t *cost);
 
-/* Sum over 8 paths. `p2` holds P2 by absolute intensity difference, p1 <= p2 <= MAX_P2. Bases of neighbours that
- * differ by at most `max_slant` are taken for the slope of one surface, which then costs nothing to follow. */
+typedef struct {
+    uint8_t p1;
+    const uint8_t *p2; /* by absolute intensity difference; p1 <= p2 <= MAX_P2 */
+    /* Bases of neighbours that differ by at most this are taken for the slope of one surface, which then costs
+     * nothing to follow. */
+    int32_t max_slant;
+} path_penalties;
+
+/* Sum over 8 paths. */
 typedef int aggregation_fn(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                           uint8_t p1, const uint8_t *p2, int32_t max_slant, uint16_t *aggregated);
+                           path_penalties penalties, uint16_t *aggregated);
 
 /* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. */
 typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference,

@@ -139,8 +139,9 @@ static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     if (aggregated && check_depth(shape[2]) && check_width(shape[1]) && check_penalties(p1, p2) &&
         check(max_slant >= 0, "the slant must not be negative") && arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], 0, shape[2]};
+        const path_penalties penalties = {(uint8_t)p1, p2, max_slant};
         Py_BEGIN_ALLOW_THREADS;
-        status = table->aggregation(cost, base, image, size, (uint8_t)p1, p2, max_slant, aggregated);
+        status = table->aggregation(cost, base, image, size, penalties, aggregated);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
