@@ -10,8 +10,8 @@ enum { VERTICAL_PATHS = 3 };
 
 /* Room for one target row with `depth` unseen pixels on both sides; NULL without memory. */
 uint64_t *cost_row_buffer(match_size size);
-/* Costs of row y: `size.width * size.depth` of them. */
-void cost_row(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size, ptrdiff_t y,
+/* Costs of one row, `size.width * size.depth` of them; all pointers but the buffer are to that row. */
+void cost_row(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
               uint64_t *buffer, uint8_t *cost);
 
 /* ---- path aggregation -------------------------------------------------------------------------------------- */
