@@ -68,6 +68,7 @@ def check_consistency(
     /,
 ) -> None: ...
 def fit_planes(
+    backend: str,
     inverse_depth: Array,
     inverse_sigma: Array,
     K: Array,

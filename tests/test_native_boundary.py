@@ -98,6 +98,7 @@ def arguments(function):
             "out weight": np.zeros((H, W), f32),
         },
         "fit_planes": {
+            "backend": "scalar",
             "inverse_depth": np.ones((H, W), f32),
             "inverse_sigma": np.ones((H, W), f32),
             "K": np.eye(3, dtype=f64),
@@ -115,13 +116,14 @@ FUNCTIONS = [
     "matching_cost",
     "aggregation",
     "selection",
+    "refine_offsets",
     "transfer_disparity",
     "depth_candidates",
     "vote_depth",
     "check_consistency",
     "fit_planes",
 ]
-MATCHING = FUNCTIONS[:4]
+MATCHING = FUNCTIONS[:5]
 
 
 def call(function, values):
@@ -138,6 +140,7 @@ OUTPUTS = [(function, name) for function, name in ARRAYS if name.startswith("out
 FREE = {
     ("matching_cost", "target"): {1},
     ("selection", "target"): {1},
+    ("refine_offsets", "target"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -394,7 +397,7 @@ def test_empty_maps_are_no_work(shape):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
         _native.check_consistency(reference, reference, other, other, matrix, matrix, 1.0, 4.0, *counts)
         assert not any(count.any() for count in counts)
-    _native.fit_planes(empty, empty, np.eye(3), 4, 3.0, np.zeros((*shape, 3), np.float32), empty.copy())
+    _native.fit_planes("scalar", empty, empty, np.eye(3), 4, 3.0, np.zeros((*shape, 3), np.float32), empty.copy())
 
 
 def test_vote_of_no_pairs_is_no_depth():

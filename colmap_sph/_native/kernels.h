@@ -61,6 +61,12 @@ typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const 
 typedef void refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
                                match_size size, int32_t *refined);
 
+/* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
+ * depth, and the depth of each plane at its centre; zeros where no plane fits. */
+typedef int fit_planes_fn(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height,
+                          ptrdiff_t width, const double *K, int radius, float tolerance, float *normals,
+                          float *fitted_depth);
+
 typedef struct {
     const char *name;
     census_fn *census;
@@ -68,6 +74,7 @@ typedef struct {
     aggregation_fn *aggregation;
     selection_fn *selection;
     refine_offsets_fn *refine_offsets;
+    fit_planes_fn *fit_planes;
 } kernel_table;
 
 census_fn census_scalar, census_avx2;
@@ -75,6 +82,7 @@ cost_fn cost_scalar, cost_avx2;
 aggregation_fn aggregation_scalar, aggregation_avx2;
 selection_fn selection_scalar, selection_avx2;
 refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
+fit_planes_fn fit_planes_scalar, fit_planes_avx2;
 
 /* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
 int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
@@ -127,10 +135,5 @@ void check_consistency(const float *depth, const float *sigma, ptrdiff_t height,
                        ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
                        float tolerance, uint8_t *observing, uint8_t *agreeing, uint8_t *contradicting,
                        float *weighted_depth, float *weight);
-
-/* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
- * depth, and the depth of each plane at its centre; zeros where no plane fits. */
-void fit_planes(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height, ptrdiff_t width,
-                const double *K, int radius, float tolerance, float *normals, float *fitted_depth);
 
 #endif

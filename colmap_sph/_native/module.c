@@ -321,15 +321,18 @@ static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
 
 static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     (void)self;
+    const char *backend;
     PyObject *o[5];
     int radius;
     float tolerance;
-    if (!PyArg_ParseTuple(args, "OOOifOO", &o[0], &o[1], &o[2], &radius, &tolerance, &o[3], &o[4])) {
+    if (!PyArg_ParseTuple(args, "sOOOifOO", &backend, &o[0], &o[1], &o[2], &radius, &tolerance, &o[3], &o[4])) {
         return NULL;
     }
+    const kernel_table *table = table_or_error(backend);
+    int status = 0;
     array_set arrays = {.count = 0};
     Py_ssize_t shape[3] = {-1, -1, 3}, matrix_shape[2] = {3, 3};
-    const float *inverse = array_get(&arrays, o[0], "inverse_depth", F32, 2, READ, shape);
+    const float *inverse = table ? array_get(&arrays, o[0], "inverse_depth", F32, 2, READ, shape) : NULL;
     const float *sigma = inverse ? array_get(&arrays, o[1], "inverse_sigma", F32, 2, READ, shape) : NULL;
     const double *K = sigma ? array_get(&arrays, o[2], "K", F64, 2, READ, matrix_shape) : NULL;
     float *normals = K ? array_get(&arrays, o[3], "normals", F32, 3, WRITE, shape) : NULL;
@@ -337,10 +340,10 @@ static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     if (fitted && check(radius >= 1 && radius <= MAX_FIT_RADIUS, "the window radius must lie in 1..16") &&
         arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
-        fit_planes(inverse, sigma, shape[0], shape[1], K, radius, tolerance, normals, fitted);
+        status = table->fit_planes(inverse, sigma, shape[0], shape[1], K, radius, tolerance, normals, fitted);
         Py_END_ALLOW_THREADS;
     }
-    return finish(&arrays, 0);
+    return finish(&arrays, status);
 }
 
 static PyMethodDef methods[] = {
@@ -364,7 +367,7 @@ static PyMethodDef methods[] = {
      "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
      "weighted_depth, weight)"},
     {"fit_planes", py_fit_planes, METH_VARARGS,
-     "fit_planes(inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
+     "fit_planes(backend, inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
     {NULL, NULL, 0, NULL}};
 
 static PyModuleDef_Slot slots[] = {{0, NULL}};
