@@ -58,8 +58,8 @@ typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const 
                          int32_t *offset);
 
 /* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
-typedef void refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
-                               match_size size, int32_t *refined);
+typedef int refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                              match_size size, int32_t *refined);
 
 /* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
  * depth, and the depth of each plane at its centre; zeros where no plane fits. */

@@ -183,6 +183,7 @@ static PyObject *py_refine_offsets(PyObject *self, PyObject *args) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
+    int status = 0;
     array_set arrays = {.count = 0};
     Py_ssize_t shape[2] = {-1, -1};
     const int32_t *offset = table ? array_get(&arrays, o[0], "offset", I32, 2, READ, shape) : NULL;
@@ -193,10 +194,10 @@ static PyObject *py_refine_offsets(PyObject *self, PyObject *args) {
     if (refined && check_width(shape[1]) && check_width(target_shape[1]) && arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], target_shape[1], 0};
         Py_BEGIN_ALLOW_THREADS;
-        table->refine_offsets(offset, reference, target, size, refined);
+        status = table->refine_offsets(offset, reference, target, size, refined);
         Py_END_ALLOW_THREADS;
     }
-    return finish(&arrays, 0);
+    return finish(&arrays, status);
 }
 
 static PyObject *py_transfer_disparity(PyObject *self, PyObject *args) {
