@@ -60,6 +60,7 @@ def arguments(function):
             "out right": np.zeros((H, TARGET), f32),
         },
         "depth_candidates": {
+            "backend": "scalar",
             "disparity": np.zeros((H, W), f32),
             "rectified_from_pixel": np.eye(3),
             "scales": (100.0, 100.0),
@@ -387,9 +388,9 @@ def test_empty_maps_are_no_work(shape):
     _native.transfer_disparity(np.ones((shape[0], 4), np.float32), 2.0, empty)
     geometry = (np.eye(3), (9.0, 9.0), (0.0, 0.0), 1.0, 1.0, 0.3, 2.0, True, True, 0)
     depth = np.ones((5, 6), np.float32)
-    _native.depth_candidates(empty, *geometry, depth, np.ones_like(depth))
+    _native.depth_candidates("scalar", empty, *geometry, depth, np.ones_like(depth))
     assert not depth.any()
-    _native.depth_candidates(partner, *geometry, empty, empty.copy())
+    _native.depth_candidates("scalar", partner, *geometry, empty, empty.copy())
     _native.vote_depth(
         np.ones((3, *shape), np.float32), np.ones((3, *shape), np.float32), 3.0, empty, empty.copy(), bytes_
     )
@@ -438,6 +439,6 @@ def test_rays_at_the_rim_of_a_map_stay_inside(u, size):
     for x, y in ((u, 0.0), (0.0, u), (u, u)):
         matrix = np.array([[0, 0, x], [0, 0, y], [0, 0, 1.0]])
         _native.depth_candidates(
-            disparity, matrix, (1.0, 1.0), (0.0, 0.0), 0.0, 1.0, 1.0, 9.0, False, True, 0, depth, sigma
+            "scalar", disparity, matrix, (1.0, 1.0), (0.0, 0.0), 0.0, 1.0, 1.0, 9.0, False, True, 0, depth, sigma
         )
         assert depth[0, 0] in (0.0, 0.25)

@@ -61,6 +61,24 @@ typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const 
 typedef int refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
                               match_size size, int32_t *refined);
 
+/* How to read a rectified pair's disparity along the rays of one of its images. */
+typedef struct {
+    double rectified_from_pixel[9]; /* pixel (col, row, 1) to its ray, of depth 1, in the rectified frame */
+    double columns_per_radian, rows_per_radian; /* sphere; focal length in pixels for the planar model */
+    double column_origin, row_origin;           /* angle (or tangent) times scale, at array coordinate 0 */
+    double disparity_origin;                    /* added to a disparity before it is turned into a parallax */
+    double baseline;
+    double disparity_sigma; /* standard deviation of a disparity, pixels */
+    double max_disparity_step;
+    int spherical; /* 1: sphere, 0: plane */
+    int is_left;   /* the rays belong to the left image */
+} pair_geometry;
+
+/* z-depth and its standard deviation for rows [first_row, first_row + rows) of a depth map; 0 = none. */
+typedef void depth_candidates_fn(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width,
+                                 const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows,
+                                 ptrdiff_t columns, float *depth, float *sigma);
+
 /* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
  * depth, and the depth of each plane at its centre; zeros where no plane fits. */
 typedef int fit_planes_fn(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height,
@@ -74,6 +92,7 @@ typedef struct {
     aggregation_fn *aggregation;
     selection_fn *selection;
     refine_offsets_fn *refine_offsets;
+    depth_candidates_fn *depth_candidates;
     fit_planes_fn *fit_planes;
 } kernel_table;
 
@@ -82,6 +101,7 @@ cost_fn cost_scalar, cost_avx2;
 aggregation_fn aggregation_scalar, aggregation_avx2;
 selection_fn selection_scalar, selection_avx2;
 refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
+depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
 fit_planes_fn fit_planes_scalar, fit_planes_avx2;
 
 /* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
@@ -97,24 +117,6 @@ const kernel_table *kernels_best(void);
 /* Carry a disparity map from the left image's columns to the right image's, row by row (NaN = none). */
 void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
                         float max_step, float *right);
-
-/* How to read a rectified pair's disparity along the rays of one of its images. */
-typedef struct {
-    double rectified_from_pixel[9]; /* pixel (col, row, 1) to its ray, of depth 1, in the rectified frame */
-    double columns_per_radian, rows_per_radian; /* sphere; focal length in pixels for the planar model */
-    double column_origin, row_origin;           /* angle (or tangent) times scale, at array coordinate 0 */
-    double disparity_origin;                    /* added to a disparity before it is turned into a parallax */
-    double baseline;
-    double disparity_sigma; /* standard deviation of a disparity, pixels */
-    double max_disparity_step;
-    int spherical; /* 1: sphere, 0: plane */
-    int is_left;   /* the rays belong to the left image */
-} pair_geometry;
-
-/* z-depth and its standard deviation for rows [first_row, first_row + rows) of a depth map; 0 = none. */
-void depth_candidates(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width,
-                      const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows, ptrdiff_t columns,
-                      float *depth, float *sigma);
 
 /* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. */
 void vote_depth(const float *depths, const float *sigmas, ptrdiff_t count, ptrdiff_t pixels, float tolerance,

@@ -222,17 +222,20 @@ static PyObject *py_transfer_disparity(PyObject *self, PyObject *args) {
 
 static PyObject *py_depth_candidates(PyObject *self, PyObject *args) {
     (void)self;
+    const char *backend;
     PyObject *o[4];
     pair_geometry g;
     Py_ssize_t first_row;
-    if (!PyArg_ParseTuple(args, "OO(dd)(dd)ddddppnOO", &o[0], &o[1], &g.columns_per_radian, &g.rows_per_radian,
-                          &g.column_origin, &g.row_origin, &g.disparity_origin, &g.baseline, &g.disparity_sigma,
-                          &g.max_disparity_step, &g.spherical, &g.is_left, &first_row, &o[2], &o[3])) {
+    if (!PyArg_ParseTuple(args, "sOO(dd)(dd)ddddppnOO", &backend, &o[0], &o[1], &g.columns_per_radian,
+                          &g.rows_per_radian, &g.column_origin, &g.row_origin, &g.disparity_origin, &g.baseline,
+                          &g.disparity_sigma, &g.max_disparity_step, &g.spherical, &g.is_left, &first_row, &o[2],
+                          &o[3])) {
         return NULL;
     }
+    const kernel_table *table = table_or_error(backend);
     array_set arrays = {.count = 0};
     Py_ssize_t map_shape[2] = {-1, -1}, matrix_shape[2] = {3, 3}, shape[2] = {-1, -1};
-    const float *disparity = array_get(&arrays, o[0], "disparity", F32, 2, READ, map_shape);
+    const float *disparity = table ? array_get(&arrays, o[0], "disparity", F32, 2, READ, map_shape) : NULL;
     const double *m =
         disparity ? array_get(&arrays, o[1], "rectified_from_pixel", F64, 2, READ, matrix_shape) : NULL;
     float *depth = m ? array_get(&arrays, o[2], "depth", F32, 2, WRITE, shape) : NULL;
@@ -242,7 +245,8 @@ static PyObject *py_depth_candidates(PyObject *self, PyObject *args) {
             g.rectified_from_pixel[k] = m[k];
         }
         Py_BEGIN_ALLOW_THREADS;
-        depth_candidates(disparity, map_shape[0], map_shape[1], &g, first_row, shape[0], shape[1], depth, sigma);
+        table->depth_candidates(disparity, map_shape[0], map_shape[1], &g, first_row, shape[0], shape[1], depth,
+                                sigma);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -359,7 +363,7 @@ static PyMethodDef methods[] = {
      "refine_offsets(backend, offset, reference, target, refined)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},
     {"depth_candidates", py_depth_candidates, METH_VARARGS,
-     "depth_candidates(disparity, rectified_from_pixel, (columns_per_radian, rows_per_radian), "
+     "depth_candidates(backend, disparity, rectified_from_pixel, (columns_per_radian, rows_per_radian), "
      "(column_origin, row_origin), disparity_origin, baseline, disparity_sigma, max_disparity_step, spherical, "
      "is_left, first_row, depth, sigma)"},
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
