@@ -188,14 +188,20 @@ def _match_level(
     kernels = backend()
     height, width = left.image.shape
     left_census, right_census = _census(left), _census(right)
-    cost = np.empty((height, width, depth), dtype=np.uint8)
-    _native.matching_cost(kernels, left_census, right_census, base, cost)
-    aggregated = np.empty((height, width, depth), dtype=np.uint16)
-    image = np.ascontiguousarray(left.image)
-    _native.aggregation(kernels, cost, base, image, options.p1, _p2_table(options), options.max_slant, aggregated)
+    scratch = np.empty((3, height * width, depth), dtype=np.uint8)
     offset = np.empty((height, width), dtype=np.int32)
-    _native.selection(
-        kernels, aggregated, base, left_census, right_census, options.max_left_right_difference, offset
+    _native.match(
+        kernels,
+        left_census,
+        right_census,
+        base,
+        np.ascontiguousarray(left.image),
+        options.p1,
+        _p2_table(options),
+        options.max_slant,
+        options.max_left_right_difference,
+        scratch,
+        offset,
     )
     if not refine:
         return offset
