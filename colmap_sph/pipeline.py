@@ -26,7 +26,7 @@ from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate
 from colmap_sph.errors import ColmapSphError, InputError, NoResultError, OptionError, OutputError
 from colmap_sph.fusion import explain_losses, fuse
 from colmap_sph.load_cache import LoadCache
-from colmap_sph.matching import RectifiedImage, match_pair
+from colmap_sph.matching import RectifiedImage, Scratch, match_pair
 from colmap_sph.normals import fit_normals
 from colmap_sph.options import RunOptions
 from colmap_sph.pair_files import read_arrays, read_pair, write_pair
@@ -198,6 +198,7 @@ def match_pairs(
     Writes their disparity maps; returns the pairs that could be matched.
     """
     make_dir(_pairs_dir(workspace))
+    thread = threading.local()
     images = LoadCache(lambda name: _read_grey(workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
 
     def work(pair: tuple[str, str]) -> tuple[str, str]:
@@ -205,8 +206,15 @@ def match_pairs(
         geometry = rectify_pair(scene, left, right, options.rectification)
         left_image = RectifiedImage(*resample(images.get(left.name), left, geometry, "left"))
         right_image = RectifiedImage(*resample(images.get(right.name), right, geometry, "right"))
+        if not hasattr(thread, "scratch"):
+            thread.scratch = Scratch()
         disparity = match_pair(
-            left_image, right_image, geometry.min_disparity, geometry.max_disparity, options.matching
+            left_image,
+            right_image,
+            geometry.min_disparity,
+            geometry.max_disparity,
+            options.matching,
+            thread.scratch,
         )
         write_pair(
             _pair_path(workspace, left.name, right.name, scene),

@@ -197,15 +197,21 @@ static PyObject *py_match(PyObject *self, PyObject *args) {
     uint8_t *scratch = p2 ? array_get(&arrays, o[5], "scratch", U8, 3, WRITE, scratch_shape) : NULL;
     int32_t *offset = scratch ? array_get(&arrays, o[6], "offset", I32, 2, WRITE, shape) : NULL;
     if (offset && check_depth(scratch_shape[2]) && check_width(shape[1]) && check_width(target_shape[1]) &&
-        check(scratch_shape[1] == shape[0] * shape[1], "scratch must have the size (3, pixels, disparities)") &&
+        check(scratch_shape[1] > 0 && (shape[1] == 0 || scratch_shape[1] % shape[1] == 0),
+              "scratch must have the size (3, pixels of one row or more, disparities)") &&
         check_penalties(p1, p2) && check(max_slant >= 0, "the slant must not be negative") &&
         check(max_difference >= 0, "the left-right difference must not be negative") && arrays_disjoint(&arrays) &&
         check((uintptr_t)scratch % sizeof(uint16_t) == 0, "scratch must be aligned to 16 bits")) {
-        const match_size size = {shape[0], shape[1], target_shape[1], scratch_shape[2]};
-        const path_penalties penalties = {(uint8_t)p1, p2, max_slant};
+        const match_input input = {reference,
+                                   target,
+                                   base,
+                                   image,
+                                   {shape[0], shape[1], target_shape[1], scratch_shape[2]},
+                                   {(uint8_t)p1, p2, max_slant},
+                                   max_difference};
+        const Py_ssize_t band_rows = shape[1] > 0 ? scratch_shape[1] / shape[1] : shape[0] + 1;
         Py_BEGIN_ALLOW_THREADS;
-        status = table->match(reference, target, base, image, size, penalties, max_difference,
-                              (uint16_t *)(void *)scratch, offset);
+        status = table->match(&input, band_rows, (uint16_t *)(void *)scratch, offset);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
