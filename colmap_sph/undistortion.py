@@ -140,6 +140,15 @@ def open_workspace(root: Path) -> Workspace:
     OutputError
         The folders for the maps cannot be created.
     """
+    check_workspace(root)
+    workspace = Workspace(root)
+    model = load_model(workspace.sparse_dir)
+    workspace.create_stereo_dirs(model.image(image_id).name for image_id in model.reg_image_ids())
+    return workspace
+
+
+def check_workspace(root: Path) -> None:
+    """Raise `InputError` unless the folder is a dense workspace that COLMAP's ``image_undistorter`` made."""
     workspace = Workspace(root)
     if not root.is_dir():
         raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
@@ -149,9 +158,6 @@ def open_workspace(root: Path) -> Workspace:
                 f"{root} is not a dense workspace: it has no {folder.name} folder; "
                 "run COLMAP's image_undistorter, or give the sparse model with --model."
             )
-    model = load_model(workspace.sparse_dir)
-    workspace.create_stereo_dirs(model.image(image_id).name for image_id in model.reg_image_ids())
-    return workspace
 
 
 def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:

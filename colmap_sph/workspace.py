@@ -8,7 +8,7 @@ import os
 import re
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Literal
@@ -137,7 +137,8 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
             f"{path} cannot be written ({error.strerror or error}); check space and permissions."
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # not there, or on a disk that has become read-only
+            temporary.unlink()
 
 
 def write_depth_map(path: Path, depth: NDArray[np.float32]) -> None:
