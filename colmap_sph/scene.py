@@ -116,7 +116,11 @@ def read_scene(sparse_dir: Path) -> Scene:
     InputError
         No readable model in the folder, no registered image, or a distorted camera.
     """
-    model = load_model(sparse_dir)
+    return scene_of_model(load_model(sparse_dir), sparse_dir)
+
+
+def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
+    """Return the scene of a model read from `sparse_dir`; see `read_scene`."""
     points, row_of = _read_points(model)
     views = [_read_view(model, image_id, row_of, sparse_dir) for image_id in model.reg_image_ids()]
     usable = [view for view in views if _is_finite(view)]

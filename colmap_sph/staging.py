@@ -72,22 +72,27 @@ def discard_results(workspace: Workspace) -> None:
         _remove(workspace.state_dir / name)
 
 
-def discard_workspace(workspace: Workspace) -> None:
-    """Remove all that this program made in a workspace; the log stays, and so do files of others beside it.
-
-    Raises
-    ------
-    InputError
-        The workspace was made by something else, or its folders hold files that this program did not put there.
-    OutputError
-        Something cannot be removed.
-    """
+def check_discardable(workspace: Workspace) -> None:
+    """Raise `InputError` where a workspace, or a file in its folders, was made by something else."""
     there = [part for part in _PARTS if (workspace.root / part).exists()]
     if there and read_marker(workspace.state_dir) is None:
         raise InputError(_foreign_workspace(workspace, there))
     foreign = next(_foreign_files(workspace), None)
     if foreign is not None:
         raise InputError(f"{foreign} was not made by this program; move it away before you use --overwrite.")
+
+
+def discard_workspace(workspace: Workspace) -> None:
+    """Remove all that this program made in a workspace; the log stays, and so do files of others beside it.
+
+    Raises
+    ------
+    InputError
+        See `check_discardable`.
+    OutputError
+        Something cannot be removed.
+    """
+    check_discardable(workspace)
     discard_results(workspace)
     for name in ("fused.ply", "fused.ply.vis", *_PARTS):
         _remove(workspace.root / name)

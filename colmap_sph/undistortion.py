@@ -12,14 +12,22 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
 from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
-from colmap_sph.scene import Scene, is_pinhole, load_model, make_pinhole, model_files
-from colmap_sph.staging import is_finished, move_into_place, read_marker, scratch_folder, write_marker
+from colmap_sph.scene import Scene, is_pinhole, load_model, make_pinhole, model_files, scene_of_model
+from colmap_sph.staging import (
+    check_discardable,
+    is_finished,
+    move_into_place,
+    read_marker,
+    scratch_folder,
+    write_marker,
+)
 from colmap_sph.workspace import (
     Workspace,
     make_dir,
@@ -99,20 +107,9 @@ def prepare_workspace(
     OutputError
         `output` cannot be written.
     """
-    options.check()
-    model = load_model(model_dir)
-    names = sorted(model.image(image_id).name for image_id in model.reg_image_ids())
-    if image_dir is None:
-        image_dir = find_images(model_dir, names)
-    elif not image_dir.is_dir():
-        raise InputError(f"The image folder {image_dir} does not exist; check --images.")
+    source = _read_source(model_dir, image_dir, options)
+    model, image_dir, marker = source.model, source.image_dir, source.marker
     workspace = Workspace(output)
-    marker = {
-        "version": 1,
-        "options": asdict(options),
-        "model": _hash_model(model_dir),
-        "images": _hash_images(image_dir, names),
-    }
     scratch = workspace.state_dir / "undistorting"
     if read_marker(scratch) == marker:
         move_into_place(scratch, workspace)
@@ -126,8 +123,66 @@ def prepare_workspace(
         shutil.rmtree(Workspace(scratch).state_dir)
         write_marker(scratch, marker)
         move_into_place(scratch, workspace)
-    logger.info("Undistorted %d of %d images into %s", len(kept), len(names), output)
+    logger.info("Undistorted %d of %d images into %s", len(kept), model.num_reg_images(), output)
     return workspace
+
+
+def foresee_scene(
+    model_dir: Path, image_dir: Path | None, output: Path, options: UndistortionOptions, *, overwrite: bool
+) -> Scene | None:
+    """Return the scene that `prepare_workspace` would make, without making it; None where it is made already.
+
+    Parameters
+    ----------
+    model_dir, image_dir, output, options
+        As for `prepare_workspace`, which raises the same.
+    overwrite : bool
+        The workspace that is there will be discarded first.
+    """
+    source = _read_source(model_dir, image_dir, options)
+    if overwrite:
+        check_discardable(Workspace(output))
+    elif is_finished(Workspace(output), source.marker):
+        return None
+    good = _usable_images(source.model, source.image_dir)
+    _replace_ideal_fisheyes(source.model)
+    for camera in source.model.cameras.values():
+        undistorted = pycolmap.undistort_camera(_camera_options(options), camera)
+        camera.model, camera.params = undistorted.model, undistorted.params
+        camera.width, camera.height = undistorted.width, undistorted.height
+    return scene_of_model(_submodel(source.model, set(good)), model_dir)
+
+
+@dataclass(frozen=True)
+class _Source:
+    """What is to be undistorted, and the marker that says so."""
+
+    model: pycolmap.Reconstruction
+    image_dir: Path
+    marker: dict[str, Any]
+
+
+def _read_source(model_dir: Path, image_dir: Path | None, options: UndistortionOptions) -> _Source:
+    options.check()
+    model = load_model(model_dir)
+    names = sorted(model.image(image_id).name for image_id in model.reg_image_ids())
+    if image_dir is None:
+        image_dir = find_images(model_dir, names)
+    elif not image_dir.is_dir():
+        raise InputError(f"The image folder {image_dir} does not exist; check --images.")
+    marker = {
+        "version": 1,
+        "options": asdict(options),
+        "model": _hash_model(model_dir),
+        "images": _hash_images(image_dir, names),
+    }
+    return _Source(model, image_dir, marker)
+
+
+def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
+    camera_options = pycolmap.UndistortCameraOptions()
+    camera_options.max_image_size = options.max_image_size
+    return camera_options
 
 
 def open_workspace(root: Path) -> Workspace:
@@ -213,13 +268,11 @@ def _undistort(
         model_dir = scratch / "model"
         make_dir(model_dir)
         model.write_binary(model_dir)
-    camera_options = pycolmap.UndistortCameraOptions()
-    camera_options.max_image_size = options.max_image_size
     logger.info("Undistorting %d images", len(names))
     try:
         with quiet_colmap():
             pycolmap.undistort_images(
-                scratch, model_dir, image_dir, image_names=names, undistort_options=camera_options
+                scratch, model_dir, image_dir, image_names=names, undistort_options=_camera_options(options)
             )
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
