@@ -7,6 +7,7 @@ Every stage asks for each of its results first whether an earlier run has made t
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -203,47 +204,64 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
 # ---- the cloud ---------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True)
+class CloudState:
+    """Key of the cloud, and what is known of it where it is there.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Images to fuse: those with any depth.
+    partners : dict, optional
+        Where the model has no tracks, from which COLMAP's fusion knows what overlaps: partners of each image.
+    key : str
+    facts : dict, optional
+        Its number of points and the advice to give; None where it must be made.
+    """
+
+    names: tuple[str, ...]
+    partners: dict[str, list[str]] | None
+    key: str
+    facts: dict[str, Any] | None
+
+
+def cloud_state(
+    context: Context, pairs: Iterable[Pair], maps: Mapping[str, str], coverage: Mapping[str, float]
+) -> CloudState:
+    """See `CloudState`; `maps` and `coverage` are keys and coverage of the geometric maps by image name."""
+    names = tuple(view.name for view in context.scene.views if coverage.get(view.name, 0) > 0)
+    tracked = any(len(view.point_indices) for view in context.scene.views)
+    partners = None if tracked else partners_of(pairs)
+    key = context.keys.cloud({name: maps[name] for name in names}, partners or {})
+    return CloudState(names, partners, key, vouched_facts(context.cloud_record, key, context.cloud_paths))
+
+
 def fuse_views(context: Context, pairs: Iterable[Pair], maps: Mapping[str, str]) -> None:
     """Fuse the maps into the cloud; writes ``fused.ply`` and ``fused.ply.vis``.
 
     `maps` are what `check_views` returned.
     """
-    workspace, options, report = context.workspace, context.options, context.report
-    fused = cloud_input(context, maps, report.coverage)
-    write_fusion_cfg(workspace.fusion_cfg_path, fused)
-    partners = None if is_tracked(context) else partners_of(pairs)
-    key = context.keys.cloud(fused, partners or {})
-    facts = vouched_facts(context.cloud_record, key, context.cloud_paths)
+    options, report = context.options, context.report
     with context.stage("fuse", 1):
+        state = cloud_state(context, pairs, maps, report.coverage)
+        facts = state.facts
+        write_fusion_cfg(context.workspace.fusion_cfg_path, state.names)
         if facts is None:
             forget(context.cloud_record)
             points = fuse(
-                workspace,
+                context.workspace,
                 options.fusion,
                 threads=options.num_threads,
                 kind=options.fusion_input,
-                partners=partners,
+                partners=state.partners,
             )
-            advice = _advice(context, points)
-            vouch(context.cloud_record, key, context.cloud_paths, points=points, advice=advice)
-        else:
-            points, advice = facts["points"], facts["advice"]
+            facts = {"points": points, "advice": _advice(context, points)}
+            vouch(context.cloud_record, state.key, context.cloud_paths, **facts)
         context.progress.advance()
-    context.count("fuse", [Done(key, made=facts is None)])
-    report.points, report.advice = points, advice
-    if advice:
-        logger.warning("Only %d points survived fusion. %s", points, advice)
-
-
-def cloud_input(context: Context, maps: Mapping[str, str], coverage: Mapping[str, float]) -> dict[str, str]:
-    """Keys of the maps to fuse: those with any depth, in the scene's order."""
-    names = [view.name for view in context.scene.views if coverage.get(view.name, 0) > 0]
-    return {name: maps[name] for name in names}
-
-
-def is_tracked(context: Context) -> bool:
-    """Whether the model has tracks, from which COLMAP's fusion knows what overlaps."""
-    return any(len(view.point_indices) for view in context.scene.views)
+    context.count("fuse", [Done(state.key, made=state.facts is None)])
+    report.points, report.advice = facts["points"], facts["advice"]
+    if report.advice:
+        logger.warning("Only %d points survived fusion. %s", report.points, report.advice)
 
 
 def partners_of(pairs: Iterable[Pair]) -> dict[str, list[str]]:

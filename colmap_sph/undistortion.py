@@ -127,10 +127,18 @@ def prepare_workspace(
     return workspace
 
 
-def foresee_scene(
+@dataclass(frozen=True)
+class Foreseen:
+    """A workspace that is not there yet: its scene, and the pixels of all original images together."""
+
+    scene: Scene
+    original_pixels: int
+
+
+def foresee_workspace(
     model_dir: Path, image_dir: Path | None, output: Path, options: UndistortionOptions, *, overwrite: bool
-) -> Scene | None:
-    """Return the scene that `prepare_workspace` would make, without making it; None where it is made already.
+) -> Foreseen | None:
+    """Return what `prepare_workspace` would make, without making it; None where it is made already.
 
     Parameters
     ----------
@@ -144,13 +152,15 @@ def foresee_scene(
         check_discardable(Workspace(output))
     elif is_finished(Workspace(output), source.marker):
         return None
-    good = _usable_images(source.model, source.image_dir)
-    _replace_ideal_fisheyes(source.model)
-    for camera in source.model.cameras.values():
+    model = _submodel(source.model, set(_usable_images(source.model, source.image_dir)))
+    cameras = [model.camera(image.camera_id) for image in model.images.values()]
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    _replace_ideal_fisheyes(model)
+    for camera in model.cameras.values():
         undistorted = pycolmap.undistort_camera(_camera_options(options), camera)
         camera.model, camera.params = undistorted.model, undistorted.params
         camera.width, camera.height = undistorted.width, undistorted.height
-    return scene_of_model(_submodel(source.model, set(good)), model_dir)
+    return Foreseen(scene_of_model(model, model_dir), pixels)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -160,7 +161,7 @@ def test_the_log_of_a_second_run_follows_the_first(small: Path, capsys: pytest.C
 def test_as_a_program(small: Path) -> None:
     """A process of its own, without a terminal, with Python's warnings as errors."""
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "colmap_sph.cli", "run", "--model", "sparse/0", *FAST],
+        [sys.executable, "-W", "error", "-m", "colmap_sph", "run", "--model", "sparse/0", *FAST],
         capture_output=True,
         text=True,
         timeout=120,
@@ -170,7 +171,7 @@ def test_as_a_program(small: Path) -> None:
     assert re.search(r"cloud +[\d,]+ points in \S", done.stderr)
     assert done.stdout == ""
     done = subprocess.run(
-        [sys.executable, "-m", "colmap_sph.cli", "run", "--model", "nowhere"], capture_output=True, text=True
+        [sys.executable, "-m", "colmap_sph", "run", "--model", "nowhere"], capture_output=True, text=True
     )
     assert done.returncode == 2
     assert "nowhere does not exist" in error_sentence(done.returncode, done.stderr)
@@ -178,13 +179,16 @@ def test_as_a_program(small: Path) -> None:
 
 def test_interruption(small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGTERM)
 
+    before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(cli, "run", interrupted)
     code, output = command(capsys, "run", "--model", "sparse/0")
-    assert code == 130
-    assert "interrupted" in output
+    assert code == 143
+    assert output.splitlines()[-1].startswith("interrupted; ")
+    assert "run the same command again" in output
     assert "Traceback" not in output
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 # ---- images that are left out ------------------------------------------------------------------------------
