@@ -4,6 +4,8 @@ COLMAP's default gates suit its own patch match; ours keep one point per surface
 neighbours two pixels away, which thins a cloud several times.
 """
 
+import errno
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +24,9 @@ from colmap_sph.workspace import MapKind, Workspace, make_dir, read_depth_map, r
 # What `explain_losses` looks at: partners of a view, and bytes of maps kept in memory.
 _EXPLAINED_PARTNERS = 20
 _CACHE_BYTES = 1 << 30
+# COLMAP's cloud: position and normal in 32-bit floats, and a colour.
+_PLY_END = b"end_header\n"
+_PLY_POINT_BYTES = 6 * 4 + 3
 
 
 @dataclass(frozen=True)
@@ -160,13 +165,33 @@ def fuse(
                 cloud = pycolmap.stereo_fusion(
                     scratch / "fused.ply", source, input_type=kind, options=colmap_options, output_type="PLY"
                 )
+            _check_written(scratch / "fused.ply", scratch / "fused.ply.vis", cloud.num_points3D())
+            # A kill in between must not leave a cloud beside the visibility of another.
+            targets[1].unlink(missing_ok=True)
             for target in targets:
                 (scratch / target.name).replace(target)
         except (OSError, RuntimeError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
             raise OutputError(
-                f"COLMAP's fusion cannot write {workspace.fused_path} ({error}); check space and permissions."
+                f"COLMAP's fusion cannot write {workspace.fused_path} ({reason}); check space and permissions."
             ) from error
     return int(cloud.num_points3D())
+
+
+def _check_written(cloud: Path, visibility: Path, num_points: int) -> None:
+    """Raise `OSError` for files that are cut off: COLMAP does not notice a full disk."""
+    with cloud.open("rb") as file:
+        header_bytes = file.read(1000).find(_PLY_END) + len(_PLY_END)
+    is_whole = cloud.stat().st_size == header_bytes + _PLY_POINT_BYTES * num_points
+    # Behind their number, each point has its number of images, and then these.
+    words, position = np.fromfile(visibility, dtype="<u4").data, 2
+    try:
+        for _ in range(num_points):
+            position += 1 + words[position]
+    except IndexError:
+        is_whole = False
+    if not is_whole or position != len(words):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def _check_maps(workspace: Workspace, kind: MapKind) -> None:

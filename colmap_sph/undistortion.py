@@ -38,6 +38,8 @@ from colmap_sph.workspace import (
 logger = logging.getLogger(__name__)
 
 _FULL_DISK_BYTES = 64 << 20
+# Space that undistortion is given, relative to the files it starts from; JPEGs come out up to 1.6 times larger.
+_SPACE_FACTOR = 2
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,7 @@ def prepare_workspace(
         logger.info("The undistorted images in %s are up to date", output)
         return workspace
     good = _usable_images(model, image_dir)
+    _check_space(source, model_dir, good, output)
     with scratch_folder(scratch):
         kept = _undistort(model, model_dir, image_dir, good, scratch, options)
         Workspace(scratch).create_stereo_dirs(kept)
@@ -169,6 +172,7 @@ class _Source:
 
     model: pycolmap.Reconstruction
     image_dir: Path
+    options: UndistortionOptions
     marker: dict[str, Any]
 
 
@@ -186,7 +190,7 @@ def _read_source(model_dir: Path, image_dir: Path | None, options: UndistortionO
         "model": _hash_model(model_dir),
         "images": _hash_images(image_dir, names),
     }
-    return _Source(model, image_dir, marker)
+    return _Source(model, image_dir, options, marker)
 
 
 def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
@@ -313,7 +317,7 @@ def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
 
 def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     """Leave only undistorted images and PINHOLE cameras in the model; write the configuration for them."""
-    model = load_model(workspace.sparse_dir)
+    model = _load_written_model(workspace)
     cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
     kept = []
     for name in names:
@@ -332,6 +336,7 @@ def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     shutil.rmtree(workspace.sparse_dir)
     make_dir(workspace.sparse_dir)
     model.write_binary(workspace.sparse_dir)
+    _load_written_model(workspace)
     write_fusion_cfg(workspace.fusion_cfg_path, kept)
     write_patch_match_cfg(workspace.patch_match_cfg_path, dict.fromkeys(kept, 20))
     return kept
@@ -374,6 +379,33 @@ def _hash_images(image_dir: Path, names: list[str]) -> str:
             status = (image_dir / name).stat()
             digest.update(f"{name}\n{status.st_size} {status.st_mtime_ns}\n".encode())
     return digest.hexdigest()
+
+
+def _check_space(source: _Source, model_dir: Path, names: list[str], output: Path) -> None:
+    """Raise `OutputError` unless the undistorted images will fit: COLMAP ends the process at a full disk."""
+    needed = sum(path.stat().st_size for path in model_files(model_dir))
+    for image in source.model.images.values():
+        if image.name in names:
+            camera = source.model.camera(image.camera_id)
+            limit = source.options.max_image_size
+            scale = min(1.0, limit / max(camera.width, camera.height)) if limit > 0 else 1.0
+            needed += int(scale**2 * (source.image_dir / image.name).stat().st_size)
+    needed *= _SPACE_FACTOR
+    free = shutil.disk_usage(next(path for path in (output, *output.absolute().parents) if path.exists())).free
+    if free < needed:
+        raise OutputError(
+            f"The undistorted images need about {needed / 1e6:.0f} MB, but on the disk of {output} only "
+            f"{free / 1e6:.0f} MB are free; free some space or choose another --output."
+        )
+
+
+def _load_written_model(workspace: Workspace) -> pycolmap.Reconstruction:
+    """Read a model that COLMAP has just written, without noticing whether the disk took it."""
+    try:
+        return load_model(workspace.sparse_dir)
+    except InputError:
+        _raise_if_disk_is_full(workspace.root)
+        raise
 
 
 def _raise_if_disk_is_full(folder: Path) -> None:
