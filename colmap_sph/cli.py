@@ -112,9 +112,10 @@ def main(arguments: list[str] | None = None) -> int:
         config=(tyro.conf.AvoidSubcommands,),
     )
 
-    def last_words(stop: Interrupted) -> None:
+    def last_words(_: Interrupted) -> None:
+        logger.info("Interrupted")
         console.show_cursor()
-        _print_interrupted(stop, command, console)
+        _print_interrupted(command, console)
 
     with _console_logging(console):
         try:
@@ -125,7 +126,7 @@ def main(arguments: list[str] | None = None) -> int:
                     return demo_command(command, console)
                 return evaluate_command(command, console)
         except Interrupted as stop:
-            _print_interrupted(stop, command, console)
+            _print_interrupted(command, console)
             return stop.exit_code
         except ColmapSphError as error:
             return _print_error(error, console)
@@ -273,8 +274,7 @@ def _print_error(error: ColmapSphError, console: Console) -> int:
     return error.exit_code
 
 
-def _print_interrupted(stop: Interrupted, command: object, console: Console) -> None:
-    logger.info("Interrupted by signal %d", stop.signal_number)
+def _print_interrupted(command: object, console: Console) -> None:
     remedy = "; what is finished is kept, run the same command again to go on"
     words = remedy if isinstance(command, RunCommand) else ""
     console.print(f"[bold red]interrupted[/]{words}", highlight=False, soft_wrap=True)

@@ -99,6 +99,9 @@ def workspace_log(workspace: Workspace, header: str) -> Iterator[None]:
     package.addHandler(handler)
     try:
         yield
+    except KeyboardInterrupt:
+        logger.info("Interrupted")
+        raise
     except BaseException:
         logger.info("Stopped", exc_info=True)
         raise
