@@ -48,6 +48,7 @@ def _feed(state: "hashlib.blake2b", value: object) -> None:
     elif is_dataclass(value):
         _feed(state, {field.name: getattr(value, field.name) for field in fields(value)})
     elif isinstance(value, Mapping):
+        state.update(b"mapping ")
         _feed(state, sorted(value.items()))
     elif isinstance(value, Sequence) and not isinstance(value, str):
         state.update(f"sequence {len(value)} ".encode())

@@ -48,7 +48,6 @@ def for_all(
     results: dict[T, R] = {}
     with ThreadPoolExecutor(threads) as pool:
         try:
-            # Nothing else keeps a future: with its exception it would keep all arrays of the failed item.
             futures = _submit(pool, work, items)
             for future in as_completed(list(futures)):
                 item = futures.pop(future)
@@ -62,6 +61,8 @@ def for_all(
                     if not is_memory_error(error):
                         raise
                     skip(item, str(OutOfMemoryError()))
+                # Nothing may keep a future: with its exception it keeps all arrays of the item that failed.
+                del future
                 progress.advance()
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)

@@ -376,3 +376,79 @@ def test_wrong_kernels(small: Path, capsys: pytest.CaptureFixture[str], monkeypa
     assert code == 2
     assert "COLMAP_SPH_KERNELS=sse9" in error_sentence(code, output)
     assert tree(small) == before
+
+
+# ---- what is done already ----------------------------------------------------------------------------------
+
+
+def test_dry_run_writes_nothing(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = tree(small)
+    code, output = command(capsys, *RUN, *FAST, "--dry-run")
+    assert code == 0
+    assert tree(small) == before
+    words = " ".join(output.split())
+    for line in ("undistort to do", "pairs 3 to do, 0 done", "images 3 to do, 0 done", "cloud 1 to do, 0 done"):
+        assert line in words
+    assert re.search(
+        r"time about \d+ s memory about \d+\.\d MB disk about \d+\.\d MB more, of [\d.]+ \wB free", words
+    )
+    assert "estimates" in words
+    assert command(capsys, *RUN, *FAST)[0] == 0
+    before = {path: path.stat().st_mtime_ns for path in small.rglob("*")}
+    code, output = command(capsys, *RUN, *FAST, "--dry-run", "--fusion.min-num-pixels", "3")
+    assert code == 0
+    words = " ".join(output.split())
+    for line in ("undistort done", "pairs 0 to do, 3 done", "images 0 to do, 3 done", "cloud 1 to do, 0 done"):
+        assert line in words
+    assert {path: path.stat().st_mtime_ns for path in small.rglob("*")} == before
+
+
+@pytest.mark.parametrize("case", ["neither", "no model", "wrong images", "not a workspace", "pairs", "threads"])
+def test_dry_run_finds_the_same_mistakes(case: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, expected, words = BAD[case]
+    before = tree(small)
+    code, output = command(capsys, *arguments, "--dry-run")
+    assert words in error_sentence(code, output)
+    assert code == expected
+    assert tree(small) == before
+
+
+def test_a_second_run_says_what_was_up_to_date(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = command(capsys, *RUN, *FAST)[1]
+    assert "up to date" not in first
+    code, output = command(capsys, *RUN, *FAST)
+    assert code == 0
+    words = " ".join(output.split())
+    assert "up to date match pairs 3, estimate depth 3, check consistency 3, fuse 1" in words
+    code, output = command(capsys, *RUN, *FAST, "--overwrite")
+    assert code == 0
+    assert "up to date" not in output
+
+
+@pytest.mark.parametrize(
+    ("error", "expected", "words"),
+    [
+        (MemoryError(), 6, "not enough memory"),
+        (
+            OSError(28, "No space left on device", "some/file"),
+            3,
+            "some/file cannot be used (No space left on device)",
+        ),
+        (OSError(28, "No space left on device"), 3, "No space left on device"),
+    ],
+)
+def test_what_the_system_refuses(
+    error: Exception,
+    expected: int,
+    words: str,
+    small: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "run", refused)
+    code, output = command(capsys, *RUN)
+    assert words in error_sentence(code, output)
+    assert code == expected
