@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -93,11 +93,9 @@ class Context:
         """Record that vouches for the cloud; its name is none of an image's."""
         return self.workspace.state_dir / "cloud.json"
 
-    @contextmanager
-    def stage(self, name: str, total: int) -> Iterator[None]:
+    def stage(self, name: str, total: int) -> AbstractContextManager[None]:
         """Announce a stage of `total` steps, and report its wall time."""
-        with timed_stage(name, total, self.progress, self.report):
-            yield
+        return timed_stage(name, total, self.progress, self.report)
 
     def for_all(
         self, stage: str, work: Callable[[T], Done], items: Sequence[T], skip: Callable[[T, str], None]

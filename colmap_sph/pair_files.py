@@ -77,7 +77,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
             raise
         if damaged:
             path.unlink(missing_ok=True)
-        remedy = "it was removed; run again to make it anew" if damaged else "delete it and run again"
+        remedy = "it was removed, run again" if damaged else "run again, or check its permissions"
         raise InputError(f"{path} cannot be read ({error}); {remedy}.") from error
 
 

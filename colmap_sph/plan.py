@@ -49,7 +49,7 @@ _MAP_BYTES = 16.0  # depth and normals of one kind
 _CLOUD_BYTES = 9.0
 # Bytes in memory: of the libraries, per left rectified pixel and worker, per pixel of all images in fusion, and
 # there, for a moment, per squared pixel of one image.
-_BASE_MEMORY = 150e6
+_BASE_MEMORY = 200e6
 _MATCH_MEMORY = 100.0
 _FUSION_MEMORY = 30.0
 _FUSION_MASK_MEMORY = 0.1
