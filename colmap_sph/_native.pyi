@@ -30,6 +30,7 @@ def selection(
     offset: Array,
     /,
 ) -> None: ...
+def refine_offsets(backend: str, offset: Array, reference: Array, target: Array, refined: Array, /) -> None: ...
 def transfer_disparity(left: Array, max_step: float, right: Array, /) -> None: ...
 def depth_candidates(
     disparity: Array,
@@ -59,6 +60,7 @@ def check_consistency(
     reference_from_partner: Array,
     max_reprojection_error: float,
     tolerance: float,
+    observing: Array,
     agreeing: Array,
     contradicting: Array,
     weighted_depth: Array,

@@ -24,7 +24,7 @@ from colmap_sph.scene import View
 class DepthOptions:
     """How a view's pairs become its depth map."""
 
-    disparity_sigma: float = 0.35
+    disparity_sigma: float = 0.25
     """Standard deviation, pixels, of a disparity on a smooth surface; where disparities are rough it is larger.
     The scale of every tolerance below."""
     max_disparity_step: float = 2.0
@@ -35,10 +35,11 @@ class DepthOptions:
     """Pairs that must agree on a photometric depth."""
     max_reprojection_error: float = 2.0
     """Two views' depths agree when the point, seen by the other view, projects back within this many pixels."""
-    consistency_tolerance: float = 4.5
+    consistency_tolerance: float = 6.0
     """… and when they differ by less than this many standard deviations."""
     min_consistent: int = 2
-    """Views, of those that share a pair with the image, that must confirm a geometric depth."""
+    """Views, of those that share a pair with the image, that must confirm a geometric depth; one is enough for a
+    point that no other has in view."""
     max_contradiction: float = 1.0
     """A depth is dropped when more views look through it than this share of those that confirm it."""
 
@@ -208,7 +209,7 @@ def check_depth(
         `support` is the number of confirming partners.
     """
     shape = estimate.depth.shape
-    agreeing, contradicting = np.zeros(shape, np.uint8), np.zeros(shape, np.uint8)
+    observing, agreeing, contradicting = (np.zeros(shape, np.uint8) for _ in range(3))
     weighted, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for partner, partner_estimate in partners:
         _native.check_consistency(
@@ -219,13 +220,14 @@ def check_depth(
             *_pixel_transfers(view, partner),
             options.max_reprojection_error,
             options.consistency_tolerance,
+            observing,
             agreeing,
             contradicting,
             weighted,
             weight,
         )
     found = estimate.depth > 0
-    kept = found & (agreeing >= options.min_consistent)
+    kept = found & (agreeing >= np.minimum(np.maximum(observing, 1), options.min_consistent))
     kept &= contradicting <= options.max_contradiction * agreeing
     with np.errstate(divide="ignore", invalid="ignore"):
         own = 1 / np.square(estimate.sigma)

@@ -51,7 +51,7 @@ class MatchingOptions:
     """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
-    min_segment: int = 40
+    min_segment: int = 200
     """Connected regions of fewer pixels than this are removed at full resolution."""
 
     def check(self) -> None:
@@ -130,7 +130,7 @@ def match_pair(
         else:
             depth = min(depth, options.disparities if level == 0 else options.coarse_disparities)
             base = _propagate(offset, shape, depth, low, high, options)
-        offset = _match_level(lefts[level], rights[level], base, depth, options)
+        offset = _match_level(lefts[level], rights[level], base, depth, options, refine=level == 0)
         _remove_small_segments(offset, max(options.min_segment >> level, 4))
     assert offset is not None
     disparity = offset.astype(np.float32)
@@ -185,9 +185,15 @@ def _census(image: RectifiedImage) -> NDArray[np.uint64]:
 
 
 def _match_level(
-    left: RectifiedImage, right: RectifiedImage, base: NDArray[np.int32], depth: int, options: MatchingOptions
+    left: RectifiedImage,
+    right: RectifiedImage,
+    base: NDArray[np.int32],
+    depth: int,
+    options: MatchingOptions,
+    *,
+    refine: bool,
 ) -> NDArray[np.int32]:
-    """Offsets of one level, 1/256 pixel."""
+    """Offsets of one level, 1/256 pixel; those of the finest are refined from the raw costs."""
     kernels = backend()
     height, width = left.image.shape
     left_census, right_census = _census(left), _census(right)
@@ -200,7 +206,11 @@ def _match_level(
     _native.selection(
         kernels, aggregated, base, left_census, right_census, options.max_left_right_difference, offset
     )
-    return offset
+    if not refine:
+        return offset
+    refined = np.empty_like(offset)
+    _native.refine_offsets(kernels, offset, left_census, right_census, refined)
+    return refined
 
 
 def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:

@@ -6,7 +6,7 @@ Every stage asks for each of its results first whether an earlier run has made t
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -176,10 +176,7 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
         if state.coverage is not None:
             return Done(state.key, made=False, coverage=state.coverage)
         others = ((context.scene.view(name), estimates.get(name)) for name in names)
-        # As in COLMAP, no more views need to confirm a depth than there are.
-        options = context.options.depth
-        options = replace(options, min_consistent=min(options.min_consistent, len(names)))
-        checked = check_depth(view, estimates.get(view.name), others, options)
+        checked = check_depth(view, estimates.get(view.name), others, context.options.depth)
         coverage = _write_maps(context, view, checked, "geometric", state.key)
         return Done(state.key, made=True, coverage=coverage)
 

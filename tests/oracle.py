@@ -98,6 +98,75 @@ def selection(aggregated, base, reference, target, max_difference):
     return offsets
 
 
+def _nearest_256(value):
+    return (value + 128) // 256
+
+
+def _offset_plane(differences, inside):
+    """Value at the centre and gradient (x, y), 1/65536 pixel, of a least-squares plane; None if there is none.
+
+    `differences` (5, 5) are offsets minus the centre's, `inside` says which of them count.
+    """
+    y, x = (index - 2 for index in np.nonzero(inside))
+    o = differences[inside]
+    n, sx, sy, sxx, sxy, syy = len(x), x.sum(), y.sum(), (x * x).sum(), (x * y).sum(), (y * y).sum()
+    normal = [[n, sx, sy], [sx, sxx, sxy], [sy, sxy, syy]]
+    right_side = [int(o.sum()), int((x * o).sum()), int((y * o).sum())]
+
+    def cofactor(row, column):
+        rows, columns = [k for k in range(3) if k != row], [k for k in range(3) if k != column]
+        a, b, c, d = (int(normal[r][c]) for r in rows for c in columns)
+        return (-1) ** (row + column) * (a * d - b * c)
+
+    determinant = sum(int(normal[0][k]) * cofactor(0, k) for k in range(3))
+    if n < 6 or determinant <= 0:
+        return None
+    solution = [sum(cofactor(r, k) * right_side[k] for k in range(3)) * (256.0 / determinant) for r in range(3)]
+    return None if max(map(abs, solution)) > 256 * 512 * 5 else [int(np.trunc(value)) for value in solution]
+
+
+def refine_offsets(offset, reference, target):
+    """Offsets (H, W) int32 in 1/256 pixel, refined by the V of the raw costs in a 5 x 5 window along its plane."""
+    given = np.pad(offset.astype(np.int64), 2, constant_values=OFFSET_INVALID)
+    present = np.abs(given) <= 1 << 24
+    ring = np.maximum(*np.abs(np.mgrid[-2:3, -2:3]))
+    refined = np.full(offset.shape, OFFSET_INVALID, dtype=np.int32)
+    for y, x in np.ndindex(offset.shape):
+        centre = int(offset[y, x])
+        if not present[y + 2, x + 2]:
+            continue
+        refined[y, x] = centre
+        difference, there = given[y : y + 5, x : x + 5] - centre, present[y : y + 5, x : x + 5]
+        plane = _offset_plane(difference, there & (np.abs(difference) <= 512 * ring))
+        if plane is None:
+            continue
+        sums, rounded, count = [0, 0, 0], 0, 0
+        for j, i in np.ndindex(5, 5):
+            predicted = _nearest_256(plane[0] + plane[1] * (i - 2) + plane[2] * (j - 2))
+            if not there[j, i] or abs(int(difference[j, i]) - predicted) > 512:
+                continue
+            row, whole = y + j - 2, _nearest_256(predicted + centre)
+            column = x + i - 2 + whole
+            if not 1 <= column < target.shape[1] - 1:
+                continue
+            words = [int(word) for word in target[row, column - 1 : column + 2]]
+            if max(words) >= CENSUS_INVALID:
+                continue
+            sums = [s + (w ^ int(reference[row, x + i - 2])).bit_count() for s, w in zip(sums, words, strict=True)]
+            rounded += predicted + centre - whole * 256
+            count += 1
+        rise = max(sums[0], sums[2]) - sums[1]
+        if count < 6 or rise <= 0 or sums[1] > min(sums):
+            continue
+        tip = 0 if sums[1] == 0 else int(np.trunc((sums[0] - sums[2]) * 128 / rise))
+        result = centre + _nearest_256(plane[0]) + tip - int(np.trunc(rounded / count))
+        column = x + _nearest_256(result)
+        seen = 0 <= column < target.shape[1] and int(target[y, column]) < CENSUS_INVALID
+        if seen and abs(result - centre) <= 256:
+            refined[y, x] = result
+    return refined
+
+
 def transfer_disparity(left, max_step, right_width):
     """Disparity map of the right image's columns: the nearest of the surfaces that meet a column."""
     right = np.full((left.shape[0], right_width), np.nan)
@@ -161,14 +230,15 @@ def _read_depth(depth, u, v):
 
 
 def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma, max_error, tolerance):
-    """Verdict (+1 agrees, -1 looks through, 0 none), the partner's depth and sigma, clearance.
+    """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner sees the point or would if it had a depth
+    there, the partner's depth and sigma, clearance.
 
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
     origin of depth maps. The clearance is the least relative distance from any gate or from a pixel's border.
     """
     shape = depth.shape
     verdict, clearance = np.zeros(shape, dtype=int), np.full(shape, np.inf)
-    carried, spread = np.zeros(shape), np.zeros(shape)
+    carried, spread, observing = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
     for row, col in np.ndindex(shape):
         z = float(depth[row, col])
         if not z > 0:
@@ -179,6 +249,9 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
         if not seen[2] > 0:
             continue
         u, v = pixel[:2] / pixel[2]
+        border = np.subtract(partner_depth.shape[::-1], 1)
+        clearance[row, col] = np.abs([u, v, *(border - (u, v))]).min()
+        observing[row, col] = (np.array([u, v]) >= 0).all() and ([u, v] <= border).all()
         found = _read_depth(partner_depth.astype(float), u, v)
         if not found > 0:
             continue
@@ -194,11 +267,13 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
             verdict[row, col] = 1
         elif difference > 2 * gate:
             verdict[row, col] = -1
+        observing[row, col] = difference >= -2 * gate
         clearance[row, col] = min(
+            clearance[row, col],
             abs(error / max_error - 1),
             abs(abs(difference) / gate - 1),
-            abs(difference / (2 * gate) - 1),
+            abs(abs(difference) / (2 * gate) - 1),
             abs(u % 1 - 0.5),
             abs(v % 1 - 0.5),
         )
-    return verdict, carried, spread, clearance
+    return verdict, observing, carried, spread, clearance

@@ -272,6 +272,63 @@ def test_selection_reaches_the_widest_row(backend, width):
     np.testing.assert_array_equal(offset, 0)
 
 
+# ---- sub-pixel refinement ----------------------------------------------------------------------------------
+
+
+def run_refinement(backend, offset, reference, target):
+    refined = np.full(offset.shape, 5, dtype=np.int32)
+    _native.refine_offsets(backend, offset, reference, target, refined)
+    return refined
+
+
+OFFSETS = {
+    "flat": lambda rng, shape: rng.integers(-200, 200, shape),
+    "sloped": lambda rng, shape: 300 * np.arange(shape[1]) + 90 * np.arange(shape[0])[:, None] - 2000,
+    "steps": lambda rng, shape: rng.choice([-2560, -2400, 0, 512, 513], shape),
+    "extreme": lambda rng, shape: rng.choice(
+        [INT32.min + 1, -(1 << 24), 1 << 24, (1 << 24) + 1, INT32.max], shape
+    ),
+}
+
+
+@every_backend
+@property_test
+@given(
+    size=st.tuples(st.integers(1, 7), st.integers(1, 40)),
+    target_width=st.integers(1, 60),
+    kind=st.sampled_from(list(OFFSETS)),
+    missing=st.sampled_from([0.0, 0.2, 0.9]),
+    likeness=st.sampled_from([0.0, 0.5, 0.9]),
+    seed=seeds,
+)
+def test_refinement_is_the_oracles(backend, size, target_width, kind, missing, likeness, seed):
+    rng = np.random.default_rng(seed)
+    reference, target = words(rng, size, 0), words(rng, (size[0], target_width), 0.05)
+    common = min(size[1], target_width)
+    alike = rng.random((size[0], common)) < likeness
+    target[:, :common][alike] = reference[:, :common][alike]
+    offset = OFFSETS[kind](rng, size).astype(np.int32)
+    offset[rng.random(size) < missing] = oracle.OFFSET_INVALID
+    np.testing.assert_array_equal(
+        run_refinement(backend, offset, reference, target), oracle.refine_offsets(offset, reference, target)
+    )
+
+
+@every_backend
+@pytest.mark.parametrize("position", [-100, 0, 64, 120])
+def test_refinement_finds_the_tip_between_whole_pixels(backend, position):
+    """Costs that grow by 20 bits per pixel from a tip at `position` / 256 pixel: the tip is found."""
+    content = np.zeros((9, 30), dtype=np.uint64)
+    columns = np.arange(30)
+    # Target word of column c: as many bits as the cost between it and any reference pixel at c - 15.
+    costs = np.round(20 * np.abs(columns - 15 - position / 256)).astype(int)
+    target = np.broadcast_to(np.array([(1 << min(c, 62)) - 1 for c in costs], dtype=np.uint64), (9, 30)).copy()
+    offset = np.full((9, 30), oracle.OFFSET_INVALID, dtype=np.int32)
+    offset[:, 13:18] = 256 * (15 - columns[13:18])
+    refined = run_refinement(backend, offset, content, target)
+    assert np.abs(refined[2:-2, 15] - position).max() <= 8
+
+
 # ---- the whole chain ---------------------------------------------------------------------------------------
 
 

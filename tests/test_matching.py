@@ -72,27 +72,27 @@ PLANES = [(0, 0), (25, 120), (45, 0), (45, 90), (60, 0), (60, 30), (60, 90)]
     ("slant", "tilt", "rectification"),
     [*((*plane, "spherical") for plane in PLANES), (25, 120, "frame"), (45, 0, "frame"), (60, 30, "frame")],
 )
-def test_planes_are_matched_to_a_tenth_of_a_pixel(slant, tilt, rectification):
+def test_planes_are_matched_to_a_fraction_of_a_pixel(slant, tilt, rectification):
     matched = Matched(syn.slanted_plane_pair(slant, tilt, focal_length=FOCAL, size=SIZE), rectification)
     assert matched.completeness > 0.98
-    assert np.median(np.abs(matched.error)) < (0.1 if slant < 60 else 0.13)
+    assert np.median(np.abs(matched.error)) < (0.05 if slant < 60 else 0.08)
     assert abs(np.median(matched.error)) < 0.03
     assert (np.abs(matched.error) > 1).mean() < 0.01
 
 
 @pytest.mark.parametrize("depth", [10.0, 9.8, 9.7, 9.6])
 def test_a_single_disparity_is_matched_between_whole_pixels(depth):
-    """One disparity all over: nothing averages out that the sub-pixel fit leans to whole pixels."""
+    """One disparity all over: nothing averages out a fit that leans to whole pixels."""
     matched = Matched(syn.slanted_plane_pair(0, depth=depth, focal_length=FOCAL, size=SIZE), "frame")
     assert np.ptp(matched.truth[matched.seen]) < 1e-6
     assert matched.completeness > 0.98
-    assert np.median(np.abs(matched.error)) < 0.25
+    assert np.median(np.abs(matched.error)) < 0.06
 
 
 def test_a_steep_plane_is_matched():
     matched = Matched(syn.slanted_plane_pair(75, 60, focal_length=FOCAL, size=SIZE))
     assert matched.completeness > 0.6
-    assert np.median(np.abs(matched.error)) < 0.25
+    assert np.median(np.abs(matched.error)) < 0.1
     assert (np.abs(matched.error) > 1).mean() < 0.05
 
 
@@ -108,7 +108,7 @@ def test_scenes_with_occlusions_are_matched(name):
     """Most of what both see is found and right; most of what one alone sees is left out."""
     matched = matched_scene(name)
     assert matched.completeness > 0.95
-    assert np.median(np.abs(matched.error)) < 0.2
+    assert np.median(np.abs(matched.error)) < 0.1
     assert abs(np.median(matched.error)) < 0.03
     assert (np.abs(matched.error) > 1).mean() < 0.04
     assert matched.found[matched.occluded].mean() < 0.2
@@ -150,7 +150,7 @@ def test_no_motion_is_exactly_zero(search):
 
 @pytest.mark.parametrize("shift", [-37, -8, -1, 3, 20])
 @pytest.mark.parametrize("shape", [(64, 200), (71, 151), (300, 290)])
-def test_whole_pixels_are_found_exactly(shape, shift):
+def test_whole_pixels_are_found(shape, shift):
     """Disparity is left column minus right column: content moved left by `shift` has disparity `shift`."""
     scenery = random_image((shape[0], shape[1] + 80)).image
     left = whole(np.ascontiguousarray(scenery[:, 40 : 40 + shape[1]]))
@@ -158,7 +158,7 @@ def test_whole_pixels_are_found_exactly(shape, shift):
     disparity = match_pair(left, right, -40, 40, OPTIONS)
     column = np.arange(shape[1]) - shift
     inner = (column > 12) & (column < shape[1] - 12)
-    assert (disparity[:, inner] == shift).mean() > 0.95
+    assert (np.abs(disparity[:, inner] - shift) < 0.02).mean() > 0.95
     assert (np.abs(disparity[:, inner] - shift) <= 0.5).mean() > 0.99
     # Elsewhere the right image has nothing to match.
     outside = (column < -2) | (column > shape[1] + 1)
@@ -192,7 +192,7 @@ def test_pixels_without_content_are_neither_matched_nor_matched_to():
     inside = (row >= 50) & (row < 80) & (matched > 59.5) & (matched < 99.5)
     assert not inside.any()
     both = (left_valid > 0) & (right_valid > 0)
-    assert (disparity[both] == 0).mean() > 0.95
+    assert (np.abs(disparity[both]) < 0.02).mean() > 0.95
 
 
 def test_nothing_valid_gives_nothing():

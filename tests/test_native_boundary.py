@@ -48,6 +48,12 @@ def arguments(function):
             "max_difference": 2,
             "out offset": np.zeros((H, W), np.int32),
         },
+        "refine_offsets": {
+            "backend": "scalar",
+            "offset": np.zeros((H, W), np.int32),
+            **census_pair,
+            "out refined": np.zeros((H, W), np.int32),
+        },
         "transfer_disparity": {
             "left": np.zeros((H, W), f32),
             "max_step": 2.0,
@@ -85,6 +91,7 @@ def arguments(function):
             "reference_from_partner": matrix.copy(),
             "max_error": 1.0,
             "tolerance": 4.0,
+            "out observing": np.zeros((H, W), u8),
             "out agreeing": np.zeros((H, W), u8),
             "out contradicting": np.zeros((H, W), u8),
             "out weighted_depth": np.zeros((H, W), f32),
@@ -384,7 +391,7 @@ def test_empty_maps_are_no_work(shape):
         np.ones((3, *shape), np.float32), np.ones((3, *shape), np.float32), 3.0, empty, empty.copy(), bytes_
     )
     for reference, other in ((empty, partner), (partner, empty)):
-        counts = [np.zeros(reference.shape, dtype) for dtype in (np.uint8, np.uint8, np.float32, np.float32)]
+        counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
         _native.check_consistency(reference, reference, other, other, matrix, matrix, 1.0, 4.0, *counts)
         assert not any(count.any() for count in counts)
     _native.fit_planes(empty, empty, np.eye(3), 4, 3.0, np.zeros((*shape, 3), np.float32), empty.copy())

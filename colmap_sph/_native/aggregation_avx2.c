@@ -1,87 +1,87 @@
 /* The AVX2 version of aggregation_scalar.c: 32 slots of 8 bits per register, four paths side by side.
  *
- * Path costs lie in rows with a gap of 255s between pixels, wide enough that a load at any shift between two
- * pixels' bases reads "no such slot" and never another pixel. */
+ * The path along the row stays in registers. The three paths from the row before keep one row each, in place: row
+ * n stores pixel x where its predecessor on the path was, which nothing needs any more. Between the pixels lies a
+ * gap of 255s, so that a load one slot beside a pixel's own reads "no such slot". */
 #include <immintrin.h>
 #include <stdlib.h>
 #include <string.h>
 
-#include "kernels.h"
+#include "rows_avx2.h"
 
-enum { PATHS = 4 };
+enum {
+    GAP = DEPTH_STEP,
+    MINIMUM = GAP / 2,            /* where in the gap a pixel's least slot is kept */
+    MAX_VECTORS = MAX_DEPTH / 32, /* registers per pixel */
+    AHEAD = 1024                  /* bytes of the volumes fetched ahead: the processor's own prefetching is late */
+};
 
-typedef struct {
-    uint8_t *slots;  /* first slot of pixel 0 */
-    uint8_t *minima; /* least slot of each pixel */
-} path_row;
+#define ALWAYS_INLINE static inline __attribute__((always_inline))
 
-typedef struct {
-    path_row rows[2][PATHS]; /* [parity of the row][path] */
-    uint8_t *edge;           /* the pixel before the image's edge: all zero, which makes L = C */
-    ptrdiff_t stride;        /* from pixel to pixel in `slots` */
-    uint8_t *memory;
-} path_buffers;
+/* The pixel before the image's edge: it makes L = C. */
+static const uint8_t edge[MAX_DEPTH + 2 * GAP];
 
-static int allocate(path_buffers *buffers, ptrdiff_t width, ptrdiff_t depth) {
-    const ptrdiff_t gap = depth + DEPTH_STEP; /* >= depth + 2, the furthest load from a pixel's slots */
-    const ptrdiff_t row_size = (width * (depth + gap) + gap + 63) / 64 * 64;
-    const ptrdiff_t edge_size = depth + 2 * gap;
-    const ptrdiff_t minima_size = (width + 63) / 64 * 64;
-    const size_t size = (size_t)(2 * PATHS * (row_size + minima_size) + edge_size);
-    buffers->memory = malloc(size);
-    if (!buffers->memory) {
+int sweep_begin(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
+                path_penalties penalties, int backward) {
+    *state = (sweep_state){.base = base,
+                           .image = image,
+                           .size = size,
+                           .penalties = penalties,
+                           .backward = backward,
+                           .stride = size.depth + GAP};
+    const size_t row_size = (size_t)(size.width * state->stride + GAP);
+    state->memory = aligned_alloc(64, (VERTICAL_PATHS * row_size + 63) / 64 * 64);
+    if (!state->memory) {
         return -1;
     }
-    memset(buffers->memory, 255, size);
-    uint8_t *next = buffers->memory;
-    for (int k = 0; k < 2 * PATHS; k++, next += row_size + minima_size) {
-        buffers->rows[k / PATHS][k % PATHS] = (path_row){next + gap, next + row_size};
+    memset(state->memory, 255, VERTICAL_PATHS * row_size);
+    for (int k = 0; k < VERTICAL_PATHS; k++) {
+        state->rows[k] = state->memory + (size_t)k * row_size + GAP;
     }
-    memset(next, 0, (size_t)edge_size);
-    buffers->edge = next + gap;
-    buffers->stride = depth + gap;
     return 0;
 }
 
-/* What one path brings to a pixel: where the slots before it are, already shifted, and its penalties. */
+void sweep_end(sweep_state *state) { free(state->memory); }
+
+ALWAYS_INLINE __m256i load(const uint8_t *p) { return _mm256_loadu_si256((const __m256i *)p); }
+
+ALWAYS_INLINE void store(uint8_t *p, __m256i v) { _mm256_storeu_si256((__m256i *)p, v); }
+
+/* The pixel before on a path: its slots, as the new pixel counts them, and the penalties. */
 typedef struct {
-    const uint8_t *before;
+    const uint8_t *slots;
     __m256i least, jump; /* min_k L(q, k) and that plus P2 */
     __m256i minimum;     /* running minimum of the new slots */
-    uint8_t *path;
 } step;
 
-static inline void begin_step(step *s, const uint8_t *slots, uint8_t least, ptrdiff_t difference, ptrdiff_t depth,
-                              uint8_t p2, uint8_t *path) {
-    const ptrdiff_t limit = depth + 1;
-    s->before = slots + (difference > limit ? limit : difference < -limit ? -limit : difference);
-    s->least = _mm256_set1_epi8((char)least);
-    /* Saturated: without common slots `least` itself has grown to 62 + P2. */
-    s->jump = _mm256_set1_epi8((char)(least + p2 > 255 ? 255 : least + p2));
-    s->minimum = _mm256_set1_epi8((char)255);
-    s->path = path;
+/* Slots from -1 to `depth`: slot i of the result is slot i + difference of `slots`, 255 where there is none. */
+static const uint8_t *shifted(const uint8_t *slots, int64_t difference, ptrdiff_t depth, uint8_t *scratch) {
+    memset(scratch, 255, (size_t)(depth + 2 * GAP));
+    const int64_t first = difference > 0 ? -1 : -difference;
+    const int64_t end = difference < 0 ? depth + 1 : depth - difference;
+    if (end > first) {
+        memcpy(scratch + GAP + first, slots + first + difference, (size_t)(end - first));
+    }
+    return scratch + GAP;
 }
 
-static inline __m256i advance(step *s, ptrdiff_t i, __m256i cost, __m256i p1) {
-    const __m256i same = _mm256_loadu_si256((const __m256i *)(s->before + i));
-    const __m256i below = _mm256_loadu_si256((const __m256i *)(s->before + i - 1));
-    const __m256i above = _mm256_loadu_si256((const __m256i *)(s->before + i + 1));
+ALWAYS_INLINE __m256i advance(step *s, __m256i below, __m256i same, __m256i above, __m256i cost, __m256i p1) {
     const __m256i one_step = _mm256_adds_epu8(_mm256_min_epu8(below, above), p1);
     const __m256i best = _mm256_min_epu8(_mm256_min_epu8(same, one_step), s->jump);
     const __m256i slots = _mm256_add_epi8(cost, _mm256_sub_epi8(best, s->least));
     s->minimum = _mm256_min_epu8(s->minimum, slots);
-    _mm256_storeu_si256((__m256i *)(s->path + i), slots);
     return slots;
 }
 
-static inline uint8_t horizontal_min(__m256i v) {
+/* The least byte, in every byte. */
+ALWAYS_INLINE __m256i horizontal_min(__m256i v) {
     __m128i m = _mm_min_epu8(_mm256_castsi256_si128(v), _mm256_extracti128_si256(v, 1));
     m = _mm_min_epu8(m, _mm_srli_epi16(m, 8));
-    return (uint8_t)_mm_cvtsi128_si32(_mm_minpos_epu16(_mm_and_si128(m, _mm_set1_epi16(255))));
+    return _mm256_broadcastb_epi8(_mm_minpos_epu16(_mm_and_si128(m, _mm_set1_epi16(255))));
 }
 
-/* sums[0..31] (+)= a + b + c + d, 8 bits to 16. */
-static inline void add_paths(uint16_t *sums, int accumulate, __m256i a, __m256i b, __m256i c, __m256i d) {
+/* out[0..31] = in[0..31] + a + b + c + d, 8 bits to 16; without `in` for the first sweep. */
+ALWAYS_INLINE void add_paths(const uint16_t *in, uint16_t *out, __m256i a, __m256i b, __m256i c, __m256i d) {
     const __m256i ones = _mm256_set1_epi8(1);
     const __m256i low = _mm256_add_epi16(_mm256_maddubs_epi16(_mm256_unpacklo_epi8(a, b), ones),
                                          _mm256_maddubs_epi16(_mm256_unpacklo_epi8(c, d), ones));
@@ -89,66 +89,151 @@ static inline void add_paths(uint16_t *sums, int accumulate, __m256i a, __m256i 
                                           _mm256_maddubs_epi16(_mm256_unpackhi_epi8(c, d), ones));
     __m256i first = _mm256_permute2x128_si256(low, high, 0x20);
     __m256i second = _mm256_permute2x128_si256(low, high, 0x31);
-    if (accumulate) {
-        first = _mm256_add_epi16(first, _mm256_loadu_si256((const __m256i *)sums));
-        second = _mm256_add_epi16(second, _mm256_loadu_si256((const __m256i *)(sums + 16)));
+    if (in) {
+        first = _mm256_add_epi16(first, _mm256_loadu_si256((const __m256i *)in));
+        second = _mm256_add_epi16(second, _mm256_loadu_si256((const __m256i *)(in + 16)));
     }
-    _mm256_storeu_si256((__m256i *)sums, first);
-    _mm256_storeu_si256((__m256i *)(sums + 16), second);
+    _mm256_storeu_si256((__m256i *)out, first);
+    _mm256_storeu_si256((__m256i *)(out + 16), second);
 }
 
-static inline void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                         uint8_t p1, const uint8_t *p2, int32_t max_slant, int backward, path_buffers *buffers,
-                         uint16_t *aggregated) {
-    const ptrdiff_t direction = backward ? -1 : 1, depth = size.depth;
-    const __m256i p1_vector = _mm256_set1_epi8((char)p1);
-    for (ptrdiff_t n = 0; n < size.height; n++) {
-        const ptrdiff_t y = backward ? size.height - 1 - n : n;
-        path_row *now = buffers->rows[n & 1], *above = buffers->rows[!(n & 1)];
-        for (ptrdiff_t m = 0; m < size.width; m++) {
-            const ptrdiff_t x = backward ? size.width - 1 - m : m;
-            const ptrdiff_t p = y * size.width + x;
-            const uint8_t *pixel_cost = cost + p * depth;
-            uint16_t *sums = aggregated + p * depth;
-            step steps[PATHS];
-            for (int k = 0; k < PATHS; k++) {
-                /* Path 0 comes along the row, 1 to 3 from the three neighbours in the row before. */
-                const ptrdiff_t before_x = k == 0 ? x - direction : x + (k - 2) * direction;
-                const ptrdiff_t q = (k == 0 ? y : y - direction) * size.width + before_x;
-                const path_row *from = k == 0 ? now : above + k;
-                uint8_t *path = now[k].slots + x * buffers->stride;
-                if (before_x < 0 || before_x >= size.width || (k > 0 && n == 0)) {
-                    begin_step(&steps[k], buffers->edge, 0, 0, depth, p2[0], path);
-                } else {
-                    const ptrdiff_t difference = (ptrdiff_t)base[p] - base[q];
-                    begin_step(&steps[k], from->slots + before_x * buffers->stride, from->minima[before_x],
-                               llabs(difference) <= max_slant ? 0 : difference, depth,
-                               p2[abs(image[p] - image[q])], path);
-                }
-            }
-            for (ptrdiff_t i = 0; i < depth; i += DEPTH_STEP) {
-                const __m256i c = _mm256_loadu_si256((const __m256i *)(pixel_cost + i));
-                const __m256i l0 = advance(&steps[0], i, c, p1_vector);
-                const __m256i l1 = advance(&steps[1], i, c, p1_vector);
-                const __m256i l2 = advance(&steps[2], i, c, p1_vector);
-                const __m256i l3 = advance(&steps[3], i, c, p1_vector);
-                add_paths(sums + i, backward, l0, l1, l2, l3);
-            }
-            for (int k = 0; k < PATHS; k++) {
-                now[k].minima[x] = horizontal_min(steps[k].minimum);
-            }
+ALWAYS_INLINE void prefetch(const void *row, ptrdiff_t offset) {
+    _mm_prefetch((const char *)((uintptr_t)row + (uintptr_t)offset), _MM_HINT_T0);
+}
+
+/* Path k comes from the row before: from column x - 1, x or x + 1 in the direction of the sweep. */
+ALWAYS_INLINE step begin_vertical(const sweep_state *s, ptrdiff_t y, ptrdiff_t x, int k, const uint8_t *place,
+                                  ptrdiff_t depth, uint8_t *scratch) {
+    const ptrdiff_t direction = s->backward ? -1 : 1, width = s->size.width;
+    const ptrdiff_t before_x = x + (k - 1) * direction;
+    if (s->done == 0 || before_x < 0 || before_x >= width) {
+        const __m256i zero = _mm256_setzero_si256();
+        return (step){edge + GAP, zero, zero, _mm256_set1_epi8((char)255)};
+    }
+    const ptrdiff_t p = y * width + x, q = (y - direction) * width + before_x;
+    const int64_t difference = (int64_t)s->base[p] - s->base[q];
+    const int jump = s->penalties.p2[abs(s->image[p] - s->image[q])];
+    const __m256i least = _mm256_set1_epi8((char)place[depth + MINIMUM]);
+    /* Saturated: without common slots `least` itself has grown to 62 + P2. */
+    return (step){llabs(difference) <= s->penalties.max_slant ? place : shifted(place, difference, depth, scratch),
+                  least, _mm256_adds_epu8(least, _mm256_set1_epi8((char)jump)), _mm256_set1_epi8((char)255)};
+}
+
+/* The path along the row: slots of the pixel before in registers. */
+typedef struct {
+    __m256i slots[MAX_VECTORS];
+    __m256i first_below, last_above; /* what lies beside them */
+} along_row;
+
+ALWAYS_INLINE step begin_along(const sweep_state *s, ptrdiff_t p, __m256i least, ptrdiff_t depth,
+                               along_row *along) {
+    const ptrdiff_t q = p - (s->backward ? -1 : 1);
+    const int64_t difference = (int64_t)s->base[p] - s->base[q];
+    const int jump = s->penalties.p2[abs(s->image[p] - s->image[q])];
+    along->first_below = along->last_above = _mm256_set1_epi8((char)255);
+    if (llabs(difference) > s->penalties.max_slant) {
+        uint8_t unshifted[MAX_DEPTH], scratch[MAX_DEPTH + 2 * GAP];
+        for (ptrdiff_t i = 0; i < depth / 32; i++) {
+            store(unshifted + 32 * i, along->slots[i]);
         }
+        const uint8_t *slots = shifted(unshifted, difference, depth, scratch);
+        for (ptrdiff_t i = 0; i < depth / 32; i++) {
+            along->slots[i] = load(slots + 32 * i);
+        }
+        along->first_below = load(slots - 32);
+        along->last_above = load(slots + depth);
+    }
+    return (step){NULL, least, _mm256_adds_epu8(least, _mm256_set1_epi8((char)jump)), _mm256_set1_epi8((char)255)};
+}
+
+ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
+                                uint16_t *sums_out, const ptrdiff_t depth) {
+    const ptrdiff_t direction = s->backward ? -1 : 1, width = s->size.width, vectors = depth / 32;
+    const ptrdiff_t turned = s->done % width;
+    const __m256i p1 = _mm256_set1_epi8((char)s->penalties.p1), zero = _mm256_setzero_si256();
+    uint8_t scratch[VERTICAL_PATHS][MAX_DEPTH + 2 * GAP];
+    along_row along;
+    step horizontal = {NULL, zero, zero, _mm256_set1_epi8((char)255)};
+    along.first_below = along.last_above = zero;
+    for (ptrdiff_t i = 0; i < vectors; i++) {
+        along.slots[i] = zero; /* as `edge` */
+    }
+    for (ptrdiff_t m = 0; m < width; m++) {
+        const ptrdiff_t x = s->backward ? width - 1 - m : m;
+        const uint8_t *pixel_cost = cost + x * depth;
+        uint8_t *places[VERTICAL_PATHS];
+        step steps[VERTICAL_PATHS];
+        for (int k = 0; k < VERTICAL_PATHS; k++) {
+            /* Row n of path k has pixel x at x + (k - 1) n, going round: its predecessor's place in row n - 1. */
+            ptrdiff_t place = x + (k - 1) * direction * turned;
+            place += place < 0 ? width : place >= width ? -width : 0;
+            places[k] = s->rows[k] + place * s->stride;
+            steps[k] = begin_vertical(s, y, x, k, places[k], depth, scratch[k]);
+        }
+        if (m > 0) {
+            horizontal = begin_along(s, y * width + x, horizontal.least, depth, &along);
+        }
+        __m256i beside = along.first_below, paths[VERTICAL_PATHS] = {zero, zero, zero};
+        for (ptrdiff_t i = 0; i < vectors; i++) {
+            const __m256i c = load(pixel_cost + 32 * i);
+            prefetch(pixel_cost, 32 * i + direction * AHEAD);
+            for (int k = 0; k < VERTICAL_PATHS; k++) {
+                const uint8_t *slots = steps[k].slots + 32 * i;
+                const __m256i below = load(slots - 1), same = load(slots), above = load(slots + 1);
+                if (i > 0) {
+                    store(places[k] + 32 * (i - 1), paths[k]); /* not before `below` was read from there */
+                }
+                paths[k] = advance(&steps[k], below, same, above, c, p1);
+            }
+            const __m256i old = along.slots[i];
+            const __m256i next = i + 1 < vectors ? along.slots[i + 1] : along.last_above;
+            const __m256i below = _mm256_alignr_epi8(old, _mm256_permute2x128_si256(beside, old, 0x21), 15);
+            const __m256i above = _mm256_alignr_epi8(_mm256_permute2x128_si256(old, next, 0x21), old, 1);
+            along.slots[i] = advance(&horizontal, below, old, above, c, p1);
+            beside = old;
+            uint16_t *out = sums_out + x * depth + 32 * i;
+            prefetch((sums_in ? sums_in : sums_out) + x * depth, 64 * i + direction * AHEAD);
+            add_paths(sums_in ? sums_in + x * depth + 32 * i : NULL, out, paths[0], paths[1], paths[2],
+                      along.slots[i]);
+        }
+        for (int k = 0; k < VERTICAL_PATHS; k++) {
+            store(places[k] + depth - 32, paths[k]);
+            places[k][depth + MINIMUM] = (uint8_t)_mm256_extract_epi8(horizontal_min(steps[k].minimum), 0);
+        }
+        horizontal.least = horizontal_min(horizontal.minimum);
+    }
+    s->done++;
+}
+
+void sweep_row(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in, uint16_t *sums_out) {
+    /* The usual numbers of disparities as constants, for which the compiler keeps slots in registers. */
+    switch (s->size.depth) {
+    case 32:
+        sums_in ? sweep_row_of(s, y, cost, sums_in, sums_out, 32) : sweep_row_of(s, y, cost, NULL, sums_out, 32);
+        break;
+    case 64:
+        sums_in ? sweep_row_of(s, y, cost, sums_in, sums_out, 64) : sweep_row_of(s, y, cost, NULL, sums_out, 64);
+        break;
+    case 128:
+        sums_in ? sweep_row_of(s, y, cost, sums_in, sums_out, 128) : sweep_row_of(s, y, cost, NULL, sums_out, 128);
+        break;
+    default:
+        sweep_row_of(s, y, cost, sums_in, sums_out, s->size.depth);
     }
 }
 
-int aggregation_avx2(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
-                     const uint8_t *p2, int32_t max_slant, uint16_t *aggregated) {
-    path_buffers buffers;
-    if (allocate(&buffers, size.width, size.depth)) {
-        return -1;
+int aggregation_avx2(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
+                     path_penalties penalties, uint16_t *aggregated) {
+    for (int backward = 0; backward < 2; backward++) {
+        sweep_state state;
+        if (sweep_begin(&state, base, image, size, penalties, backward)) {
+            return -1;
+        }
+        for (ptrdiff_t n = 0; n < size.height; n++) {
+            const ptrdiff_t y = backward ? size.height - 1 - n : n, row = y * size.width * size.depth;
+            sweep_row(&state, y, cost + row, backward ? aggregated + row : NULL, aggregated + row);
+        }
+        sweep_end(&state);
     }
-    sweep(cost, base, image, size, p1, p2, max_slant, 0, &buffers, aggregated);
-    sweep(cost, base, image, size, p1, p2, max_slant, 1, &buffers, aggregated);
-    free(buffers.memory);
     return 0;
 }

@@ -40,8 +40,8 @@ static void path_step(const uint8_t *cost, const uint8_t *before, ptrdiff_t dept
 }
 
 /* One sweep: the four paths that come from pixels already visited, top-left to bottom-right or back. */
-static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
-                  const uint8_t *p2, int32_t max_slant, int backward, uint8_t *scratch, uint16_t *aggregated) {
+static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
+                  path_penalties penalties, int backward, uint8_t *scratch, uint16_t *aggregated) {
     const ptrdiff_t step = backward ? -1 : 1;
     const ptrdiff_t row_size = size.width * size.depth;
     uint8_t *rows[2][4]; /* [current or previous row][path] */
@@ -65,7 +65,8 @@ static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image
                 const int contrast = inside ? abs(image[p] - image[q]) : 0;
                 uint8_t *current = rows[now][path] + x * size.depth;
                 path_step(cost + p * size.depth, inside ? before : NULL, size.depth,
-                          llabs(difference) <= max_slant ? 0 : difference, p1, p2[contrast], current);
+                          llabs(difference) <= penalties.max_slant ? 0 : difference, penalties.p1,
+                          penalties.p2[contrast], current);
                 for (ptrdiff_t i = 0; i < size.depth; i++) {
                     const int first = path == 0 && !backward;
                     sums[i] = (uint16_t)((first ? 0 : sums[i]) + current[i]);
@@ -75,14 +76,14 @@ static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image
     }
 }
 
-int aggregation_scalar(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size, uint8_t p1,
-                       const uint8_t *p2, int32_t max_slant, uint16_t *aggregated) {
+int aggregation_scalar(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
+                       path_penalties penalties, uint16_t *aggregated) {
     uint8_t *scratch = malloc((size_t)(8 * size.width * size.depth));
     if (!scratch) {
         return -1;
     }
-    sweep(cost, base, image, size, p1, p2, max_slant, 0, scratch, aggregated);
-    sweep(cost, base, image, size, p1, p2, max_slant, 1, scratch, aggregated);
+    sweep(cost, base, image, size, penalties, 0, scratch, aggregated);
+    sweep(cost, base, image, size, penalties, 1, scratch, aggregated);
     free(scratch);
     return 0;
 }

@@ -11,13 +11,12 @@ static inline vector transform(const double *m, const double *t, double x, doubl
                     (m[6] * x + m[7] * y + m[8]) * z + t[2]};
 }
 
-/* Depth map value at (u, v): bilinear in inverse depth where the four neighbours are one surface, else nearest.
- * 0 = none. */
+static inline void count(uint8_t *counter) { *counter += *counter < UINT8_MAX; }
+
+/* Depth map value at (u, v) inside the map: bilinear in inverse depth where the four neighbours are one surface,
+ * else nearest. 0 = none. */
 static float sample_depth(const float *depth, ptrdiff_t height, ptrdiff_t width, double u, double v,
                           float max_relative_step) {
-    if (!(u >= 0 && v >= 0 && u <= (double)(width - 1) && v <= (double)(height - 1))) {
-        return 0;
-    }
     const float nearest = depth[(ptrdiff_t)(v + 0.5) * width + (ptrdiff_t)(u + 0.5)];
     const ptrdiff_t x = (ptrdiff_t)u, y = (ptrdiff_t)v;
     if (x + 1 >= width || y + 1 >= height || !(nearest > 0)) {
@@ -38,8 +37,8 @@ static float sample_depth(const float *depth, ptrdiff_t height, ptrdiff_t width,
 void check_consistency(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                        const float *partner_depth, const float *partner_sigma, ptrdiff_t partner_height,
                        ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
-                       float tolerance, uint8_t *agreeing, uint8_t *contradicting, float *weighted_depth,
-                       float *weight) {
+                       float tolerance, uint8_t *observing, uint8_t *agreeing, uint8_t *contradicting,
+                       float *weighted_depth, float *weight) {
     const double max_error_squared = (double)max_reprojection_error * max_reprojection_error;
     for (ptrdiff_t row = 0; row < height; row++) {
         for (ptrdiff_t column = 0; column < width; column++) {
@@ -53,8 +52,12 @@ void check_consistency(const float *depth, const float *sigma, ptrdiff_t height,
                 continue;
             }
             const double u = seen.x / seen.z, v = seen.y / seen.z;
+            if (!(u >= 0 && v >= 0 && u <= (double)(partner_width - 1) && v <= (double)(partner_height - 1))) {
+                continue;
+            }
             const float partner = sample_depth(partner_depth, partner_height, partner_width, u, v, 0.02f);
             if (!(partner > 0)) {
+                count(&observing[p]);
                 continue;
             }
             const float partner_spread =
@@ -68,10 +71,12 @@ void check_consistency(const float *depth, const float *sigma, ptrdiff_t height,
                 const float w = 1 / (partner_spread * partner_spread);
                 weighted_depth[p] += w * ((float)back.z - depth[p]);
                 weight[p] += w;
-                agreeing[p] += agreeing[p] < UINT8_MAX;
-            } else if (difference > 2 * gate) {
-                /* The partner looks through this point at something behind it. */
-                contradicting[p] += contradicting[p] < UINT8_MAX;
+                count(&agreeing[p]);
+                count(&observing[p]);
+            } else if (difference >= -2 * gate) { /* else it sees something nearer, which hides the point */
+                count(&observing[p]);
+                /* Or it looks through this point at something behind it. */
+                contradicting[p] += difference > 2 * gate && contradicting[p] < UINT8_MAX;
             }
         }
     }

@@ -2,7 +2,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "kernels.h"
+#include "rows_avx2.h"
 
 /* Hamming distances of one census word to 4 others, one per 64-bit lane. */
 static inline __m256i hamming_4(__m256i reference, const uint64_t *target) {
@@ -39,35 +39,42 @@ static inline __m256i hamming_32(__m256i reference, const uint64_t *target) {
     return _mm256_set_m128i(_mm_unpackhi_epi16(low, high), _mm_unpacklo_epi16(low, high));
 }
 
-int cost_avx2(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-              uint8_t *cost) {
-    /* One target row with `depth` unseen pixels on both sides: every load stays inside. */
+uint64_t *cost_row_buffer(match_size size) {
     const ptrdiff_t padded_width = size.target_width + 2 * size.depth;
-    uint64_t *padded = malloc((size_t)padded_width * sizeof *padded);
-    if (!padded) {
-        return -1;
+    uint64_t *buffer = malloc((size_t)padded_width * sizeof *buffer);
+    for (ptrdiff_t i = 0; buffer && i < padded_width; i++) {
+        buffer[i] = CENSUS_INVALID;
     }
-    for (ptrdiff_t i = 0; i < padded_width; i++) {
-        padded[i] = CENSUS_INVALID;
-    }
-    uint64_t *row = padded + size.depth;
-    for (ptrdiff_t y = 0; y < size.height; y++) {
-        memcpy(row, target + y * size.target_width, (size_t)size.target_width * sizeof *row);
-        for (ptrdiff_t x = 0; x < size.width; x++) {
-            const ptrdiff_t pixel = y * size.width + x;
-            uint8_t *slots = cost + pixel * size.depth;
-            if (reference[pixel] & CENSUS_INVALID) {
-                memset(slots, 0, (size_t)size.depth);
-                continue;
-            }
-            const __m256i word = _mm256_set1_epi64x((long long)reference[pixel]);
-            ptrdiff_t first = x + base[pixel];
-            first = first < -size.depth ? -size.depth : first > size.target_width ? size.target_width : first;
-            for (ptrdiff_t i = 0; i < size.depth; i += DEPTH_STEP) {
-                _mm256_storeu_si256((__m256i *)(slots + i), hamming_32(word, row + first + i));
-            }
+    return buffer;
+}
+
+void cost_row(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
+              uint64_t *buffer, uint8_t *cost) {
+    uint64_t *row = buffer + size.depth;
+    memcpy(row, target, (size_t)size.target_width * sizeof *row);
+    for (ptrdiff_t x = 0; x < size.width; x++) {
+        uint8_t *slots = cost + x * size.depth;
+        if (reference[x] & CENSUS_INVALID) {
+            memset(slots, 0, (size_t)size.depth);
+            continue;
+        }
+        const __m256i word = _mm256_set1_epi64x((long long)reference[x]);
+        ptrdiff_t first = x + base[x];
+        first = first < -size.depth ? -size.depth : first > size.target_width ? size.target_width : first;
+        for (ptrdiff_t i = 0; i < size.depth; i += DEPTH_STEP) {
+            _mm256_storeu_si256((__m256i *)(slots + i), hamming_32(word, row + first + i));
         }
     }
-    free(padded);
-    return 0;
+}
+
+int cost_avx2(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
+              uint8_t *cost) {
+    uint64_t *buffer = cost_row_buffer(size);
+    for (ptrdiff_t y = 0; buffer && y < size.height; y++) {
+        cost_row(reference + y * size.width, target + y * size.target_width, base + y * size.width, size, buffer,
+                 cost + y * size.width * size.depth);
+    }
+    const int status = buffer ? 0 : -1;
+    free(buffer);
+    return status;
 }

@@ -2,15 +2,16 @@
 
 #include "kernels.h"
 
-static const kernel_table scalar_kernels = {"scalar", census_scalar, cost_scalar, aggregation_scalar,
-                                            selection_scalar};
+static const kernel_table scalar_kernels = {"scalar",           census_scalar,    cost_scalar,
+                                            aggregation_scalar, selection_scalar, refine_offsets_scalar};
 
 #ifdef COLMAP_SPH_HAVE_AVX2
-static const kernel_table avx2_kernels = {"avx2", census_avx2, cost_avx2, aggregation_avx2, selection_avx2};
+static const kernel_table avx2_kernels = {"avx2",           census_avx2,    cost_avx2,
+                                          aggregation_avx2, selection_avx2, refine_offsets_avx2};
 
 static int has_avx2(void) {
     __builtin_cpu_init();
-    return __builtin_cpu_supports("avx2");
+    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("popcnt");
 }
 #endif
 

@@ -18,7 +18,9 @@ enum {
     MAX_P2 = 255 - CENSUS_BITS,
     DEPTH_STEP = 32,
     MAX_DEPTH = 1024,
-    MAX_FIT_RADIUS = 16
+    MAX_FIT_RADIUS = 16,
+    MAX_OFFSET_STEP = 512, /* 1/256 pixel: neighbours whose offsets differ by more are not one surface */
+    MAX_REFINEMENT = 256   /* 1/256 pixel */
 };
 
 /* Bit 63 of a census word marks a pixel without image content. */
@@ -38,15 +40,26 @@ typedef void census_fn(const uint8_t *padded, const uint8_t *valid, ptrdiff_t he
 typedef int cost_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
                     uint8_t *cost);
 
-/* Sum over 8 paths. `p2` holds P2 by absolute intensity difference, p1 <= p2 <= MAX_P2. Bases of neighbours that
- * differ by at most `max_slant` are taken for the slope of one surface, which then costs nothing to follow. */
+typedef struct {
+    uint8_t p1;
+    const uint8_t *p2; /* by absolute intensity difference; p1 <= p2 <= MAX_P2 */
+    /* Bases of neighbours that differ by at most this are taken for the slope of one surface, which then costs
+     * nothing to follow. */
+    int32_t max_slant;
+} path_penalties;
+
+/* Sum over 8 paths. */
 typedef int aggregation_fn(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                           uint8_t p1, const uint8_t *p2, int32_t max_slant, uint16_t *aggregated);
+                           path_penalties penalties, uint16_t *aggregated);
 
 /* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. */
 typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference,
                          const uint64_t *target, match_size size, int32_t max_left_right_difference,
                          int32_t *offset);
+
+/* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
+typedef void refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                               match_size size, int32_t *refined);
 
 typedef struct {
     const char *name;
@@ -54,12 +67,14 @@ typedef struct {
     cost_fn *cost;
     aggregation_fn *aggregation;
     selection_fn *selection;
+    refine_offsets_fn *refine_offsets;
 } kernel_table;
 
 census_fn census_scalar, census_avx2;
 cost_fn cost_scalar, cost_avx2;
 aggregation_fn aggregation_scalar, aggregation_avx2;
 selection_fn selection_scalar, selection_avx2;
+refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
 
 /* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
 int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
@@ -104,13 +119,14 @@ typedef struct {
     double back_translation[3];
 } view_transfer;
 
-/* Adds to `agreeing` (and `contradicting`) the partner's verdict on every pixel of a depth map, and the
- * partner's depth, carried to the reference ray, to the running weighted sums. */
+/* Adds the partner's verdict on every pixel of a depth map: to `observing` if it has the point in view and sees
+ * nothing in front of it, to `agreeing` or `contradicting`; and the partner's depth, carried to the reference ray,
+ * to the running weighted sums. */
 void check_consistency(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                        const float *partner_depth, const float *partner_sigma, ptrdiff_t partner_height,
                        ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
-                       float tolerance, uint8_t *agreeing, uint8_t *contradicting, float *weighted_depth,
-                       float *weight);
+                       float tolerance, uint8_t *observing, uint8_t *agreeing, uint8_t *contradicting,
+                       float *weighted_depth, float *weight);
 
 /* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
  * depth, and the depth of each plane at its centre; zeros where no plane fits. */

@@ -139,8 +139,9 @@ static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     if (aggregated && check_depth(shape[2]) && check_width(shape[1]) && check_penalties(p1, p2) &&
         check(max_slant >= 0, "the slant must not be negative") && arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], 0, shape[2]};
+        const path_penalties penalties = {(uint8_t)p1, p2, max_slant};
         Py_BEGIN_ALLOW_THREADS;
-        status = table->aggregation(cost, base, image, size, (uint8_t)p1, p2, max_slant, aggregated);
+        status = table->aggregation(cost, base, image, size, penalties, aggregated);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
@@ -172,6 +173,30 @@ static PyObject *py_selection(PyObject *self, PyObject *args) {
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
+}
+
+static PyObject *py_refine_offsets(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[4];
+    if (!PyArg_ParseTuple(args, "sOOOO", &backend, &o[0], &o[1], &o[2], &o[3])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[2] = {-1, -1};
+    const int32_t *offset = table ? array_get(&arrays, o[0], "offset", I32, 2, READ, shape) : NULL;
+    const uint64_t *reference = offset ? array_get(&arrays, o[1], "reference", U64, 2, READ, shape) : NULL;
+    Py_ssize_t target_shape[2] = {shape[0], -1};
+    const uint64_t *target = reference ? array_get(&arrays, o[2], "target", U64, 2, READ, target_shape) : NULL;
+    int32_t *refined = target ? array_get(&arrays, o[3], "refined", I32, 2, WRITE, shape) : NULL;
+    if (refined && check_width(shape[1]) && check_width(target_shape[1]) && arrays_disjoint(&arrays)) {
+        const match_size size = {shape[0], shape[1], target_shape[1], 0};
+        Py_BEGIN_ALLOW_THREADS;
+        table->refine_offsets(offset, reference, target, size, refined);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
 }
 
 static PyObject *py_transfer_disparity(PyObject *self, PyObject *args) {
@@ -264,10 +289,10 @@ static int copy_transfer(array_set *arrays, PyObject *forward, PyObject *back, v
 
 static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     (void)self;
-    PyObject *o[10];
+    PyObject *o[11];
     float max_error, tolerance;
-    if (!PyArg_ParseTuple(args, "OOOOOOffOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &max_error, &tolerance,
-                          &o[6], &o[7], &o[8], &o[9])) {
+    if (!PyArg_ParseTuple(args, "OOOOOOffOOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &max_error, &tolerance,
+                          &o[6], &o[7], &o[8], &o[9], &o[10])) {
         return NULL;
     }
     array_set arrays = {.count = 0};
@@ -279,15 +304,16 @@ static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     const float *partner_sigma =
         partner ? array_get(&arrays, o[3], "partner_sigma", F32, 2, READ, partner_shape) : NULL;
     const int ready = partner_sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
-    uint8_t *agreeing = ready ? array_get(&arrays, o[6], "agreeing", U8, 2, WRITE, shape) : NULL;
-    uint8_t *contradicting = agreeing ? array_get(&arrays, o[7], "contradicting", U8, 2, WRITE, shape) : NULL;
-    float *weighted = contradicting ? array_get(&arrays, o[8], "weighted_depth", F32, 2, WRITE, shape) : NULL;
-    float *weight = weighted ? array_get(&arrays, o[9], "weight", F32, 2, WRITE, shape) : NULL;
+    uint8_t *observing = ready ? array_get(&arrays, o[6], "observing", U8, 2, WRITE, shape) : NULL;
+    uint8_t *agreeing = observing ? array_get(&arrays, o[7], "agreeing", U8, 2, WRITE, shape) : NULL;
+    uint8_t *contradicting = agreeing ? array_get(&arrays, o[8], "contradicting", U8, 2, WRITE, shape) : NULL;
+    float *weighted = contradicting ? array_get(&arrays, o[9], "weighted_depth", F32, 2, WRITE, shape) : NULL;
+    float *weight = weighted ? array_get(&arrays, o[10], "weight", F32, 2, WRITE, shape) : NULL;
     if (weight && arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
         check_consistency(depth, sigma, shape[0], shape[1], partner, partner_sigma, partner_shape[0],
-                          partner_shape[1], &transfer, max_error, tolerance, agreeing, contradicting, weighted,
-                          weight);
+                          partner_shape[1], &transfer, max_error, tolerance, observing, agreeing, contradicting,
+                          weighted, weight);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -325,6 +351,8 @@ static PyMethodDef methods[] = {
      "aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)"},
     {"selection", py_selection, METH_VARARGS,
      "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
+    {"refine_offsets", py_refine_offsets, METH_VARARGS,
+     "refine_offsets(backend, offset, reference, target, refined)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},
     {"depth_candidates", py_depth_candidates, METH_VARARGS,
      "depth_candidates(disparity, rectified_from_pixel, (columns_per_radian, rows_per_radian), "
@@ -333,8 +361,8 @@ static PyMethodDef methods[] = {
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
     {"check_consistency", py_check_consistency, METH_VARARGS,
      "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
-     "reference_from_partner, max_reprojection_error, tolerance, agreeing, contradicting, weighted_depth, "
-     "weight)"},
+     "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
+     "weighted_depth, weight)"},
     {"fit_planes", py_fit_planes, METH_VARARGS,
      "fit_planes(inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
     {NULL, NULL, 0, NULL}};

@@ -1,0 +1,2 @@
+#define REFINE_OFFSETS refine_offsets_scalar
+#include "subpixel.inc"
