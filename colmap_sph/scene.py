@@ -6,7 +6,7 @@ the first pixel's centre is at (0.5, 0.5).
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
+from colmap_sph.map_coordinates import local_origin
 from colmap_sph.model_check import check_binary_file
 
 logger = logging.getLogger(__name__)
@@ -79,10 +80,14 @@ class Scene:
         Sorted by name.
     points : (N, 3) float64 ndarray
         Sparse points in the world frame, in model units.
+    origin : (3,) float64 ndarray
+        Where the scene's world origin lies in the model's coordinates: zero, but for a model in map
+        coordinates, whose scene is moved near its origin.
     """
 
     views: tuple[View, ...]
     points: NDArray[np.float64]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     @cached_property
     def index_of(self) -> dict[str, int]:
@@ -99,7 +104,8 @@ class Scene:
 def read_scene(sparse_dir: Path) -> Scene:
     """Read an undistorted COLMAP model, such as the ``sparse`` folder of a dense workspace.
 
-    Views whose pose or calibration is not finite, and points that are not, are left out with a warning.
+    Views whose pose or calibration is not finite, and points that are not, are left out with a warning. A model
+    in map coordinates is moved near its origin, see `Scene.origin`.
 
     Parameters
     ----------
@@ -117,15 +123,18 @@ def read_scene(sparse_dir: Path) -> Scene:
         No readable model in the folder, no registered image, or a distorted camera.
     """
     model = load_model(sparse_dir)
+    origin = local_origin(model)
+    if origin.any():
+        logger.info("%s is in map coordinates; worked on relative to %s", sparse_dir, tuple(origin.tolist()))
     points, row_of = _read_points(model)
-    views = [_read_view(model, image_id, row_of, sparse_dir) for image_id in model.reg_image_ids()]
+    views = [_read_view(model, image_id, row_of, sparse_dir, origin) for image_id in model.reg_image_ids()]
     usable = [view for view in views if _is_finite(view)]
     for view in views:
         if not _is_finite(view):
             logger.warning("%s: the pose or calibration in %s is not finite; left out", view.name, sparse_dir)
     if not usable:
         raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
-    return Scene(tuple(sorted(usable, key=lambda view: view.name)), points)
+    return Scene(tuple(sorted(usable, key=lambda view: view.name)), points - origin, origin)
 
 
 def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
@@ -215,7 +224,13 @@ def _read_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], d
     return points[kept], {ids[index]: row for row, index in enumerate(kept)}
 
 
-def _read_view(model: pycolmap.Reconstruction, image_id: int, row_of: dict[int, int], sparse_dir: Path) -> View:
+def _read_view(
+    model: pycolmap.Reconstruction,
+    image_id: int,
+    row_of: dict[int, int],
+    sparse_dir: Path,
+    origin: NDArray[np.float64],
+) -> View:
     image = model.image(image_id)
     camera = model.camera(image.camera_id)
     if not is_pinhole(camera):
@@ -233,7 +248,7 @@ def _read_view(model: pycolmap.Reconstruction, image_id: int, row_of: dict[int, 
         height=camera.height,
         K=np.array(camera.calibration_matrix(), dtype=np.float64),
         R=np.ascontiguousarray(pose[:, :3]),
-        t=np.ascontiguousarray(pose[:, 3]),
+        t=pose[:, 3] + pose[:, :3] @ origin,
         point_indices=np.array(sorted(rows), dtype=np.int64),
     )
 
