@@ -26,12 +26,13 @@ from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate
 from colmap_sph.errors import ColmapSphError, InputError, NoResultError, OptionError, OutputError
 from colmap_sph.fusion import explain_losses, fuse
 from colmap_sph.load_cache import LoadCache
+from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, match_pair
 from colmap_sph.normals import fit_normals
 from colmap_sph.options import RunOptions
 from colmap_sph.pair_files import read_arrays, read_pair, write_pair
 from colmap_sph.pairs import select_pairs
-from colmap_sph.rectification import rectify_pair, resample
+from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
 from colmap_sph.report import Progress, RunReport, Silent
 from colmap_sph.scene import Scene, View, load_model, read_scene
 from colmap_sph.undistortion import UndistortionOptions, leave_out_bad_images, open_workspace, prepare_workspace
@@ -62,6 +63,7 @@ def run(
     model: Path | str | None = None,
     *,
     images: Path | str | None = None,
+    masks: Path | str | None = None,
     output: Path | str | None = None,
     workspace: Path | str | None = None,
     options: RunOptions | None = None,
@@ -75,10 +77,13 @@ def run(
         COLMAP sparse model; its images are undistorted into `output`.
     images : Path, optional
         Original images; found by COLMAP's usual layouts if not given.
+    masks : Path, optional
+        Folder of masks ``NAME.png``, black where image NAME is to be ignored: of the original images, or with
+        `workspace` of the undistorted ones.
     output : Path, optional
         Dense workspace to create; "dense" beside the model's project if not given.
     workspace : Path, optional
-        An existing dense workspace, instead of the three above.
+        An existing dense workspace, instead of `model`, `images` and `output`.
     options : RunOptions, optional
     progress : Progress, optional
 
@@ -95,16 +100,18 @@ def run(
     progress = Silent() if progress is None else progress
     options.check()
     root = workspace_root(model, images=images, output=output, workspace=workspace)
+    masks = None if masks is None else Path(masks)
     if model is None:
         if options.undistortion != UndistortionOptions():
             raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
         with _stage(report, progress, "undistort", 1):
-            dense = open_workspace(root)
+            dense = open_workspace(root, masks)
             progress.advance()
         return reconstruct(dense, options, progress=progress, report=report)
     model = Path(model)
     with _stage(report, progress, "undistort", 1):
-        dense = prepare_workspace(model, None if images is None else Path(images), root, options.undistortion)
+        originals = None if images is None else Path(images)
+        dense = prepare_workspace(model, originals, root, options.undistortion, masks)
         registered = load_model(model)
         names = [registered.image(image_id).name for image_id in registered.reg_image_ids()]
         progress.advance()
@@ -199,14 +206,23 @@ def match_pairs(
     """
     make_dir(_pairs_dir(workspace))
     images = LoadCache(lambda name: _read_grey(workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
+    masks = LoadCache(
+        lambda name: _read_mask(workspace, scene.view(name)), lambda m: 0 if m is None else m.nbytes, _CACHE_BYTES
+    )
+
+    def rectified(view: View, geometry: RectifiedPair, side: Side) -> RectifiedImage:
+        image, mask = images.get(view.name), masks.get(view.name)
+        return RectifiedImage(*resample(image, view, geometry, side, mask=mask))
 
     def work(pair: tuple[str, str]) -> tuple[str, str]:
         left, right = (scene.view(name) for name in pair)
         geometry = rectify_pair(scene, left, right, options.rectification)
-        left_image = RectifiedImage(*resample(images.get(left.name), left, geometry, "left"))
-        right_image = RectifiedImage(*resample(images.get(right.name), right, geometry, "right"))
         disparity = match_pair(
-            left_image, right_image, geometry.min_disparity, geometry.max_disparity, options.matching
+            rectified(left, geometry, "left"),
+            rectified(right, geometry, "right"),
+            geometry.min_disparity,
+            geometry.max_disparity,
+            options.matching,
         )
         write_pair(
             _pair_path(workspace, left.name, right.name, scene),
@@ -243,6 +259,10 @@ def estimate_views(
     def work(view: View) -> None:
         files = (_pair_path(workspace, view.name, other, scene) for other in partners.get(view.name, []))
         estimate = estimate_depth(view, (read_pair(file) for file in files), options.depth)
+        mask = _read_mask(workspace, view)
+        if mask is not None:
+            # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
+            estimate.depth[mask == 0] = 0
         _write_maps(workspace, view, estimate, "photometric", options)
         with atomic_file(_sigma_path(workspace, view.name)) as file:
             np.savez(file, depth=estimate.depth, sigma=estimate.sigma, support=estimate.support)
@@ -409,6 +429,10 @@ def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:
     if image is None:
         raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
     return np.asarray(image, dtype=np.uint8)
+
+
+def _read_mask(workspace: Workspace, view: View) -> NDArray[np.uint8] | None:
+    return read_mask(workspace.mask_path(view.name), view.width, view.height)
 
 
 def _read_estimate(workspace: Workspace, name: str) -> DepthEstimate:

@@ -16,7 +16,7 @@ from colmap_sph.errors import InputError, OutputError
 from colmap_sph.workspace import Workspace, atomic_file, make_dir
 
 # What COLMAP's undistortion makes; the model comes last, as it is what makes a folder look like a workspace.
-_PARTS = ("images", "stereo", "run-colmap-photometric.sh", "run-colmap-geometric.sh", "sparse")
+_PARTS = ("images", "masks", "stereo", "run-colmap-photometric.sh", "run-colmap-geometric.sh", "sparse")
 _MARKER = "undistortion.json"
 
 

@@ -18,11 +18,13 @@ import pycolmap
 from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
+from colmap_sph.masks import check_masks, undistort_mask
 from colmap_sph.scene import Scene, is_pinhole, load_model, make_pinhole, model_files
 from colmap_sph.staging import is_finished, move_into_place, read_marker, scratch_folder, write_marker
 from colmap_sph.workspace import (
     Workspace,
     make_dir,
+    mask_path,
     write_fusion_cfg,
     write_patch_match_cfg,
 )
@@ -69,7 +71,11 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
 
 
 def prepare_workspace(
-    model_dir: Path, image_dir: Path | None, output: Path, options: UndistortionOptions
+    model_dir: Path,
+    image_dir: Path | None,
+    output: Path,
+    options: UndistortionOptions,
+    masks: Path | None = None,
 ) -> Workspace:
     """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
 
@@ -86,16 +92,19 @@ def prepare_workspace(
     output : Path
         The dense workspace; created where missing.
     options : UndistortionOptions
+    masks : Path, optional
+        Folder of masks of the original images, see `colmap_sph.masks`; they are undistorted, too.
 
     Returns
     -------
     Workspace
-        With ``images``, ``sparse`` and ``stereo``.
+        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
 
     Raises
     ------
     InputError
-        No usable model or image, or `output` holds a workspace made from something else.
+        No usable model or image, a mask that does not fit its image, or `output` holds a workspace made from
+        something else.
     OutputError
         `output` cannot be written.
     """
@@ -112,6 +121,7 @@ def prepare_workspace(
         "options": asdict(options),
         "model": _hash_model(model_dir),
         "images": _hash_images(image_dir, names),
+        "masks": None if masks is None else _hash_images(masks, [f"{name}.png" for name in names]),
     }
     scratch = workspace.state_dir / "undistorting"
     if read_marker(scratch) == marker:
@@ -120,8 +130,11 @@ def prepare_workspace(
         logger.info("The undistorted images in %s are up to date", output)
         return workspace
     good = _usable_images(model, image_dir)
+    masked = [] if masks is None else check_masks(masks, _sizes(model, good))
     with scratch_folder(scratch):
         kept = _undistort(model, model_dir, image_dir, good, scratch, options)
+        if masks is not None:
+            _undistort_masks(model, masks, [name for name in kept if name in set(masked)], scratch, options)
         Workspace(scratch).create_stereo_dirs(kept)
         shutil.rmtree(Workspace(scratch).state_dir)
         write_marker(scratch, marker)
@@ -130,17 +143,23 @@ def prepare_workspace(
     return workspace
 
 
-def open_workspace(root: Path) -> Workspace:
+def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
     """Open a dense workspace that COLMAP's ``image_undistorter`` made, and create the folders for our maps.
+
+    Parameters
+    ----------
+    root : Path
+    masks : Path, optional
+        Folder of masks of the undistorted images; without it those in the workspace's own ``masks``.
 
     Raises
     ------
     InputError
-        The folder is missing or is not a dense workspace.
+        The folder is missing or is not a dense workspace, or a mask does not fit its image.
     OutputError
         The folders for the maps cannot be created.
     """
-    workspace = Workspace(root)
+    workspace = Workspace(root, masks)
     if not root.is_dir():
         raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
     for folder in (workspace.images_dir, workspace.sparse_dir):
@@ -150,7 +169,10 @@ def open_workspace(root: Path) -> Workspace:
                 "run COLMAP's image_undistorter, or give the sparse model with --model."
             )
     model = load_model(workspace.sparse_dir)
-    workspace.create_stereo_dirs(model.image(image_id).name for image_id in model.reg_image_ids())
+    names = [model.image(image_id).name for image_id in model.reg_image_ids()]
+    if masks is not None or workspace.masks_dir.is_dir():
+        check_masks(workspace.masks_dir, _sizes(model, names))
+    workspace.create_stereo_dirs(names)
     return workspace
 
 
@@ -194,6 +216,12 @@ def _usable_images(model: pycolmap.Reconstruction, image_dir: Path) -> list[str]
     return good
 
 
+def _sizes(model: pycolmap.Reconstruction, names: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Width and height of images, by name."""
+    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    return {name: (cameras[name].width, cameras[name].height) for name in names}
+
+
 def _undistort(
     model: pycolmap.Reconstruction,
     model_dir: Path,
@@ -207,18 +235,34 @@ def _undistort(
         model_dir = scratch / "model"
         make_dir(model_dir)
         model.write_binary(model_dir)
-    camera_options = pycolmap.UndistortCameraOptions()
-    camera_options.max_image_size = options.max_image_size
     logger.info("Undistorting %d images", len(names))
     try:
         with quiet_colmap():
             pycolmap.undistort_images(
-                scratch, model_dir, image_dir, image_names=names, undistort_options=camera_options
+                scratch, model_dir, image_dir, image_names=names, undistort_options=_camera_options(options)
             )
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
         raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {error}") from error
     return _mend_workspace(Workspace(scratch), names)
+
+
+def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
+    """Our options as COLMAP's."""
+    camera_options = pycolmap.UndistortCameraOptions()
+    camera_options.max_image_size = options.max_image_size
+    return camera_options
+
+
+def _undistort_masks(
+    model: pycolmap.Reconstruction, masks: Path, names: list[str], scratch: Path, options: UndistortionOptions
+) -> None:
+    """Undistort the masks of images `names` into `scratch`; `model` is that of the original images."""
+    logger.info("Undistorting %d masks", len(names))
+    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    for name in names:
+        target = Workspace(scratch).mask_path(name)
+        undistort_mask(mask_path(masks, name), cameras[name], _camera_options(options), target)
 
 
 def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:

@@ -32,9 +32,12 @@ class Workspace:
     ----------
     root : Path
         The workspace's folder, usually called ``dense``.
+    given_masks : Path, optional
+        Where the masks of its images are, if not in the workspace itself.
     """
 
     root: Path
+    given_masks: Path | None = None
 
     @property
     def images_dir(self) -> Path:
@@ -75,6 +78,15 @@ class Workspace:
         """Undistorted image `name`."""
         return self.images_dir / _checked_name(name)
 
+    @property
+    def masks_dir(self) -> Path:
+        """Masks of the undistorted images; need not exist."""
+        return self.given_masks or self.root / "masks"
+
+    def mask_path(self, name: str) -> Path:
+        """Mask of undistorted image `name`; need not exist."""
+        return mask_path(self.masks_dir, name)
+
     def depth_map_path(self, name: str, kind: MapKind) -> Path:
         """Depth map of image `name`."""
         return self.stereo_dir / "depth_maps" / f"{_checked_name(name)}.{kind}.bin"
@@ -102,6 +114,11 @@ class Workspace:
             folders.add(self.normal_map_path(name, "geometric").parent)
         for folder in sorted(folders):
             make_dir(folder)
+
+
+def mask_path(folder: Path, name: str) -> Path:
+    """Where COLMAP looks for the mask of image `name` in a folder of masks."""
+    return folder / f"{_checked_name(name)}.png"
 
 
 def make_dir(folder: Path) -> None:
