@@ -21,7 +21,7 @@ from colmap_sph.load_cache import LoadCache
 from colmap_sph.map_coordinates import local_origin, move_cloud, move_model
 from colmap_sph.scene import Scene, View, load_model
 from colmap_sph.staging import scratch_folder
-from colmap_sph.workspace import MapKind, Workspace, make_dir, read_depth_map, read_normal_map
+from colmap_sph.workspace import MapKind, Workspace, check_map, make_dir, read_depth_map, read_normal_map
 
 # What `explain_losses` looks at: partners of a view, and bytes of maps kept in memory.
 _EXPLAINED_PARTNERS = 20
@@ -184,7 +184,7 @@ def fuse(
 
 
 def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
-    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, and each has both maps."""
+    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, and these whole maps."""
     try:
         names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -192,13 +192,16 @@ def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
             f"{workspace.fusion_cfg_path} cannot be read ({error}); list the images in it."
         ) from error
     model = load_model(workspace.sparse_dir)
-    registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    cameras = {image.name: model.camera(image.camera_id) for image in map(model.image, model.reg_image_ids())}
     for name in filter(None, map(str.strip, names)):
-        if name not in registered:
+        if name not in cameras:
             raise InputError(f"{workspace.fusion_cfg_path} names {name!r}, which is not in the model; remove it.")
         for path in (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)):
             if not path.is_file():
                 raise InputError(f"The map {path} is missing; compute it, or remove {name!r} from fusion.cfg.")
+        shape = (cameras[name].height, cameras[name].width)
+        check_map(workspace.depth_map_path(name, kind), shape)
+        check_map(workspace.normal_map_path(name, kind), (*shape, 3))
     return model
 
 
@@ -336,7 +339,7 @@ def _verdicts(
     """(n, 4): stopped by depth, by reprojection, by normal; agrees. All false where the view has no depth."""
     in_camera = points @ view.R.T + view.t
     pixel = in_camera @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         uv = pixel[:, :2] / pixel[:, 2:]
     inside = (pixel[:, 2] > 0) & (uv > -0.5).all(axis=1)
     inside &= (uv < np.array([view.width, view.height]) - 0.5).all(axis=1)

@@ -18,8 +18,15 @@ from colmap_sph.workspace import atomic_file
 # millionth of its size, a few hundredths of a pixel.
 _FAR = 20.0
 _SAMPLED_POINTS = 1000
+# In whatever unit: what lies beyond comes from damage, and its square may be more than a float holds.
+_MAX_COORDINATE = 1e12
 _CHUNK_POINTS = 1_000_000
 _PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
+
+
+def is_plausible(places: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) bool: which of (N, 3) world coordinates are finite and not absurdly far."""
+    return np.asarray((np.abs(places) < _MAX_COORDINATE).all(axis=1))
 
 
 def local_origin(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
@@ -37,11 +44,12 @@ def local_origin(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
     """
     places = [model.image(image_id).projection_center() for image_id in model.reg_image_ids()]
     places += [point.xyz for point in islice(model.points3D.values(), _SAMPLED_POINTS)]
-    finite = np.array([place for place in places if np.isfinite(place).all()]).reshape(-1, 3)
-    if not len(finite):
+    known = np.array(places).reshape(-1, 3)
+    known = known[is_plausible(known)]
+    if not len(known):
         return np.zeros(3)
-    middle = np.median(finite, axis=0)
-    size = float(np.median(np.linalg.norm(finite - middle, axis=1)))
+    middle = np.median(known, axis=0)
+    size = float(np.median(np.linalg.norm(known - middle, axis=1)))
     if not 0 < _FAR * size < np.linalg.norm(middle):
         return np.zeros(3)
     step = 10.0 ** np.floor(np.log10(size))

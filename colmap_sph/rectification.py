@@ -227,7 +227,7 @@ def _points_in_both(scene: Scene, left: View, right: View) -> Float:
     points = scene.points[indices]
     for view in (left, right):
         pixel = (points @ view.R.T + view.t) @ view.K.T
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             uv = pixel[:, :2] / pixel[:, 2:]
         inside = (pixel[:, 2] > 0) & (uv > 0).all(axis=1) & (uv < [view.width, view.height]).all(axis=1)
         points = points[inside]
