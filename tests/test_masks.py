@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import keep_images
+from PIL import Image
 from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 
 import colmap_sph
@@ -127,7 +128,7 @@ def test_any_png_is_a_mask(tmp_path: Path, kind: str) -> None:
     if kind == "alpha":
         mask[..., 3] = 255
     if kind == "palette":
-        image = pytest.importorskip("PIL.Image").fromarray(mask, "L").convert("P")
+        image = Image.fromarray(mask).convert("P")
         image.save(tmp_path / "mask.png")
     else:
         cv2.imwrite(str(tmp_path / "mask.png"), mask)
