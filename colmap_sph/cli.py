@@ -57,6 +57,9 @@ class RunCommand:
     """Sparse model (binary or text), such as sparse/0. Its images are undistorted into --output."""
     images: Path | None = None
     """Original images. Default: the folder `images` beside or above the model."""
+    masks: Path | None = None
+    """Masks: NAME.png for image NAME with its folders, black = ignored. Of the original images, or with
+    --workspace of the undistorted ones."""
     output: Path | None = None
     """Dense workspace to create. Default: the folder `dense` beside the model's `sparse`."""
     workspace: Path | None = None
@@ -150,6 +153,7 @@ def run_command(command: RunCommand, console: Console) -> int:
         plan = make_plan(
             command.model,
             images=command.images,
+            masks=command.masks,
             output=command.output,
             workspace=command.workspace,
             options=options,
@@ -161,6 +165,7 @@ def run_command(command: RunCommand, console: Console) -> int:
         report = run(
             command.model,
             images=command.images,
+            masks=command.masks,
             output=command.output,
             workspace=command.workspace,
             options=options,

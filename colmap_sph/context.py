@@ -85,8 +85,9 @@ class Context:
 
     @property
     def cloud_paths(self) -> list[Path]:
-        """The cloud and its visibility."""
-        return [self.workspace.fused_path, self.workspace.fused_path.with_name("fused.ply.vis")]
+        """The cloud and its visibility, and for a model in map coordinates the cloud near its origin."""
+        local = [self.workspace.local_dir / "fused.ply"] if self.scene.origin.any() else []
+        return [self.workspace.fused_path, self.workspace.fused_path.with_name("fused.ply.vis"), *local]
 
     @property
     def cloud_record(self) -> Path:

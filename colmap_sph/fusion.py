@@ -1,11 +1,13 @@
 """Dense workspace → fused cloud, by COLMAP's own fusion of the depth and normal maps.
 
 COLMAP's default gates suit its own patch match; ours keep one point per surface element instead of merging
-neighbours two pixels away, which thins a cloud several times.
+neighbours two pixels away, which thins a cloud several times. COLMAP computes with 32-bit floats, so a model in
+map coordinates is moved near its origin before, and the cloud back afterwards.
 """
 
 import errno
 import os
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +19,10 @@ from numpy.typing import NDArray
 from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.load_cache import LoadCache
+from colmap_sph.map_coordinates import local_origin, move_cloud, move_model
 from colmap_sph.scene import Scene, View, load_model
 from colmap_sph.staging import scratch_folder
-from colmap_sph.workspace import MapKind, Workspace, make_dir, read_depth_map, read_normal_map
+from colmap_sph.workspace import MapKind, Workspace, check_map, make_dir, read_depth_map, read_normal_map
 
 # What `explain_losses` looks at: partners of a view, and bytes of maps kept in memory.
 _EXPLAINED_PARTNERS = 20
@@ -119,6 +122,10 @@ def fuse(
 ) -> int:
     """Fuse the workspace's maps with COLMAP's `stereo_fusion` into ``fused.ply`` and ``fused.ply.vis``.
 
+    The cloud of a model in map coordinates has 64-bit coordinates. What COLMAP's other programs, which compute
+    with 32-bit floats, need to go on is left in ``colmap_sph/local``: a workspace of links with the model and the
+    cloud near their origin, and that origin's map coordinates in ``origin.txt``.
+
     Parameters
     ----------
     workspace : Workspace
@@ -151,7 +158,8 @@ def fuse(
         if name != "mask_path" or value is not None:
             setattr(colmap_options, name, value)
     colmap_options.num_threads = threads
-    _check_maps(workspace, kind)
+    model = _check_maps(workspace, kind)
+    origin = local_origin(model)
     targets = [workspace.root / name for name in ("fused.ply", "fused.ply.vis")]
     for target in targets:
         if target.is_dir():
@@ -160,12 +168,18 @@ def fuse(
     scratch = workspace.state_dir / "fusion"
     with scratch_folder(scratch):
         try:
-            source = workspace.root if partners is None else _link_with_tracks(workspace, partners, scratch)
+            source = workspace.root
+            if partners is not None or origin.any():
+                model = model if partners is None else _with_tracks(model, partners)
+                source = _link_workspace(workspace, model, origin, scratch)
             with quiet_colmap():
                 cloud = pycolmap.stereo_fusion(
                     scratch / "fused.ply", source, input_type=kind, options=colmap_options, output_type="PLY"
                 )
             _check_written(scratch / "fused.ply", scratch / "fused.ply.vis", cloud.num_points3D())
+            shutil.rmtree(workspace.local_dir, ignore_errors=True)
+            if origin.any():
+                _keep_local_workspace(workspace.local_dir, scratch, origin)
             # A kill in between must not leave a cloud beside the visibility of another.
             targets[1].unlink(missing_ok=True)
             for target in targets:
@@ -194,8 +208,8 @@ def _check_written(cloud: Path, visibility: Path, num_points: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def _check_maps(workspace: Workspace, kind: MapKind) -> None:
-    """Raise `InputError` unless every image of ``fusion.cfg`` is in the model and has both maps."""
+def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
+    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, and these whole maps."""
     try:
         names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -203,21 +217,27 @@ def _check_maps(workspace: Workspace, kind: MapKind) -> None:
             f"{workspace.fusion_cfg_path} cannot be read ({error}); list the images in it."
         ) from error
     model = load_model(workspace.sparse_dir)
-    registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    cameras = {image.name: model.camera(image.camera_id) for image in map(model.image, model.reg_image_ids())}
     for name in filter(None, map(str.strip, names)):
-        if name not in registered:
+        if name not in cameras:
             raise InputError(f"{workspace.fusion_cfg_path} names {name!r}, which is not in the model; remove it.")
         for path in (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)):
             if not path.is_file():
                 raise InputError(f"The map {path} is missing; compute it, or remove {name!r} from fusion.cfg.")
+        shape = (cameras[name].height, cameras[name].width)
+        check_map(workspace.depth_map_path(name, kind), shape)
+        check_map(workspace.normal_map_path(name, kind), (*shape, 3))
+    return model
 
 
-def _link_with_tracks(workspace: Workspace, partners: Mapping[str, Sequence[str]], folder: Path) -> Path:
-    """Make a workspace of links whose model has a track for every pair of `partners`; return `folder`.
+def _with_tracks(
+    source: pycolmap.Reconstruction, partners: Mapping[str, Sequence[str]]
+) -> pycolmap.Reconstruction:
+    """Copy a model, with one track for every pair of `partners` and no others.
 
     COLMAP's fusion asks the tracks alone which images overlap, and nothing else.
     """
-    source, model = load_model(workspace.sparse_dir), pycolmap.Reconstruction()
+    model = pycolmap.Reconstruction()
     pairs = sorted({(min(a, b), max(a, b)) for a, others in partners.items() for b in others})
     tracks = [pycolmap.Track() for _ in pairs]
     for camera in source.cameras.values():
@@ -234,12 +254,32 @@ def _link_with_tracks(workspace: Workspace, partners: Mapping[str, Sequence[str]
         # Between the two centres, where a triangulation angle is defined.
         middle = (first.projection_center() + second.projection_center()) / 2
         model.add_point3D(middle, track, np.zeros(3, dtype=np.uint8))
+    return model
+
+
+def _link_workspace(
+    workspace: Workspace, model: pycolmap.Reconstruction, origin: NDArray[np.float64], folder: Path
+) -> Path:
+    """Make `folder` a workspace of links, but for its model, which is moved to `origin`; return it."""
     linked = Workspace(folder)
     make_dir(linked.sparse_dir)
+    if origin.any():
+        move_model(model, origin)
     model.write_binary(linked.sparse_dir)
-    linked.images_dir.symlink_to(workspace.images_dir.resolve())
-    linked.stereo_dir.symlink_to(workspace.stereo_dir.resolve())
+    for link, target in ((linked.images_dir, workspace.images_dir), (linked.stereo_dir, workspace.stereo_dir)):
+        # Relative, so that the workspace can be moved as a whole.
+        link.symlink_to(os.path.relpath(target.resolve(), folder.resolve()))
     return folder
+
+
+def _keep_local_workspace(local: Path, scratch: Path, origin: NDArray[np.float64]) -> None:
+    """Keep what was fused near the origin as `local`, and leave the cloud in map coordinates in `scratch`."""
+    local.mkdir()
+    for name in ("fused.ply", "images", "stereo", "sparse"):
+        (scratch / name).rename(local / name)
+    (local / "fused.ply.vis").symlink_to(Path("..", "..", "fused.ply.vis"))
+    (local / "origin.txt").write_text(" ".join(map(repr, origin.tolist())) + "\n")
+    move_cloud(local / "fused.ply", scratch / "fused.ply", origin)
 
 
 def explain_losses(
@@ -322,7 +362,7 @@ def _verdicts(
     """(n, 4): stopped by depth, by reprojection, by normal; agrees. All false where the view has no depth."""
     in_camera = points @ view.R.T + view.t
     pixel = in_camera @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         uv = pixel[:, :2] / pixel[:, 2:]
     inside = (pixel[:, 2] > 0) & (uv > -0.5).all(axis=1)
     inside &= (uv < np.array([view.width, view.height]) - 0.5).all(axis=1)

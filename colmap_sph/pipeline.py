@@ -19,12 +19,11 @@ from colmap_sph.keys import Keys
 from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairSelection, select_pairs
 from colmap_sph.report import Progress, RunReport, Silent
-from colmap_sph.scene import Scene, load_model, model_files, read_scene
+from colmap_sph.scene import Scene, image_names, load_model, model_files, read_scene
 from colmap_sph.stages import check_views, estimate_views, fuse_views, match_pairs
-from colmap_sph.staging import discard_results, discard_workspace
+from colmap_sph.staging import discard_results
 from colmap_sph.undistortion import (
     UndistortionOptions,
-    check_workspace,
     leave_out_bad_images,
     open_workspace,
     prepare_workspace,
@@ -37,6 +36,7 @@ def run(
     model: Path | str | None = None,
     *,
     images: Path | str | None = None,
+    masks: Path | str | None = None,
     output: Path | str | None = None,
     workspace: Path | str | None = None,
     options: RunOptions | None = None,
@@ -53,10 +53,13 @@ def run(
         COLMAP sparse model; its images are undistorted into `output`.
     images : Path, optional
         Original images; found by COLMAP's usual layouts if not given.
+    masks : Path, optional
+        Folder of masks ``NAME.png``, black where image NAME is to be ignored: of the original images, or with
+        `workspace` of the undistorted ones.
     output : Path, optional
         Dense workspace to create; "dense" beside the model's project if not given.
     workspace : Path, optional
-        An existing dense workspace, instead of the three above.
+        An existing dense workspace, instead of `model`, `images` and `output`.
     options : RunOptions, optional
     progress : Progress, optional
     overwrite : bool
@@ -75,24 +78,25 @@ def run(
     options, report = options or RunOptions(), RunReport()
     progress = Silent() if progress is None else progress
     root = check_arguments(model, images=images, output=output, workspace=workspace, options=options)
-    with claimed(Workspace(root)):
-        if model is None:
-            with timed_stage("undistort", 1, progress, report):
-                dense = open_workspace(root)
-                progress.advance()
+    masks = None if masks is None else Path(masks)
+    if model is None:
+        dense = open_workspace(root, masks)
+        with claimed(dense):
             if overwrite:
                 discard_results(dense)
             return reconstruct(dense, options, progress=progress, report=report)
-        model = Path(model)
+    model, originals = Path(model), None if images is None else Path(images)
+    with claimed(Workspace(root)):
         with timed_stage("undistort", 1, progress, report):
-            if overwrite:
-                discard_workspace(Workspace(root))
-            dense = prepare_workspace(model, None if images is None else Path(images), root, options.undistortion)
-            registered = load_model(model)
-            names = [registered.image(image_id).name for image_id in registered.reg_image_ids()]
+            dense = prepare_workspace(model, originals, root, options.undistortion, masks, overwrite=overwrite)
             progress.advance()
         return reconstruct(
-            dense, options, progress=progress, report=report, database=find_database(model), expected=names
+            dense,
+            options,
+            progress=progress,
+            report=report,
+            database=find_database(model),
+            expected=image_names(load_model(model)),
         )
 
 
@@ -111,8 +115,6 @@ def check_arguments(
         model_files(Path(model))
     elif options.undistortion != UndistortionOptions():
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
-    else:
-        check_workspace(root)
     return root
 
 
@@ -167,6 +169,7 @@ def reconstruct(
         scene = leave_out_bad_images(whole, workspace)
         for name in sorted({*expected, *whole.index_of} - scene.index_of.keys()):
             report.skipped_images[name] = "its image is missing, damaged or not of its camera's size; see the log"
+        workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
             selection = choose_pairs(workspace, scene, options, database)
             report.pair_source = selection.source

@@ -28,7 +28,7 @@ from colmap_sph.stages import (
     partners_of,
     vote_state,
 )
-from colmap_sph.undistortion import foresee_workspace, leave_out_bad_images
+from colmap_sph.undistortion import foresee_workspace, leave_out_bad_images, open_workspace
 from colmap_sph.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -96,6 +96,7 @@ def make_plan(
     model: Path | str | None = None,
     *,
     images: Path | str | None = None,
+    masks: Path | str | None = None,
     output: Path | str | None = None,
     workspace: Path | str | None = None,
     options: RunOptions | None = None,
@@ -105,7 +106,7 @@ def make_plan(
 
     Parameters
     ----------
-    model, images, output, workspace, options, overwrite
+    model, images, masks, output, workspace, options, overwrite
         As for `pipeline.run`.
 
     Returns
@@ -114,10 +115,15 @@ def make_plan(
     """
     options = options or RunOptions()
     root = check_arguments(model, images=images, output=output, workspace=workspace, options=options)
-    dense, database, foreseen = Workspace(root), None, None
-    if model is not None:
-        image_dir, database = None if images is None else Path(images), find_database(Path(model))
-        foreseen = foresee_workspace(Path(model), image_dir, root, options.undistortion, overwrite=overwrite)
+    mask_dir, database, foreseen = None if masks is None else Path(masks), None, None
+    if model is None:
+        dense = open_workspace(root, mask_dir)
+    else:
+        dense, database = Workspace(root), find_database(Path(model))
+        image_dir = None if images is None else Path(images)
+        foreseen = foresee_workspace(
+            Path(model), image_dir, root, options.undistortion, mask_dir, overwrite=overwrite
+        )
     if foreseen is None:
         scene = leave_out_bad_images(read_scene(dense.sparse_dir), dense)
         selection = choose_pairs(dense, scene, options, database)

@@ -18,10 +18,11 @@ from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.fusion import explain_losses, fuse
 from colmap_sph.load_cache import LoadCache
+from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, match_pair
 from colmap_sph.normals import fit_normals
 from colmap_sph.pair_files import read_arrays, read_pair, stored_key, write_arrays, write_pair
-from colmap_sph.rectification import RectifiedPair, rectify_pair, resample
+from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
 from colmap_sph.scene import View
 from colmap_sph.state import forget, vouch, vouched_facts
 from colmap_sph.workspace import (
@@ -70,17 +71,23 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
     report = context.report
     make_dir(context.pairs_dir)
     images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
+    masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, _CACHE_BYTES)
+
+    def rectified(name: str, geometry: RectifiedPair, side: Side) -> RectifiedImage:
+        view, mask = context.scene.view(name), masks.get(name)
+        return RectifiedImage(*resample(images.get(name), view, geometry, side, mask=mask))
 
     def work(pair: Pair) -> Done:
         state = pair_state(context, pair)
         if state.is_done:
             return Done(state.key, made=False)
-        geometry = state.geometry
-        left, right = (context.scene.view(name) for name in pair)
-        left_image = RectifiedImage(*resample(images.get(left.name), left, geometry, "left"))
-        right_image = RectifiedImage(*resample(images.get(right.name), right, geometry, "right"))
+        geometry, (left, right) = state.geometry, pair
         disparity = match_pair(
-            left_image, right_image, geometry.min_disparity, geometry.max_disparity, context.options.matching
+            rectified(left, geometry, "left"),
+            rectified(right, geometry, "right"),
+            geometry.min_disparity,
+            geometry.max_disparity,
+            context.options.matching,
         )
         write_pair(context.pair_path(*pair), PairDisparity(*pair, geometry, disparity), state.key)
         return Done(state.key, made=True)
@@ -123,7 +130,6 @@ def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str,
 
     Returns the keys of the votes by image name, without those of views that failed.
     """
-    context.workspace.create_stereo_dirs(view.name for view in context.scene.views)
     for view in context.scene.views:
         make_dir(context.estimate_path(view.name).parent)
 
@@ -137,6 +143,10 @@ def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str,
     def _vote(view: View, key: str) -> DepthEstimate:
         files = (context.pair_path(*pair) for pair in _pairs_of(pair_keys, view.name))
         estimate = estimate_depth(view, (read_pair(file) for file in files), context.options.depth)
+        mask = _read_mask(context, view.name)
+        if mask is not None:
+            # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
+            estimate.depth[mask == 0] = 0
         arrays = {"depth": estimate.depth, "sigma": estimate.sigma, "support": estimate.support}
         write_arrays(context.estimate_path(view.name), arrays, key)
         return estimate
@@ -229,7 +239,7 @@ def cloud_state(
     names = tuple(view.name for view in context.scene.views if coverage.get(view.name, 0) > 0)
     tracked = any(len(view.point_indices) for view in context.scene.views)
     partners = None if tracked else partners_of(pairs)
-    key = context.keys.cloud({name: maps[name] for name in names}, partners or {})
+    key = context.keys.cloud({name: maps[name] for name in names}, partners or {}, context.scene.origin)
     return CloudState(names, partners, key, vouched_facts(context.cloud_record, key, context.cloud_paths))
 
 
@@ -303,6 +313,11 @@ def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:
     if image is None:
         raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
     return np.asarray(image, dtype=np.uint8)
+
+
+def _read_mask(context: Context, name: str) -> NDArray[np.uint8] | None:
+    view = context.scene.view(name)
+    return read_mask(context.workspace.mask_path(name), view.width, view.height)
 
 
 def _read_estimate(context: Context, name: str) -> DepthEstimate:

@@ -16,11 +16,11 @@ from pathlib import Path
 from typing import Any, get_args
 
 from colmap_sph.errors import InputError, OutputError
-from colmap_sph.scene import MODEL_FILES, RIG_FILES, load_model
+from colmap_sph.scene import MODEL_FILES, RIG_FILES, image_names, load_model
 from colmap_sph.workspace import MapKind, Workspace, atomic_file, make_dir
 
 # What COLMAP's undistortion makes; the model comes last, as it is what makes a folder look like a workspace.
-_PARTS = ("images", "stereo", "run-colmap-photometric.sh", "run-colmap-geometric.sh", "sparse")
+_PARTS = ("images", "masks", "stereo", "run-colmap-photometric.sh", "run-colmap-geometric.sh", "sparse")
 _MARKER = "undistortion.json"
 
 
@@ -96,38 +96,32 @@ def discard_workspace(workspace: Workspace) -> None:
     discard_results(workspace)
     for name in ("fused.ply", "fused.ply.vis", *_PARTS):
         _remove(workspace.root / name)
-    for name in ("undistorting", _MARKER):
+    for name in (workspace.local_dir.name, "undistorting", _MARKER):
         _remove(workspace.state_dir / name)
 
 
 def _foreign_files(workspace: Workspace) -> Iterator[Path]:
     """Files and links in the workspace's folders under names that neither COLMAP nor this program uses."""
-    names = _image_names(workspace)
+    try:
+        names = image_names(load_model(workspace.sparse_dir))
+    except InputError:  # an interrupted removal has taken the model
+        names = []
     known = {workspace.fusion_cfg_path, workspace.patch_match_cfg_path}
     known |= {
         workspace.sparse_dir / f"{stem}{end}" for stem in (*MODEL_FILES, *RIG_FILES) for end in (".bin", ".txt")
     }
     for name in names:
-        known.add(workspace.image_path(name))
+        known |= {workspace.image_path(name), workspace.mask_path(name)}
         for kind in get_args(MapKind):
             known |= {workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)}
             known.add(workspace.stereo_dir / "consistency_graphs" / f"{name}.{kind}.bin")
-    for part in (workspace.images_dir, workspace.stereo_dir, workspace.sparse_dir):
+    for part in (workspace.images_dir, workspace.masks_dir, workspace.stereo_dir, workspace.sparse_dir):
         if part.is_symlink():
             yield part
             continue
         for path in part.rglob("*"):
             if path not in known and (path.is_symlink() or not path.is_dir()):
                 yield path
-
-
-def _image_names(workspace: Workspace) -> list[str]:
-    """Names of the images in the workspace's model; none where an interrupted removal has taken the model."""
-    try:
-        model = load_model(workspace.sparse_dir)
-    except InputError:
-        return []
-    return [model.image(image_id).name for image_id in model.reg_image_ids()]
 
 
 def _remove(path: Path) -> None:

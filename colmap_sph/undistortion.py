@@ -19,9 +19,11 @@ import pycolmap
 from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
-from colmap_sph.scene import Scene, is_pinhole, load_model, make_pinhole, model_files, scene_of_model
+from colmap_sph.masks import check_masks, undistort_mask
+from colmap_sph.scene import Scene, image_names, is_pinhole, load_model, make_pinhole, model_files, scene_of_model
 from colmap_sph.staging import (
     check_discardable,
+    discard_workspace,
     is_finished,
     move_into_place,
     read_marker,
@@ -31,6 +33,7 @@ from colmap_sph.staging import (
 from colmap_sph.workspace import (
     Workspace,
     make_dir,
+    mask_path,
     write_fusion_cfg,
     write_patch_match_cfg,
 )
@@ -79,7 +82,13 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
 
 
 def prepare_workspace(
-    model_dir: Path, image_dir: Path | None, output: Path, options: UndistortionOptions
+    model_dir: Path,
+    image_dir: Path | None,
+    output: Path,
+    options: UndistortionOptions,
+    masks: Path | None = None,
+    *,
+    overwrite: bool = False,
 ) -> Workspace:
     """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
 
@@ -96,32 +105,42 @@ def prepare_workspace(
     output : Path
         The dense workspace; created where missing.
     options : UndistortionOptions
+    masks : Path, optional
+        Folder of masks of the original images, see `colmap_sph.masks`; they are undistorted, too.
+    overwrite : bool
+        Discard what an earlier run has made, once it is clear that this one can start.
 
     Returns
     -------
     Workspace
-        With ``images``, ``sparse`` and ``stereo``.
+        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
 
     Raises
     ------
     InputError
-        No usable model or image, or `output` holds a workspace made from something else.
+        No usable model or image, a mask that does not fit its image, or `output` holds a workspace made from
+        something else.
     OutputError
         `output` cannot be written.
     """
-    source = _read_source(model_dir, image_dir, options)
+    source = _read_source(model_dir, image_dir, options, masks)
     model, image_dir, marker = source.model, source.image_dir, source.marker
     workspace = Workspace(output)
     scratch = workspace.state_dir / "undistorting"
-    if read_marker(scratch) == marker:
+    if read_marker(scratch) == marker and not overwrite:
         move_into_place(scratch, workspace)
-    if is_finished(workspace, marker):
+    if not overwrite and is_finished(workspace, marker):
         logger.info("The undistorted images in %s are up to date", output)
         return workspace
     good = _usable_images(model, image_dir)
+    masked = [] if masks is None else check_masks(masks, _sizes(model, good))
+    if overwrite:
+        discard_workspace(workspace)
     _check_space(source, model_dir, good, output)
     with scratch_folder(scratch):
         kept = _undistort(model, model_dir, image_dir, good, scratch, options)
+        if masks is not None:
+            _undistort_masks(model, masks, [name for name in kept if name in set(masked)], scratch, options)
         Workspace(scratch).create_stereo_dirs(kept)
         shutil.rmtree(Workspace(scratch).state_dir)
         write_marker(scratch, marker)
@@ -139,23 +158,32 @@ class Foreseen:
 
 
 def foresee_workspace(
-    model_dir: Path, image_dir: Path | None, output: Path, options: UndistortionOptions, *, overwrite: bool
+    model_dir: Path,
+    image_dir: Path | None,
+    output: Path,
+    options: UndistortionOptions,
+    masks: Path | None = None,
+    *,
+    overwrite: bool,
 ) -> Foreseen | None:
     """Return what `prepare_workspace` would make, without making it; None where it is made already.
 
     Parameters
     ----------
-    model_dir, image_dir, output, options
+    model_dir, image_dir, output, options, masks
         As for `prepare_workspace`, which raises the same.
     overwrite : bool
         The workspace that is there will be discarded first.
     """
-    source = _read_source(model_dir, image_dir, options)
+    source = _read_source(model_dir, image_dir, options, masks)
     if overwrite:
         check_discardable(Workspace(output))
     elif is_finished(Workspace(output), source.marker):
         return None
-    model = _submodel(source.model, set(_usable_images(source.model, source.image_dir)))
+    names = _usable_images(source.model, source.image_dir)
+    if masks is not None:
+        check_masks(masks, _sizes(source.model, names))
+    model = _submodel(source.model, set(names))
     cameras = [model.camera(image.camera_id) for image in model.images.values()]
     pixels = sum(camera.width * camera.height for camera in cameras)
     _replace_ideal_fisheyes(model)
@@ -176,10 +204,12 @@ class _Source:
     marker: dict[str, Any]
 
 
-def _read_source(model_dir: Path, image_dir: Path | None, options: UndistortionOptions) -> _Source:
+def _read_source(
+    model_dir: Path, image_dir: Path | None, options: UndistortionOptions, masks: Path | None
+) -> _Source:
     options.check()
     model = load_model(model_dir)
-    names = sorted(model.image(image_id).name for image_id in model.reg_image_ids())
+    names = image_names(model)
     if image_dir is None:
         image_dir = find_images(model_dir, names)
     elif not image_dir.is_dir():
@@ -189,36 +219,26 @@ def _read_source(model_dir: Path, image_dir: Path | None, options: UndistortionO
         "options": asdict(options),
         "model": _hash_model(model_dir),
         "images": _hash_images(image_dir, names),
+        "masks": None if masks is None else _hash_images(masks, [f"{name}.png" for name in names]),
     }
     return _Source(model, image_dir, options, marker)
 
 
-def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
-    camera_options = pycolmap.UndistortCameraOptions()
-    camera_options.max_image_size = options.max_image_size
-    return camera_options
+def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
+    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and write nothing there.
 
-
-def open_workspace(root: Path) -> Workspace:
-    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and create the folders for our maps.
+    Parameters
+    ----------
+    root : Path
+    masks : Path, optional
+        Folder of masks of the undistorted images; without it those in the workspace's own ``masks``.
 
     Raises
     ------
     InputError
-        The folder is missing or is not a dense workspace.
-    OutputError
-        The folders for the maps cannot be created.
+        The folder is missing or is not a dense workspace, or a mask does not fit its image.
     """
-    check_workspace(root)
-    workspace = Workspace(root)
-    model = load_model(workspace.sparse_dir)
-    workspace.create_stereo_dirs(model.image(image_id).name for image_id in model.reg_image_ids())
-    return workspace
-
-
-def check_workspace(root: Path) -> None:
-    """Raise `InputError` unless the folder is a dense workspace that COLMAP's ``image_undistorter`` made."""
-    workspace = Workspace(root)
+    workspace = Workspace(root, masks)
     if not root.is_dir():
         raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
     for folder in (workspace.images_dir, workspace.sparse_dir):
@@ -227,6 +247,10 @@ def check_workspace(root: Path) -> None:
                 f"{root} is not a dense workspace: it has no {folder.name} folder; "
                 "run COLMAP's image_undistorter, or give the sparse model with --model."
             )
+    model = load_model(workspace.sparse_dir)
+    if masks is not None or workspace.masks_dir.is_dir():
+        check_masks(workspace.masks_dir, _sizes(model, image_names(model)))
+    return workspace
 
 
 def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
@@ -269,6 +293,12 @@ def _usable_images(model: pycolmap.Reconstruction, image_dir: Path) -> list[str]
     return good
 
 
+def _sizes(model: pycolmap.Reconstruction, names: Sequence[str]) -> dict[str, tuple[int, int]]:
+    """Width and height of images, by name."""
+    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    return {name: (cameras[name].width, cameras[name].height) for name in names}
+
+
 def _undistort(
     model: pycolmap.Reconstruction,
     model_dir: Path,
@@ -292,6 +322,24 @@ def _undistort(
         _raise_if_disk_is_full(scratch)
         raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {error}") from error
     return _mend_workspace(Workspace(scratch), names)
+
+
+def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
+    """Our options as COLMAP's."""
+    camera_options = pycolmap.UndistortCameraOptions()
+    camera_options.max_image_size = options.max_image_size
+    return camera_options
+
+
+def _undistort_masks(
+    model: pycolmap.Reconstruction, masks: Path, names: list[str], scratch: Path, options: UndistortionOptions
+) -> None:
+    """Undistort the masks of images `names` into `scratch`; `model` is that of the original images."""
+    logger.info("Undistorting %d masks", len(names))
+    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    for name in names:
+        target = Workspace(scratch).mask_path(name)
+        undistort_mask(mask_path(masks, name), cameras[name], _camera_options(options), target)
 
 
 def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:

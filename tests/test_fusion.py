@@ -298,3 +298,16 @@ def test_fusion_cfg_that_does_not_fit(workspace):
     workspace.fusion_cfg_path.unlink()
     with pytest.raises(InputError, match=r"fusion\.cfg"):
         fuse(workspace, FusionOptions())
+
+
+@pytest.mark.parametrize("kind", ["cut off", "other size", "no header"])
+def test_a_damaged_map_is_named(workspace, kind):
+    """COLMAP itself would end the process or read beyond the file."""
+    path = workspace.depth_map_path("c.png", "geometric")
+    if kind == "other size":
+        write_depth_map(path, np.ones((HEIGHT, WIDTH - 1), np.float32))
+    else:
+        path.write_bytes(path.read_bytes()[:-100] if kind == "cut off" else b"\0" * 100)
+    with pytest.raises(InputError, match=str(path)):
+        fuse(workspace, FusionOptions())
+    assert not workspace.fused_path.exists()
