@@ -33,6 +33,7 @@ def selection(
 def refine_offsets(backend: str, offset: Array, reference: Array, target: Array, refined: Array, /) -> None: ...
 def transfer_disparity(left: Array, max_step: float, right: Array, /) -> None: ...
 def depth_candidates(
+    backend: str,
     disparity: Array,
     rectified_from_pixel: Array,
     scales: tuple[float, float],
@@ -68,6 +69,7 @@ def check_consistency(
     /,
 ) -> None: ...
 def fit_planes(
+    backend: str,
     inverse_depth: Array,
     inverse_sigma: Array,
     K: Array,

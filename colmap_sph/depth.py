@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
+from colmap_sph.kernels import backend
 from colmap_sph.rectification import RectifiedPair, Side, rectified_ray_from_pixel
 from colmap_sph.scene import View
 
@@ -133,6 +134,7 @@ def depth_candidates(
     depth = np.empty((view.height, view.width), dtype=np.float32)
     sigma = np.empty_like(depth)
     _native.depth_candidates(
+        backend(),
         disparity,
         np.ascontiguousarray(rectified_ray_from_pixel(view, geometry)),
         (geometry.columns_per_radian, geometry.rows_per_radian),

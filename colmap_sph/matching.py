@@ -8,7 +8,6 @@ This module is the only caller of the matching kernels. Their convention is an *
 reference column; with the left image as reference it is minus the disparity.
 """
 
-import os
 from dataclasses import dataclass
 
 import cv2
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
+from colmap_sph.kernels import backend
 
 _OFFSET_INVALID = np.iinfo(np.int32).min
 _SUBPIXEL = 256  # offsets come in 1/256 pixel
@@ -79,15 +79,6 @@ class RectifiedImage:
 
     image: NDArray[np.uint8]
     valid: NDArray[np.uint8]
-
-
-def backend() -> str:
-    """Name of the kernels in use: the fastest this processor has, or what COLMAP_SPH_KERNELS asks for."""
-    wanted = os.environ.get("COLMAP_SPH_KERNELS")
-    available: list[str] = _native.backends()
-    if wanted and wanted not in available:
-        raise OptionError(f"COLMAP_SPH_KERNELS={wanted}: this processor has {', '.join(available)}.")
-    return wanted or available[0]
 
 
 def match_pair(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.depth import DepthEstimate
 from colmap_sph.errors import OptionError
+from colmap_sph.kernels import backend
 from colmap_sph.scene import View
 
 
@@ -56,5 +57,7 @@ def fit_normals(
     inverse_sigma = (estimate.sigma * inverse * inverse).astype(np.float32)
     normals = np.empty((*inverse.shape, 3), dtype=np.float32)
     fitted = np.empty_like(inverse)
-    _native.fit_planes(inverse, inverse_sigma, view.K.copy(), options.radius, options.tolerance, normals, fitted)
+    _native.fit_planes(
+        backend(), inverse, inverse_sigma, view.K.copy(), options.radius, options.tolerance, normals, fitted
+    )
     return normals, fitted

@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import OptionError
 from colmap_sph.fusion import FusionOptions
-from colmap_sph.matching import MatchingOptions, backend
+from colmap_sph.kernels import backend
+from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 from colmap_sph.pairs import PairOptions
 from colmap_sph.rectification import RectificationOptions

@@ -100,7 +100,8 @@ def depth_candidates(rng: Random) -> Arguments:
     geometry = [filled(rng, (3, 3), np.float64), (number(rng), number(rng)), (number(rng), number(rng))]
     numbers = [number(rng) for _ in range(4)]
     flags = [bool(rng.integers(2)), bool(rng.integers(2)), int(rng.integers(0, 9))]
-    return [filled(rng, size(rng), np.float32), *geometry, *numbers, *flags, maps[0], maps[1].copy()]
+    disparity = filled(rng, size(rng), np.float32)
+    return [backend(rng), disparity, *geometry, *numbers, *flags, maps[0], maps[1].copy()]
 
 
 def vote_depth(rng: Random) -> Arguments:
@@ -122,7 +123,8 @@ def fit_planes(rng: Random) -> Arguments:
     h, w = size(rng)
     inputs = [filled(rng, (h, w), np.float32) for _ in range(2)]
     outputs = [np.zeros((h, w, 3), np.float32), np.zeros((h, w), np.float32)]
-    return [*inputs, filled(rng, (3, 3), np.float64), int(rng.integers(1, 17)), number(rng), *outputs]
+    K = filled(rng, (3, 3), np.float64)
+    return [backend(rng), *inputs, K, int(rng.integers(1, 17)), number(rng), *outputs]
 
 
 def backend(rng: Random) -> str:

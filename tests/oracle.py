@@ -125,45 +125,52 @@ def _offset_plane(differences, inside):
     return None if max(map(abs, solution)) > 256 * 512 * 5 else [int(np.trunc(value)) for value in solution]
 
 
+def _costs_around(offset, reference, target, y, x):
+    """Costs of the five target pixels around a pixel's offset; None where not all of them have content."""
+    given = int(offset[y, x])
+    if abs(given) > 1 << 24:
+        return None
+    columns = x + _nearest_256(given) + np.arange(-2, 3)
+    if columns[0] < 0 or columns[-1] >= target.shape[1]:
+        return None
+    words = [int(word) for word in target[y, columns]]
+    return None if max(words) >= CENSUS_INVALID else [(w ^ int(reference[y, x])).bit_count() for w in words]
+
+
 def refine_offsets(offset, reference, target):
     """Offsets (H, W) int32 in 1/256 pixel, refined by the V of the raw costs in a 5 x 5 window along its plane."""
-    given = np.pad(offset.astype(np.int64), 2, constant_values=OFFSET_INVALID)
-    present = np.abs(given) <= 1 << 24
+    height, width = offset.shape
     ring = np.maximum(*np.abs(np.mgrid[-2:3, -2:3]))
-    refined = np.full(offset.shape, OFFSET_INVALID, dtype=np.int32)
+    refined = offset.copy()
+    costs = {pixel: _costs_around(offset, reference, target, *pixel) for pixel in np.ndindex(offset.shape)}
     for y, x in np.ndindex(offset.shape):
         centre = int(offset[y, x])
-        if not present[y + 2, x + 2]:
+        if costs[y, x] is None:
             continue
-        refined[y, x] = centre
-        difference, there = given[y : y + 5, x : x + 5] - centre, present[y : y + 5, x : x + 5]
+        window = [(y + j, x + i) for j in range(-2, 3) for i in range(-2, 3)]
+        there = np.array([0 <= r < height and 0 <= c < width and costs[r, c] is not None for r, c in window])
+        difference = np.array([int(offset[q]) - centre if t else 0 for q, t in zip(window, there, strict=True)])
+        there, difference = there.reshape(5, 5), difference.reshape(5, 5)
         plane = _offset_plane(difference, there & (np.abs(difference) <= 512 * ring))
         if plane is None:
             continue
-        sums, rounded, count = [0, 0, 0], 0, 0
-        for j, i in np.ndindex(5, 5):
-            predicted = _nearest_256(plane[0] + plane[1] * (i - 2) + plane[2] * (j - 2))
-            if not there[j, i] or abs(int(difference[j, i]) - predicted) > 512:
+        sums, rounded, count = np.zeros(3, dtype=int), 0, 0
+        for j, i in np.argwhere(there):
+            predicted = _nearest_256(plane[0] + plane[1] * (int(i) - 2) + plane[2] * (int(j) - 2))
+            whole = _nearest_256(predicted + centre)
+            step = whole - _nearest_256(int(difference[j, i]) + centre)
+            if abs(int(difference[j, i]) - predicted) > 512 or abs(step) > 1:
                 continue
-            row, whole = y + j - 2, _nearest_256(predicted + centre)
-            column = x + i - 2 + whole
-            if not 1 <= column < target.shape[1] - 1:
-                continue
-            words = [int(word) for word in target[row, column - 1 : column + 2]]
-            if max(words) >= CENSUS_INVALID:
-                continue
-            sums = [s + (w ^ int(reference[row, x + i - 2])).bit_count() for s, w in zip(sums, words, strict=True)]
+            sums += costs[y + j - 2, x + i - 2][step + 1 : step + 4]
             rounded += predicted + centre - whole * 256
             count += 1
         rise = max(sums[0], sums[2]) - sums[1]
         if count < 6 or rise <= 0 or sums[1] > min(sums):
             continue
-        tip = 0 if sums[1] == 0 else int(np.trunc((sums[0] - sums[2]) * 128 / rise))
-        result = centre + _nearest_256(plane[0]) + tip - int(np.trunc(rounded / count))
-        column = x + _nearest_256(result)
-        seen = 0 <= column < target.shape[1] and int(target[y, column]) < CENSUS_INVALID
-        if seen and abs(result - centre) <= 256:
-            refined[y, x] = result
+        tip = 0 if sums[1] == 0 else int(np.trunc(int(sums[0] - sums[2]) * 128 / int(rise)))
+        change = _nearest_256(plane[0]) + tip - int(np.trunc(rounded / count))
+        if abs(change) <= 256:
+            refined[y, x] = centre + change
     return refined
 
 

@@ -29,6 +29,7 @@ from colmap_sph.depth import (
     right_disparity,
 )
 from colmap_sph.errors import OptionError
+from colmap_sph.kernels import backend
 from colmap_sph.rectification import RectificationOptions, RectifiedPair, rectify_pair
 from colmap_sph.scene import View
 
@@ -151,12 +152,31 @@ def test_rays_are_found_in_the_map_to_a_millionth_of_a_pixel(scale):
             depth, sigma = np.empty((1, 1), np.float32), np.empty((1, 1), np.float32)
             origins = (u - 0.3, v - 0.6)
             _native.depth_candidates(
-                ramp, matrix, (scale, scale), origins, 0.0, 1.0, 1.0, 5.0, True, True, 0, depth, sigma
+                backend(), ramp, matrix, (scale, scale), origins, 0.0, 1.0, 1.0, 5.0, True, True, 0, depth, sigma
             )
             norm = np.sqrt(x * x + across**2)
             tangent = across / (float(depth[0, 0]) * norm**2 - x)
             read = np.arctan(tangent) * scale - 1
             assert read == pytest.approx(0.6 if along_rows else 0.3, abs=1e-6)
+
+
+@pytest.mark.parametrize("options", [SPHERE, FRAME], ids=["sphere", "frame"])
+def test_candidates_do_not_depend_on_the_backend(options, monkeypatch):
+    synthetic = RENDERED["convergent"]
+    scene, left, right = scene_of_pair(synthetic)
+    pair = rectify_pair(scene, left, right, options)
+    rng = np.random.default_rng(0)
+    for side, view in (("left", left), ("right", right)):
+        disparity, _ = exact_disparity(synthetic.surfaces, left, right, pair, side)
+        disparity += rng.normal(0, 1.5, disparity.shape)
+        disparity[rng.random(disparity.shape) < 0.2] = np.nan
+        results = []
+        for kernels in _native.backends():
+            monkeypatch.setenv("COLMAP_SPH_KERNELS", kernels)
+            results.append(depth_candidates(view, disparity.astype(np.float32), pair, side, OPTIONS))
+        assert (results[0][0] > 0).mean() > 0.3
+        for other in results[1:]:
+            np.testing.assert_array_equal(other, results[0])
 
 
 def test_disparities_without_a_point_in_front_give_none():

@@ -11,7 +11,8 @@ from scipy import ndimage
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
-from colmap_sph.matching import MatchingOptions, RectifiedImage, backend, match_pair
+from colmap_sph.kernels import backend
+from colmap_sph.matching import MatchingOptions, RectifiedImage, match_pair
 from colmap_sph.rectification import RectificationOptions, rectify_pair, resample
 
 SIZE, FOCAL = (240, 180), 300.0

@@ -60,6 +60,7 @@ def arguments(function):
             "out right": np.zeros((H, TARGET), f32),
         },
         "depth_candidates": {
+            "backend": "scalar",
             "disparity": np.zeros((H, W), f32),
             "rectified_from_pixel": np.eye(3),
             "scales": (100.0, 100.0),
@@ -98,6 +99,7 @@ def arguments(function):
             "out weight": np.zeros((H, W), f32),
         },
         "fit_planes": {
+            "backend": "scalar",
             "inverse_depth": np.ones((H, W), f32),
             "inverse_sigma": np.ones((H, W), f32),
             "K": np.eye(3, dtype=f64),
@@ -115,13 +117,14 @@ FUNCTIONS = [
     "matching_cost",
     "aggregation",
     "selection",
+    "refine_offsets",
     "transfer_disparity",
     "depth_candidates",
     "vote_depth",
     "check_consistency",
     "fit_planes",
 ]
-MATCHING = FUNCTIONS[:4]
+MATCHING = FUNCTIONS[:5]
 
 
 def call(function, values):
@@ -138,6 +141,7 @@ OUTPUTS = [(function, name) for function, name in ARRAYS if name.startswith("out
 FREE = {
     ("matching_cost", "target"): {1},
     ("selection", "target"): {1},
+    ("refine_offsets", "target"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -384,9 +388,9 @@ def test_empty_maps_are_no_work(shape):
     _native.transfer_disparity(np.ones((shape[0], 4), np.float32), 2.0, empty)
     geometry = (np.eye(3), (9.0, 9.0), (0.0, 0.0), 1.0, 1.0, 0.3, 2.0, True, True, 0)
     depth = np.ones((5, 6), np.float32)
-    _native.depth_candidates(empty, *geometry, depth, np.ones_like(depth))
+    _native.depth_candidates("scalar", empty, *geometry, depth, np.ones_like(depth))
     assert not depth.any()
-    _native.depth_candidates(partner, *geometry, empty, empty.copy())
+    _native.depth_candidates("scalar", partner, *geometry, empty, empty.copy())
     _native.vote_depth(
         np.ones((3, *shape), np.float32), np.ones((3, *shape), np.float32), 3.0, empty, empty.copy(), bytes_
     )
@@ -394,7 +398,7 @@ def test_empty_maps_are_no_work(shape):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
         _native.check_consistency(reference, reference, other, other, matrix, matrix, 1.0, 4.0, *counts)
         assert not any(count.any() for count in counts)
-    _native.fit_planes(empty, empty, np.eye(3), 4, 3.0, np.zeros((*shape, 3), np.float32), empty.copy())
+    _native.fit_planes("scalar", empty, empty, np.eye(3), 4, 3.0, np.zeros((*shape, 3), np.float32), empty.copy())
 
 
 def test_vote_of_no_pairs_is_no_depth():
@@ -435,6 +439,6 @@ def test_rays_at_the_rim_of_a_map_stay_inside(u, size):
     for x, y in ((u, 0.0), (0.0, u), (u, u)):
         matrix = np.array([[0, 0, x], [0, 0, y], [0, 0, 1.0]])
         _native.depth_candidates(
-            disparity, matrix, (1.0, 1.0), (0.0, 0.0), 0.0, 1.0, 1.0, 9.0, False, True, 0, depth, sigma
+            "scalar", disparity, matrix, (1.0, 1.0), (0.0, 0.0), 0.0, 1.0, 1.0, 9.0, False, True, 0, depth, sigma
         )
         assert depth[0, 0] in (0.0, 0.25)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from rendered import pixel_rays
 
+from colmap_sph import _native
 from colmap_sph.depth import DepthEstimate
 from colmap_sph.errors import OptionError
 from colmap_sph.normals import NormalOptions, fit_normals
@@ -92,6 +93,18 @@ def test_noisy_planes_give_normals_within_ten_degrees(slant, noise):
     inner = (depth > 0) & (exact > 0)
     before, after = (np.abs(1 / values[inner] - exact[inner]) for values in (noisy.depth, depth))
     assert np.median(after) < 0.5 * np.median(before)
+
+
+def test_normals_do_not_depend_on_the_backend(monkeypatch):
+    noisy = estimate(inverse_depth(plane_normal(40, 70)), noise=0.3, seed=3)
+    noisy.depth[np.random.default_rng(0).random(noisy.depth.shape) < 0.3] = 0
+    results = []
+    for kernels in _native.backends():
+        monkeypatch.setenv("COLMAP_SPH_KERNELS", kernels)
+        results.append(fit_normals(VIEW, noisy, OPTIONS))
+    for other in results[1:]:
+        for first, second in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(first, second)
 
 
 @pytest.mark.parametrize("tilt", [0, 90, 45])

@@ -149,7 +149,6 @@ ALWAYS_INLINE step begin_along(const sweep_state *s, ptrdiff_t p, __m256i least,
 ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
                                 uint16_t *sums_out, const ptrdiff_t depth) {
     const ptrdiff_t direction = s->backward ? -1 : 1, width = s->size.width, vectors = depth / 32;
-    const ptrdiff_t turned = s->done % width;
     const __m256i p1 = _mm256_set1_epi8((char)s->penalties.p1), zero = _mm256_setzero_si256();
     uint8_t scratch[VERTICAL_PATHS][MAX_DEPTH + 2 * GAP];
     along_row along;
@@ -165,7 +164,7 @@ ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost
         step steps[VERTICAL_PATHS];
         for (int k = 0; k < VERTICAL_PATHS; k++) {
             /* Row n of path k has pixel x at x + (k - 1) n, going round: its predecessor's place in row n - 1. */
-            ptrdiff_t place = x + (k - 1) * direction * turned;
+            ptrdiff_t place = x + (k - 1) * direction * s->turned;
             place += place < 0 ? width : place >= width ? -width : 0;
             places[k] = s->rows[k] + place * s->stride;
             steps[k] = begin_vertical(s, y, x, k, places[k], depth, scratch[k]);
@@ -203,6 +202,7 @@ ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost
         horizontal.least = horizontal_min(horizontal.minimum);
     }
     s->done++;
+    s->turned = s->turned + 1 < width ? s->turned + 1 : 0;
 }
 
 void sweep_row(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in, uint16_t *sums_out) {

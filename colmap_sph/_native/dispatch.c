@@ -2,12 +2,24 @@
 
 #include "kernels.h"
 
-static const kernel_table scalar_kernels = {"scalar",           census_scalar,    cost_scalar,
-                                            aggregation_scalar, selection_scalar, refine_offsets_scalar};
+static const kernel_table scalar_kernels = {"scalar",
+                                            census_scalar,
+                                            cost_scalar,
+                                            aggregation_scalar,
+                                            selection_scalar,
+                                            refine_offsets_scalar,
+                                            depth_candidates_scalar,
+                                            fit_planes_scalar};
 
 #ifdef COLMAP_SPH_HAVE_AVX2
-static const kernel_table avx2_kernels = {"avx2",           census_avx2,    cost_avx2,
-                                          aggregation_avx2, selection_avx2, refine_offsets_avx2};
+static const kernel_table avx2_kernels = {"avx2",
+                                          census_avx2,
+                                          cost_avx2,
+                                          aggregation_avx2,
+                                          selection_avx2,
+                                          refine_offsets_avx2,
+                                          depth_candidates_avx2,
+                                          fit_planes_avx2};
 
 static int has_avx2(void) {
     __builtin_cpu_init();

@@ -58,37 +58,8 @@ typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const 
                          int32_t *offset);
 
 /* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
-typedef void refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
-                               match_size size, int32_t *refined);
-
-typedef struct {
-    const char *name;
-    census_fn *census;
-    cost_fn *cost;
-    aggregation_fn *aggregation;
-    selection_fn *selection;
-    refine_offsets_fn *refine_offsets;
-} kernel_table;
-
-census_fn census_scalar, census_avx2;
-cost_fn cost_scalar, cost_avx2;
-aggregation_fn aggregation_scalar, aggregation_avx2;
-selection_fn selection_scalar, selection_avx2;
-refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
-
-/* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
-int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
-
-/* The table of this name, NULL when the processor or the build has no such version. */
-const kernel_table *kernels_by_name(const char *name);
-/* The fastest table this processor can run. */
-const kernel_table *kernels_best(void);
-
-/* ---- floating-point kernels: one version, so that the result never depends on the processor ---------------- */
-
-/* Carry a disparity map from the left image's columns to the right image's, row by row (NaN = none). */
-void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
-                        float max_step, float *right);
+typedef int refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                              match_size size, int32_t *refined);
 
 /* How to read a rectified pair's disparity along the rays of one of its images. */
 typedef struct {
@@ -104,9 +75,48 @@ typedef struct {
 } pair_geometry;
 
 /* z-depth and its standard deviation for rows [first_row, first_row + rows) of a depth map; 0 = none. */
-void depth_candidates(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width,
-                      const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows, ptrdiff_t columns,
-                      float *depth, float *sigma);
+typedef void depth_candidates_fn(const float *disparity, ptrdiff_t map_height, ptrdiff_t map_width,
+                                 const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows,
+                                 ptrdiff_t columns, float *depth, float *sigma);
+
+/* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
+ * depth, and the depth of each plane at its centre; zeros where no plane fits. */
+typedef int fit_planes_fn(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height,
+                          ptrdiff_t width, const double *K, int radius, float tolerance, float *normals,
+                          float *fitted_depth);
+
+typedef struct {
+    const char *name;
+    census_fn *census;
+    cost_fn *cost;
+    aggregation_fn *aggregation;
+    selection_fn *selection;
+    refine_offsets_fn *refine_offsets;
+    depth_candidates_fn *depth_candidates;
+    fit_planes_fn *fit_planes;
+} kernel_table;
+
+census_fn census_scalar, census_avx2;
+cost_fn cost_scalar, cost_avx2;
+aggregation_fn aggregation_scalar, aggregation_avx2;
+selection_fn selection_scalar, selection_avx2;
+refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
+depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
+fit_planes_fn fit_planes_scalar, fit_planes_avx2;
+
+/* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
+int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
+
+/* The table of this name, NULL when the processor or the build has no such version. */
+const kernel_table *kernels_by_name(const char *name);
+/* The fastest table this processor can run. */
+const kernel_table *kernels_best(void);
+
+/* ---- floating-point kernels: one version, so that the result never depends on the processor ---------------- */
+
+/* Carry a disparity map from the left image's columns to the right image's, row by row (NaN = none). */
+void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
+                        float max_step, float *right);
 
 /* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. */
 void vote_depth(const float *depths, const float *sigmas, ptrdiff_t count, ptrdiff_t pixels, float tolerance,
@@ -127,10 +137,5 @@ void check_consistency(const float *depth, const float *sigma, ptrdiff_t height,
                        ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
                        float tolerance, uint8_t *observing, uint8_t *agreeing, uint8_t *contradicting,
                        float *weighted_depth, float *weight);
-
-/* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
- * depth, and the depth of each plane at its centre; zeros where no plane fits. */
-void fit_planes(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height, ptrdiff_t width,
-                const double *K, int radius, float tolerance, float *normals, float *fitted_depth);
 
 #endif

@@ -183,6 +183,7 @@ static PyObject *py_refine_offsets(PyObject *self, PyObject *args) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
+    int status = 0;
     array_set arrays = {.count = 0};
     Py_ssize_t shape[2] = {-1, -1};
     const int32_t *offset = table ? array_get(&arrays, o[0], "offset", I32, 2, READ, shape) : NULL;
@@ -193,10 +194,10 @@ static PyObject *py_refine_offsets(PyObject *self, PyObject *args) {
     if (refined && check_width(shape[1]) && check_width(target_shape[1]) && arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], target_shape[1], 0};
         Py_BEGIN_ALLOW_THREADS;
-        table->refine_offsets(offset, reference, target, size, refined);
+        status = table->refine_offsets(offset, reference, target, size, refined);
         Py_END_ALLOW_THREADS;
     }
-    return finish(&arrays, 0);
+    return finish(&arrays, status);
 }
 
 static PyObject *py_transfer_disparity(PyObject *self, PyObject *args) {
@@ -221,17 +222,20 @@ static PyObject *py_transfer_disparity(PyObject *self, PyObject *args) {
 
 static PyObject *py_depth_candidates(PyObject *self, PyObject *args) {
     (void)self;
+    const char *backend;
     PyObject *o[4];
     pair_geometry g;
     Py_ssize_t first_row;
-    if (!PyArg_ParseTuple(args, "OO(dd)(dd)ddddppnOO", &o[0], &o[1], &g.columns_per_radian, &g.rows_per_radian,
-                          &g.column_origin, &g.row_origin, &g.disparity_origin, &g.baseline, &g.disparity_sigma,
-                          &g.max_disparity_step, &g.spherical, &g.is_left, &first_row, &o[2], &o[3])) {
+    if (!PyArg_ParseTuple(args, "sOO(dd)(dd)ddddppnOO", &backend, &o[0], &o[1], &g.columns_per_radian,
+                          &g.rows_per_radian, &g.column_origin, &g.row_origin, &g.disparity_origin, &g.baseline,
+                          &g.disparity_sigma, &g.max_disparity_step, &g.spherical, &g.is_left, &first_row, &o[2],
+                          &o[3])) {
         return NULL;
     }
+    const kernel_table *table = table_or_error(backend);
     array_set arrays = {.count = 0};
     Py_ssize_t map_shape[2] = {-1, -1}, matrix_shape[2] = {3, 3}, shape[2] = {-1, -1};
-    const float *disparity = array_get(&arrays, o[0], "disparity", F32, 2, READ, map_shape);
+    const float *disparity = table ? array_get(&arrays, o[0], "disparity", F32, 2, READ, map_shape) : NULL;
     const double *m =
         disparity ? array_get(&arrays, o[1], "rectified_from_pixel", F64, 2, READ, matrix_shape) : NULL;
     float *depth = m ? array_get(&arrays, o[2], "depth", F32, 2, WRITE, shape) : NULL;
@@ -241,7 +245,8 @@ static PyObject *py_depth_candidates(PyObject *self, PyObject *args) {
             g.rectified_from_pixel[k] = m[k];
         }
         Py_BEGIN_ALLOW_THREADS;
-        depth_candidates(disparity, map_shape[0], map_shape[1], &g, first_row, shape[0], shape[1], depth, sigma);
+        table->depth_candidates(disparity, map_shape[0], map_shape[1], &g, first_row, shape[0], shape[1], depth,
+                                sigma);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -321,15 +326,18 @@ static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
 
 static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     (void)self;
+    const char *backend;
     PyObject *o[5];
     int radius;
     float tolerance;
-    if (!PyArg_ParseTuple(args, "OOOifOO", &o[0], &o[1], &o[2], &radius, &tolerance, &o[3], &o[4])) {
+    if (!PyArg_ParseTuple(args, "sOOOifOO", &backend, &o[0], &o[1], &o[2], &radius, &tolerance, &o[3], &o[4])) {
         return NULL;
     }
+    const kernel_table *table = table_or_error(backend);
+    int status = 0;
     array_set arrays = {.count = 0};
     Py_ssize_t shape[3] = {-1, -1, 3}, matrix_shape[2] = {3, 3};
-    const float *inverse = array_get(&arrays, o[0], "inverse_depth", F32, 2, READ, shape);
+    const float *inverse = table ? array_get(&arrays, o[0], "inverse_depth", F32, 2, READ, shape) : NULL;
     const float *sigma = inverse ? array_get(&arrays, o[1], "inverse_sigma", F32, 2, READ, shape) : NULL;
     const double *K = sigma ? array_get(&arrays, o[2], "K", F64, 2, READ, matrix_shape) : NULL;
     float *normals = K ? array_get(&arrays, o[3], "normals", F32, 3, WRITE, shape) : NULL;
@@ -337,10 +345,10 @@ static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     if (fitted && check(radius >= 1 && radius <= MAX_FIT_RADIUS, "the window radius must lie in 1..16") &&
         arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
-        fit_planes(inverse, sigma, shape[0], shape[1], K, radius, tolerance, normals, fitted);
+        status = table->fit_planes(inverse, sigma, shape[0], shape[1], K, radius, tolerance, normals, fitted);
         Py_END_ALLOW_THREADS;
     }
-    return finish(&arrays, 0);
+    return finish(&arrays, status);
 }
 
 static PyMethodDef methods[] = {
@@ -355,7 +363,7 @@ static PyMethodDef methods[] = {
      "refine_offsets(backend, offset, reference, target, refined)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},
     {"depth_candidates", py_depth_candidates, METH_VARARGS,
-     "depth_candidates(disparity, rectified_from_pixel, (columns_per_radian, rows_per_radian), "
+     "depth_candidates(backend, disparity, rectified_from_pixel, (columns_per_radian, rows_per_radian), "
      "(column_origin, row_origin), disparity_origin, baseline, disparity_sigma, max_disparity_step, spherical, "
      "is_left, first_row, depth, sigma)"},
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
@@ -364,7 +372,7 @@ static PyMethodDef methods[] = {
      "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
      "weighted_depth, weight)"},
     {"fit_planes", py_fit_planes, METH_VARARGS,
-     "fit_planes(inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
+     "fit_planes(backend, inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
     {NULL, NULL, 0, NULL}};
 
 static PyModuleDef_Slot slots[] = {{0, NULL}};

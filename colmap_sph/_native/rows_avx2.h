@@ -24,6 +24,7 @@ typedef struct {
     path_penalties penalties;
     int backward;
     ptrdiff_t done;   /* rows */
+    ptrdiff_t turned; /* the same, modulo the width */
     ptrdiff_t stride; /* from pixel to pixel in `rows` */
     uint8_t *rows[VERTICAL_PATHS];
     uint8_t *memory;

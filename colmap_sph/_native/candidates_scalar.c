@@ -1,0 +1,2 @@
+#define DEPTH_CANDIDATES depth_candidates_scalar
+#include "candidates.inc"

@@ -1,0 +1,2 @@
+#define FIT_PLANES fit_planes_scalar
+#include "normals.inc"
