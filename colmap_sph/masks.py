@@ -49,14 +49,14 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8] | None:
     return np.where(mask > 0, np.uint8(255), np.uint8(0))
 
 
-def check_masks(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> list[str]:
+def check_masks(folder: Path, cameras: Mapping[str, pycolmap.Camera]) -> list[str]:
     """Make sure that a folder's masks can be used; return the names of the images that have one.
 
     Parameters
     ----------
     folder : Path
-    sizes : mapping of str to (int, int)
-        Width and height of each image, by its name.
+    cameras : mapping of str to pycolmap.Camera
+        That of each image, by its name.
 
     Raises
     ------
@@ -66,9 +66,13 @@ def check_masks(folder: Path, sizes: Mapping[str, tuple[int, int]]) -> list[str]
     """
     if not folder.is_dir():
         raise InputError(f"The mask folder {folder} does not exist; check --masks.")
-    masked = [name for name, size in sizes.items() if read_mask(mask_path(folder, name), *size) is not None]
+    masked = [
+        name
+        for name, camera in cameras.items()
+        if read_mask(mask_path(folder, name), camera.width, camera.height) is not None
+    ]
     if not masked:
-        name = next(iter(sizes))
+        name = min(cameras)
         raise InputError(f"{folder} holds no mask for any image; that of {name} must be {folder / name}.png.")
     return masked
 

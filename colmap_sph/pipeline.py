@@ -85,19 +85,13 @@ def run(
             if overwrite:
                 discard_results(dense)
             return reconstruct(dense, options, progress=progress, report=report)
-    model, originals = Path(model), None if images is None else Path(images)
+    model, images = Path(model), None if images is None else Path(images)
     with claimed(Workspace(root)):
         with timed_stage("undistort", 1, progress, report):
-            dense = prepare_workspace(model, originals, root, options.undistortion, masks, overwrite=overwrite)
+            dense = prepare_workspace(model, images, root, options.undistortion, masks, overwrite=overwrite)
             progress.advance()
-        return reconstruct(
-            dense,
-            options,
-            progress=progress,
-            report=report,
-            database=find_database(model),
-            expected=image_names(load_model(model)),
-        )
+        database, names = find_database(model), image_names(load_model(model))
+        return reconstruct(dense, options, progress=progress, report=report, database=database, expected=names)
 
 
 def check_arguments(

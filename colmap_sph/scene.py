@@ -192,6 +192,12 @@ def image_names(model: pycolmap.Reconstruction) -> list[str]:
     return sorted(model.image(image_id).name for image_id in model.reg_image_ids())
 
 
+def cameras_of_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Camera]:
+    """Cameras of the registered images of a model, by the image's name."""
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    return {image.name: model.camera(image.camera_id) for image in images}
+
+
 def is_pinhole(camera: pycolmap.Camera) -> bool:
     """Whether a camera of any model maps as its calibration matrix does, to 0.001 px inside the image."""
     if camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE):

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from colmap_sph.context import Context, Done
 from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate_depth
 from colmap_sph.errors import InputError, NoResultError
-from colmap_sph.fusion import explain_losses, fuse
+from colmap_sph.fusion import fuse
+from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.load_cache import LoadCache
 from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, match_pair

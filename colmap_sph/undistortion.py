@@ -1,15 +1,12 @@
 """Sparse model and original images → COLMAP dense workspace of undistorted images; or open an existing one.
 
-COLMAP itself undistorts (`pycolmap.undistort_images`). This module checks what goes in, because COLMAP ends
-the process at some bad input, and mends what comes out, because COLMAP leaves images which it did not
-undistort, and cameras without distortion but of a distorted model, in the model it writes.
+COLMAP itself undistorts (`pycolmap.undistort_images`). What goes in is checked before (see `originals`), because
+COLMAP ends the process at some bad input. What comes out is mended here, because COLMAP leaves images which it did
+not undistort, and cameras without distortion but of a distorted model, in the model it writes.
 """
 
-import hashlib
 import logging
 import shutil
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +17,16 @@ from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
 from colmap_sph.masks import check_masks, undistort_mask
-from colmap_sph.scene import Scene, image_names, is_pinhole, load_model, make_pinhole, model_files, scene_of_model
+from colmap_sph.originals import Originals, read_originals
+from colmap_sph.scene import (
+    Scene,
+    cameras_of_images,
+    is_pinhole,
+    load_model,
+    make_pinhole,
+    model_files,
+    scene_of_model,
+)
 from colmap_sph.staging import (
     check_discardable,
     discard_workspace,
@@ -30,13 +36,7 @@ from colmap_sph.staging import (
     scratch_folder,
     write_marker,
 )
-from colmap_sph.workspace import (
-    Workspace,
-    make_dir,
-    mask_path,
-    write_fusion_cfg,
-    write_patch_match_cfg,
-)
+from colmap_sph.workspace import Workspace, make_dir, mask_path, write_fusion_cfg, write_patch_match_cfg
 
 logger = logging.getLogger(__name__)
 
@@ -60,27 +60,6 @@ class UndistortionOptions:
             )
 
 
-def find_images(model_dir: Path, names: Sequence[str]) -> Path:
-    """Find the image folder of a model by COLMAP's usual layouts.
-
-    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
-    folder that holds most of the model's images is taken, the first among equals.
-
-    Raises
-    ------
-    InputError
-        None of the folders holds any image of the model; the message lists them.
-    """
-    absolute, resolved = Path.cwd() / model_dir, Path(model_dir).resolve()
-    parents = [p for model in (absolute, resolved) for p in (model.parent.parent, model.parent, model)]
-    folders = list(dict.fromkeys(parent / "images" for parent in parents))
-    found = [sum((folder / name).is_file() for name in names) for folder in folders]
-    if max(found) == 0:
-        tried = ", ".join(str(folder) for folder in folders)
-        raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
-    return folders[found.index(max(found))]
-
-
 def prepare_workspace(
     model_dir: Path,
     image_dir: Path | None,
@@ -101,7 +80,7 @@ def prepare_workspace(
     model_dir : Path
         COLMAP model, binary or text, any camera model that has a pinhole equivalent.
     image_dir : Path or None
-        Original images; None: found by `find_images`.
+        Original images; None: found by `originals.find_images`.
     output : Path
         The dense workspace; created where missing.
     options : UndistortionOptions
@@ -123,29 +102,24 @@ def prepare_workspace(
     OutputError
         `output` cannot be written.
     """
-    source = _read_source(model_dir, image_dir, options, masks)
-    model, image_dir, marker = source.model, source.image_dir, source.marker
-    workspace = Workspace(output)
+    options.check()
+    originals = read_originals(model_dir, image_dir, masks)
+    marker, workspace = _marker(originals, options), Workspace(output)
     scratch = workspace.state_dir / "undistorting"
-    if read_marker(scratch) == marker and not overwrite:
-        move_into_place(scratch, workspace)
-    if not overwrite and is_finished(workspace, marker):
-        logger.info("The undistorted images in %s are up to date", output)
+    if not overwrite and _is_made(workspace, scratch, marker):
         return workspace
-    good = _usable_images(model, image_dir)
-    masked = [] if masks is None else check_masks(masks, _sizes(model, good))
+    usable = originals.usable()
     if overwrite:
         discard_workspace(workspace)
-    _check_space(source, model_dir, good, output)
+    _check_space(originals, usable.images, output, options)
     with scratch_folder(scratch):
-        kept = _undistort(model, model_dir, image_dir, good, scratch, options)
-        if masks is not None:
-            _undistort_masks(model, masks, [name for name in kept if name in set(masked)], scratch, options)
+        kept = _undistort(originals, usable.images, scratch, options)
+        _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
         Workspace(scratch).create_stereo_dirs(kept)
         shutil.rmtree(Workspace(scratch).state_dir)
         write_marker(scratch, marker)
         move_into_place(scratch, workspace)
-    logger.info("Undistorted %d of %d images into %s", len(kept), model.num_reg_images(), output)
+    logger.info("Undistorted %d of %d images into %s", len(kept), originals.model.num_reg_images(), output)
     return workspace
 
 
@@ -175,15 +149,13 @@ def foresee_workspace(
     overwrite : bool
         The workspace that is there will be discarded first.
     """
-    source = _read_source(model_dir, image_dir, options, masks)
+    options.check()
+    originals = read_originals(model_dir, image_dir, masks)
     if overwrite:
         check_discardable(Workspace(output))
-    elif is_finished(Workspace(output), source.marker):
+    elif is_finished(Workspace(output), _marker(originals, options)):
         return None
-    names = _usable_images(source.model, source.image_dir)
-    if masks is not None:
-        check_masks(masks, _sizes(source.model, names))
-    model = _submodel(source.model, set(names))
+    model = _submodel(originals.model, set(originals.usable().images))
     cameras = [model.camera(image.camera_id) for image in model.images.values()]
     pixels = sum(camera.width * camera.height for camera in cameras)
     _replace_ideal_fisheyes(model)
@@ -192,36 +164,6 @@ def foresee_workspace(
         camera.model, camera.params = undistorted.model, undistorted.params
         camera.width, camera.height = undistorted.width, undistorted.height
     return Foreseen(scene_of_model(model, model_dir), pixels)
-
-
-@dataclass(frozen=True)
-class _Source:
-    """What is to be undistorted, and the marker that says so."""
-
-    model: pycolmap.Reconstruction
-    image_dir: Path
-    options: UndistortionOptions
-    marker: dict[str, Any]
-
-
-def _read_source(
-    model_dir: Path, image_dir: Path | None, options: UndistortionOptions, masks: Path | None
-) -> _Source:
-    options.check()
-    model = load_model(model_dir)
-    names = image_names(model)
-    if image_dir is None:
-        image_dir = find_images(model_dir, names)
-    elif not image_dir.is_dir():
-        raise InputError(f"The image folder {image_dir} does not exist; check --images.")
-    marker = {
-        "version": 1,
-        "options": asdict(options),
-        "model": _hash_model(model_dir),
-        "images": _hash_images(image_dir, names),
-        "masks": None if masks is None else _hash_images(masks, [f"{name}.png" for name in names]),
-    }
-    return _Source(model, image_dir, options, marker)
 
 
 def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
@@ -249,7 +191,7 @@ def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
             )
     model = load_model(workspace.sparse_dir)
     if masks is not None or workspace.masks_dir.is_dir():
-        check_masks(workspace.masks_dir, _sizes(model, image_names(model)))
+        check_masks(workspace.masks_dir, cameras_of_images(model))
     return workspace
 
 
@@ -275,48 +217,37 @@ def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
     return replace(scene, views=tuple(good))
 
 
-def _usable_images(model: pycolmap.Reconstruction, image_dir: Path) -> list[str]:
-    """Return the sorted names of the registered images that are fit for undistortion; report the others."""
-    source, good = Workspace(image_dir), []
-    for image in sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name):
-        camera = model.camera(image.camera_id)
-        source.image_path(image.name)  # refuses a name that leads out of the folder
-        problem = image_problem(image_dir / image.name, camera.width, camera.height)
-        if problem is None:
-            good.append(image.name)
-        else:
-            logger.warning("%s %s; left out", image_dir / image.name, problem)
-    if not good:
-        raise InputError(
-            f"None of the model's {model.num_reg_images()} images in {image_dir} is usable; check --images."
-        )
-    return good
+def _is_made(workspace: Workspace, scratch: Path, marker: dict[str, Any]) -> bool:
+    """Whether the workspace is there, once a move into place that was interrupted is finished."""
+    if read_marker(scratch) == marker:
+        move_into_place(scratch, workspace)
+    finished = is_finished(workspace, marker)
+    if finished:
+        logger.info("The undistorted images in %s are up to date", workspace.root)
+    return finished
 
 
-def _sizes(model: pycolmap.Reconstruction, names: Sequence[str]) -> dict[str, tuple[int, int]]:
-    """Width and height of images, by name."""
-    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    return {name: (cameras[name].width, cameras[name].height) for name in names}
+def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any]:
+    """What a workspace is made from."""
+    return {"version": 1, "options": asdict(options), **originals.fingerprint()}
 
 
-def _undistort(
-    model: pycolmap.Reconstruction,
-    model_dir: Path,
-    image_dir: Path,
-    names: list[str],
-    scratch: Path,
-    options: UndistortionOptions,
-) -> list[str]:
+def _undistort(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> list[str]:
     """Let COLMAP undistort images `names` into `scratch`; return the names that came out well."""
-    if _replace_ideal_fisheyes(model):
+    model_dir = originals.model_dir
+    if _replace_ideal_fisheyes(originals.model):
         model_dir = scratch / "model"
         make_dir(model_dir)
-        model.write_binary(model_dir)
+        originals.model.write_binary(model_dir)
     logger.info("Undistorting %d images", len(names))
     try:
         with quiet_colmap():
             pycolmap.undistort_images(
-                scratch, model_dir, image_dir, image_names=names, undistort_options=_camera_options(options)
+                scratch,
+                model_dir,
+                originals.image_dir,
+                image_names=names,
+                undistort_options=_camera_options(options),
             )
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
@@ -331,15 +262,15 @@ def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOpt
     return camera_options
 
 
-def _undistort_masks(
-    model: pycolmap.Reconstruction, masks: Path, names: list[str], scratch: Path, options: UndistortionOptions
-) -> None:
-    """Undistort the masks of images `names` into `scratch`; `model` is that of the original images."""
+def _undistort_masks(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> None:
+    """Undistort the masks of images `names` into `scratch`."""
+    if originals.mask_dir is None:
+        return
     logger.info("Undistorting %d masks", len(names))
-    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
+    cameras = cameras_of_images(originals.model)
     for name in names:
         target = Workspace(scratch).mask_path(name)
-        undistort_mask(mask_path(masks, name), cameras[name], _camera_options(options), target)
+        undistort_mask(mask_path(originals.mask_dir, name), cameras[name], _camera_options(options), target)
 
 
 def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
@@ -366,8 +297,7 @@ def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
 def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     """Leave only undistorted images and PINHOLE cameras in the model; write the configuration for them."""
     model = _load_written_model(workspace)
-    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    kept = []
+    cameras, kept = cameras_of_images(model), []
     for name in names:
         problem = image_problem(workspace.image_path(name), cameras[name].width, cameras[name].height)
         if problem is None:
@@ -411,33 +341,14 @@ def _submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Recon
     return part
 
 
-def _hash_model(model_dir: Path) -> str:
-    digest = hashlib.sha256()
-    for path in model_files(model_dir):
-        with path.open("rb") as file:
-            digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
-
-
-def _hash_images(image_dir: Path, names: list[str]) -> str:
-    """Hash names, sizes and times of the images: their content would take as long to read as to undistort."""
-    digest = hashlib.sha256()
-    for name in names:
-        with suppress(OSError):
-            status = (image_dir / name).stat()
-            digest.update(f"{name}\n{status.st_size} {status.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
-
-
-def _check_space(source: _Source, model_dir: Path, names: list[str], output: Path) -> None:
+def _check_space(originals: Originals, names: list[str], output: Path, options: UndistortionOptions) -> None:
     """Raise `OutputError` unless the undistorted images will fit: COLMAP ends the process at a full disk."""
-    needed = sum(path.stat().st_size for path in model_files(model_dir))
-    for image in source.model.images.values():
-        if image.name in names:
-            camera = source.model.camera(image.camera_id)
-            limit = source.options.max_image_size
-            scale = min(1.0, limit / max(camera.width, camera.height)) if limit > 0 else 1.0
-            needed += int(scale**2 * (source.image_dir / image.name).stat().st_size)
+    needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
+    cameras, limit = cameras_of_images(originals.model), options.max_image_size
+    for name in names:
+        longest = max(cameras[name].width, cameras[name].height)
+        scale = min(1.0, limit / longest) if limit > 0 else 1.0
+        needed += int(scale**2 * (originals.image_dir / name).stat().st_size)
     needed *= _SPACE_FACTOR
     free = shutil.disk_usage(next(path for path in (output, *output.absolute().parents) if path.exists())).free
     if free < needed:

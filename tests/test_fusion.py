@@ -16,7 +16,8 @@ from clouds import read_fused, read_visibility
 
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.fusion import FusionOptions, explain_losses, fuse
+from colmap_sph.fusion import FusionOptions, fuse
+from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.scene import read_scene
 from colmap_sph.workspace import (
     Workspace,

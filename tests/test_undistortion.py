@@ -11,10 +11,10 @@ import pytest
 from colmap_sph import staging
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
+from colmap_sph.originals import find_images
 from colmap_sph.scene import read_scene
 from colmap_sph.undistortion import (
     UndistortionOptions,
-    find_images,
     leave_out_bad_images,
     open_workspace,
     prepare_workspace,
