@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.depth import CHECK_OPTIONS, VOTE_OPTIONS
 from colmap_sph.load_cache import LoadCache
 from colmap_sph.options import RunOptions
 from colmap_sph.rectification import RectifiedPair
@@ -43,8 +44,8 @@ class Keys:
 
     def vote(self, view: View, pair_keys: Sequence[str]) -> str:
         """Of a photometric estimate, from the keys of its pairs in the order in which they vote."""
-        mask = self._masks.get(view.name)
-        return digest("vote", self._program, _camera(view), mask, pair_keys, self._options.depth)
+        mask, options = self._masks.get(view.name), self._depth_options(VOTE_OPTIONS)
+        return digest("vote", self._program, _camera(view), mask, pair_keys, options)
 
     def photometric(self, vote: str) -> str:
         """Of the photometric maps of the view with this vote."""
@@ -52,7 +53,7 @@ class Keys:
 
     def geometric(self, vote: str, partner_votes: Sequence[str]) -> str:
         """Of the geometric maps of a view, from its own vote and those of its partners, in their order."""
-        return digest("geometric", vote, partner_votes, self._options.depth, self._options.normals)
+        return digest("geometric", vote, partner_votes, self._depth_options(CHECK_OPTIONS), self._options.normals)
 
     def cloud(
         self, maps: Mapping[str, str], partners: Mapping[str, Sequence[str]], origin: NDArray[np.float64]
@@ -74,6 +75,9 @@ class Keys:
             [_digest_if_there(path) for path in masks],
             options.fusion_input,
         )
+
+    def _depth_options(self, names: Sequence[str]) -> dict[str, float]:
+        return {name: getattr(self._options.depth, name) for name in names}
 
 
 def _camera(view: View) -> tuple[object, ...]:

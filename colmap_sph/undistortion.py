@@ -342,7 +342,7 @@ def _submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Recon
 
 
 def _check_space(originals: Originals, names: list[str], output: Path, options: UndistortionOptions) -> None:
-    """Raise `OutputError` unless the undistorted images will fit: COLMAP ends the process at a full disk."""
+    """Raise `OutputError` unless the undistorted images will fit: COLMAP may not notice a full disk."""
     needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
     cameras, limit = cameras_of_images(originals.model), options.max_image_size
     for name in names:

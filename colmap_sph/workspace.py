@@ -226,7 +226,8 @@ def _write_planes(path: Path, planes: NDArray[np.floating]) -> None:
 def check_map(path: Path, shape: tuple[int, ...]) -> None:
     """Raise `InputError` unless a map file is whole and its map has this shape: (H, W) or (H, W, 3).
 
-    COLMAP's fusion trusts the files, and ends the process at one that is cut off.
+    COLMAP's fusion trusts the files: it fuses one that is cut off or of another size without a word, or raises an
+    error that does not name it.
     """
     try:
         with path.open("rb") as file:

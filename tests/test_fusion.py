@@ -303,7 +303,7 @@ def test_fusion_cfg_that_does_not_fit(workspace):
 
 @pytest.mark.parametrize("kind", ["cut off", "other size", "no header"])
 def test_a_damaged_map_is_named(workspace, kind):
-    """COLMAP itself would end the process or read beyond the file."""
+    """COLMAP itself would fuse it without a word, or not say which it is."""
     path = workspace.depth_map_path("c.png", "geometric")
     if kind == "other size":
         write_depth_map(path, np.ones((HEIGHT, WIDTH - 1), np.float32))

@@ -1,5 +1,6 @@
 """A model in map coordinates gives what the same model gives at its origin, to the last digit that floats hold."""
 
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from colmap_sph.map_coordinates import local_origin, move_cloud
 from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairOptions
 from colmap_sph.scene import read_scene
+from colmap_sph.staging import discard_workspace
 from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.workspace import Workspace, read_depth_map, read_normal_map
 
@@ -128,6 +130,26 @@ def test_local_workspace_serves_colmap(near: Near, tmp_path: Path) -> None:
     cloud, whole = read_fused(local / "fused.ply"), read_geometry(dense / "fused.ply").points
     np.testing.assert_allclose(cloud["xyz"] + origin, whole, rtol=0, atol=1e-9)
     assert (local / "fused.ply.vis").read_bytes() == (dense / "fused.ply.vis").read_bytes()
+
+
+def test_local_workspace_is_made_again(near: Near, tmp_path: Path) -> None:
+    """Where it is lost or its model was moved; --overwrite removes it, and a near model leaves none."""
+    (tmp_path / "images").symlink_to(near.project / "images")
+    model = move(near.project / "sparse" / "0", UTM, tmp_path / "sparse" / "0")
+    local, sparse = tmp_path / "dense/colmap_sph/local", tmp_path / "dense/sparse"
+    colmap_sph.run(model, options=OPTIONS)
+    assert not any(colmap_sph.run(model, options=OPTIONS).made.values())
+    shutil.rmtree(local)
+    assert colmap_sph.run(model, options=OPTIONS).made["fuse"] == 1
+    assert pycolmap.Reconstruction(local / "sparse").num_reg_images() == len(NADIR)
+    discard_workspace(Workspace(tmp_path / "dense"))
+    assert not local.exists()
+    colmap_sph.run(model, options=OPTIONS)
+    shutil.rmtree(sparse)
+    move(near.dense / "sparse", (0.0, 0.0, 0.0), sparse)
+    colmap_sph.run(workspace=tmp_path / "dense", options=OPTIONS)
+    assert not local.exists()
+    assert_same_cloud(near.dense, tmp_path / "dense", (0.0, 0.0, 0.0))
 
 
 def test_far_model_without_tracks(near: Near, tmp_path: Path) -> None:

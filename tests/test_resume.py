@@ -18,6 +18,7 @@ from colmap_sph.claim import claimed
 from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import InputError, NoResultError, OutputError
 from colmap_sph.fusion import FusionOptions
+from colmap_sph.keys import Keys
 from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 from colmap_sph.options import RunOptions
@@ -138,6 +139,10 @@ CHANGES = {
         {"depth": DepthOptions(vote_tolerance=2.5)},
         expected_files(pairs=0, votes=4, photometric=4, geometric=4, cloud=True),
     ),
+    "consistency": (
+        {"depth": DepthOptions(max_contradiction=0.5)},
+        expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
+    ),
     "normals": (
         {"normals": NormalOptions(radius=3)},
         expected_files(pairs=0, votes=0, photometric=4, geometric=4, cloud=True),
@@ -192,6 +197,37 @@ def test_a_changed_image_redoes_its_pairs(finished: Finished) -> None:
         name for name in before if "pairs/" in name and number in name
     }
     assert counted(files) == expected_files(pairs=3, votes=4, photometric=4, geometric=4, cloud=True)
+
+
+def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> None:
+    """As a changed image does; and without it everything is as before."""
+    masks, number = finished.project / "masks", f"{finished.ids[NAMES[0]]:06d}"
+    masks.mkdir()
+    mask = np.full((240, 320), 255, np.uint8)
+    before = results(finished.dense)
+
+    def rerun(*, given: bool = True) -> RunReport:
+        cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
+        plan = make_plan(workspace=finished.dense, masks=masks if given else None, options=OPTIONS)
+        report = colmap_sph.run(workspace=finished.dense, masks=masks if given else None, options=OPTIONS)
+        assert plan.pairs - plan.pairs_done == report.made["match pairs"]
+        return report
+
+    for columns in (100, 200):
+        state = results(finished.dense)
+        mask[:, :columns] = 0
+        assert rerun().made == {"match pairs": 3, "estimate depth": 4, "check consistency": 4, "fuse": 1}
+        assert all(number in name for name in rewritten(state, finished.dense) if "pairs/" in name)
+        assert rerun().made == NOTHING
+    assert rerun(given=False).made["match pairs"] == 3
+    after = results(finished.dense)
+    assert {name for name in before if after[name][1] != before[name][1] and "fused" not in name} == set()
+
+
+def test_the_cloud_depends_on_the_origin(finished: Finished) -> None:
+    keys = Keys(Workspace(finished.dense), OPTIONS)
+    near, far = (keys.cloud({}, {}, np.full(3, height)) for height in (0.0, 1e6))
+    assert near != far == keys.cloud({}, {}, np.full(3, 1e6))
 
 
 def test_a_changed_mask_redoes_the_cloud(finished: Finished) -> None:
@@ -363,6 +399,29 @@ def test_overwrite_takes_other_undistortion_options(finished: Finished) -> None:
         colmap_sph.run(finished.project / "sparse/0", options=smaller)
     colmap_sph.run(finished.project / "sparse/0", options=smaller, overwrite=True)
     assert {view.width for view in read_scene(finished.dense / "sparse").views} == {200}
+
+
+def test_overwrite_with_masks(finished: Finished) -> None:
+    """Undistorted masks go with the images, but not where someone has put a file among them."""
+    masks, model = finished.project / "masks", finished.project / "sparse/0"
+    masks.mkdir()
+    with pytest.raises(InputError, match="holds no mask for any image"):
+        colmap_sph.run(model, masks=masks, options=OPTIONS, overwrite=True)
+    assert colmap_sph.run(model, options=OPTIONS).made == NOTHING
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, :100] = 0
+    cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
+    with pytest.raises(InputError, match=r"different masks; .*--overwrite"):
+        colmap_sph.run(model, masks=masks, options=OPTIONS)
+    assert make_plan(model, masks=masks, options=OPTIONS, overwrite=True).undistort
+    colmap_sph.run(model, masks=masks, options=OPTIONS, overwrite=True)
+    assert [path.name for path in (finished.dense / "masks").iterdir()] == [f"{NAMES[0]}.png"]
+    (finished.dense / "masks/mine.png").write_text("mine")
+    with pytest.raises(InputError, match=r"mine\.png was not made by this program"):
+        overwrite(finished)
+    (finished.dense / "masks/mine.png").unlink()
+    overwrite(finished)
+    assert not (finished.dense / "masks").exists()
 
 
 @pytest.mark.parametrize("place", ["images/mine.jpg", "stereo/depth_maps/notes.txt", "sparse/new/a.txt"])
