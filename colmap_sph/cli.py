@@ -2,35 +2,42 @@
 
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import rich.logging
 import rich.progress
 import tyro
 from rich.console import Console
+from rich.filesize import decimal
 from rich.table import Table
 
 import colmap_sph
 from colmap_sph.demo import run_demo
 from colmap_sph.depth import DepthOptions
-from colmap_sph.errors import ColmapSphError
+from colmap_sph.errors import ColmapSphError, OutOfMemoryError, OutputError
 from colmap_sph.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.fusion import FusionOptions
+from colmap_sph.interruption import Interrupted, stop_on_signals
 from colmap_sph.log_file import workspace_log
 from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairOptions
 from colmap_sph.pipeline import run, workspace_root
+from colmap_sph.plan import Plan, make_plan
 from colmap_sph.rectification import RectificationOptions
 from colmap_sph.report import RunReport
 from colmap_sph.undistortion import UndistortionOptions
+from colmap_sph.workers import is_memory_error
 from colmap_sph.workspace import MapKind, Workspace
+
+logger = logging.getLogger(__name__)
 
 PARTIAL_EXIT_CODE = 5
 """The run finished, but some images of the model have no depth map."""
@@ -50,6 +57,9 @@ class RunCommand:
     """Sparse model (binary or text), such as sparse/0. Its images are undistorted into --output."""
     images: Path | None = None
     """Original images. Default: the folder `images` beside or above the model."""
+    masks: Path | None = None
+    """Masks: NAME.png for image NAME with its folders, black = ignored. Of the original images, or with
+    --workspace of the undistorted ones."""
     output: Path | None = None
     """Dense workspace to create. Default: the folder `dense` beside the model's `sparse`."""
     workspace: Path | None = None
@@ -58,6 +68,10 @@ class RunCommand:
     """Worker threads; 0: all cores."""
     fusion_input: MapKind = "geometric"
     """Maps to fuse: those confirmed by other views, or the unchecked ones."""
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only say what is to do, and about how much time, memory and disk it takes; write nothing."""
+    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Do everything again, also what an earlier run in this workspace has finished."""
     undistortion: Annotated[UndistortionOptions, tyro.conf.arg(name="")] = field(
         default_factory=UndistortionOptions
     )
@@ -68,7 +82,7 @@ class RunCommand:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)
-    fusion: FusionOptions = field(default_factory=FusionOptions)
+    fusion: Annotated[FusionOptions, tyro.conf.FlagConversionOff] = field(default_factory=FusionOptions)
 
     def options(self) -> RunOptions:
         """The options of all stages."""
@@ -88,32 +102,46 @@ class DemoCommand:
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the `colmap_sph` command; returns the exit code."""
     console = Console(stderr=True)
-    commands: dict[str, tuple[type, Callable[..., int]]] = {
-        "run": (RunCommand, run_command),
-        "demo": (DemoCommand, demo_command),
-        "evaluate": (EvaluateCommand, evaluate_command),
-    }
     arguments = sys.argv[1:] if arguments is None else arguments
     if arguments and arguments[0] in ("--version", "-V"):
         print(f"colmap_sph {colmap_sph.__version__}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        {name: cls for name, (cls, _) in commands.items()},
+        # `run` alone has flags without a value.
+        {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
         prog="colmap_sph",
         description="Dense reconstruction for COLMAP without a GPU.",
         args=arguments,
-        config=(tyro.conf.AvoidSubcommands, tyro.conf.FlagConversionOff),
+        config=(tyro.conf.AvoidSubcommands,),
     )
-    handler = next(function for cls, function in commands.values() if isinstance(command, cls))
+
+    def last_words(_: Interrupted) -> None:
+        logger.info("Interrupted")
+        console.show_cursor()
+        _print_interrupted(command, console)
+
     with _console_logging(console):
         try:
-            return handler(command, console)
+            with stop_on_signals(last_words):
+                if isinstance(command, RunCommand):
+                    return run_command(command, console)
+                if isinstance(command, DemoCommand):
+                    return demo_command(command, console)
+                return evaluate_command(command, console)
+        except Interrupted as stop:
+            _print_interrupted(command, console)
+            return stop.exit_code
         except ColmapSphError as error:
-            console.print(f"[bold red]error:[/] {_escaped(error)}", highlight=False, soft_wrap=True)
-            return error.exit_code
-        except KeyboardInterrupt:
-            console.print("interrupted", style="bold red")
-            return 130
+            return _print_error(error, console)
+        except (MemoryError, cv2.error) as error:
+            if not is_memory_error(error):
+                raise
+            return _print_error(OutOfMemoryError(), console)
+        except OSError as error:
+            if error.errno is None:
+                raise
+            what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
+            return _print_error(OutputError(f"{what} ({error.strerror}); check space and permissions."), console)
 
 
 def run_command(command: RunCommand, console: Console) -> int:
@@ -121,17 +149,60 @@ def run_command(command: RunCommand, console: Console) -> int:
     root = workspace_root(command.model, images=command.images, output=command.output, workspace=command.workspace)
     options = command.options()
     options.check()
+    if command.dry_run:
+        plan = make_plan(
+            command.model,
+            images=command.images,
+            masks=command.masks,
+            output=command.output,
+            workspace=command.workspace,
+            options=options,
+            overwrite=command.overwrite,
+        )
+        print_plan(plan, Workspace(root), console)
+        return 0
     with workspace_log(Workspace(root), _header(command)), _Display(console) as display:
         report = run(
             command.model,
             images=command.images,
+            masks=command.masks,
             output=command.output,
             workspace=command.workspace,
             options=options,
             progress=display,
+            overwrite=command.overwrite,
         )
     print_summary(report, Workspace(root), console)
     return PARTIAL_EXIT_CODE if report.skipped_images else 0
+
+
+def print_plan(plan: Plan, workspace: Workspace, console: Console) -> None:
+    """What a run would do and need."""
+    facts = Table.grid(padding=(0, 2))
+    facts.add_row("undistort", "to do" if plan.undistort else "done")
+    for what, number, done in (
+        ("pairs", plan.pairs, plan.pairs_done),
+        ("images", plan.images, plan.images_done),
+        ("cloud", 1, int(not plan.fuse)),
+    ):
+        facts.add_row(what, f"{number - done} to do, {done} done")
+    facts.add_row("time", f"about {_duration(plan.seconds)}")
+    facts.add_row("memory", f"about {decimal(round(plan.memory))}")
+    facts.add_row("disk", f"about {decimal(round(plan.disk))} more, of {decimal(plan.free_disk)} free")
+    console.print(facts, highlight=False)
+    console.print(
+        "Time, memory and disk are estimates from the numbers of pixels, good to a factor of two or so; "
+        f"nothing was written to {_escaped(workspace.root)}.",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _duration(seconds: float) -> str:
+    """Such as "40 s", "12 min" or "3.5 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
 def print_summary(report: RunReport, workspace: Workspace, console: Console) -> None:
@@ -148,6 +219,9 @@ def print_summary(report: RunReport, workspace: Workspace, console: Console) -> 
     facts.add_row("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")
     facts.add_row("pairs", f"{report.pairs} matched ({report.pair_source})")
     facts.add_row("cloud", f"{report.points:,} points in {_escaped(workspace.fused_path)}")
+    if any(report.reused.values()):
+        kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
+        facts.add_row("up to date", kept)
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
     facts.add_row("seconds", f"{sum(report.seconds.values()):.1f} ({times})")
     facts.add_row("peak memory", f"{report.peak_memory / 2**30:.2f} GiB")
@@ -200,6 +274,17 @@ class _Display:
             self._bars.advance(self._task)
 
 
+def _print_error(error: ColmapSphError, console: Console) -> int:
+    console.print(f"[bold red]error:[/] {_escaped(error)}", highlight=False, soft_wrap=True)
+    return error.exit_code
+
+
+def _print_interrupted(command: object, console: Console) -> None:
+    remedy = "; what is finished is kept, run the same command again to go on"
+    words = remedy if isinstance(command, RunCommand) else ""
+    console.print(f"[bold red]interrupted[/]{words}", highlight=False, soft_wrap=True)
+
+
 def _header(command: object) -> str:
     return f"colmap_sph {colmap_sph.__version__}: {command}"
 
@@ -221,7 +306,3 @@ def _console_logging(console: Console) -> Iterator[None]:
     finally:
         package.removeHandler(handler)
         package.setLevel(level)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

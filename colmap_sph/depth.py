@@ -66,6 +66,11 @@ class DepthOptions:
             raise OptionError(f"max_contradiction must not be negative, not {self.max_contradiction}.")
 
 
+# Which options `estimate_depth` reads, and which `check_depth`.
+VOTE_OPTIONS = ("disparity_sigma", "max_disparity_step", "vote_tolerance", "min_support")
+CHECK_OPTIONS = ("max_reprojection_error", "consistency_tolerance", "min_consistent", "max_contradiction")
+
+
 @dataclass(frozen=True, eq=False)
 class PairDisparity:
     """What matching found for a rectified pair.

@@ -35,5 +35,17 @@ class NoResultError(ColmapSphError):
     exit_code = 4
 
 
+class OutOfMemoryError(ColmapSphError):
+    """The system refuses memory or threads."""
+
+    exit_code = 6
+
+    def __init__(self) -> None:
+        super().__init__(
+            "There is not enough memory; give fewer --threads or a smaller --max-image-size, "
+            "or end other programs."
+        )
+
+
 class RectificationError(ColmapSphError):
     """A pair that the chosen rectification model cannot handle; the pair is skipped and reported."""

@@ -96,7 +96,7 @@ def _sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Return which of (N, 3) points lie before the camera and inside its image."""
     camera = points @ view.R.T + view.t
     pixels = camera @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         u, v = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
         inside = (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
     return np.asarray(inside & (camera[:, 2] > 0))

@@ -1,9 +1,13 @@
 """Dense workspace → fused cloud, by COLMAP's own fusion of the depth and normal maps.
 
 COLMAP's default gates suit its own patch match; ours keep one point per surface element instead of merging
-neighbours two pixels away, which thins a cloud several times.
+neighbours two pixels away, which thins a cloud several times. COLMAP computes with 32-bit floats, so a model in
+map coordinates is moved near its origin before, and the cloud back afterwards.
 """
 
+import errno
+import os
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,14 +18,16 @@ from numpy.typing import NDArray
 
 from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.load_cache import LoadCache
-from colmap_sph.scene import Scene, View, load_model
+from colmap_sph.map_coordinates import local_origin, move_cloud, move_model
+from colmap_sph.scene import cameras_of_images, load_model
 from colmap_sph.staging import scratch_folder
-from colmap_sph.workspace import MapKind, Workspace, make_dir, read_depth_map, read_normal_map
+from colmap_sph.workspace import MapKind, Workspace, check_map, make_dir
 
-# What `explain_losses` looks at: partners of a view, and bytes of maps kept in memory.
-_EXPLAINED_PARTNERS = 20
-_CACHE_BYTES = 1 << 30
+# COLMAP derives the name of the visibility file from the cloud's.
+_CLOUD_FILES = ("fused.ply", "fused.ply.vis")
+# COLMAP's cloud: position and normal in 32-bit floats, and a colour.
+_PLY_END = b"end_header\n"
+_PLY_POINT_BYTES = 6 * 4 + 3
 
 
 @dataclass(frozen=True)
@@ -66,44 +72,6 @@ class FusionOptions:
             raise OptionError(f"the fusion mask folder {self.mask_path} does not exist.")
 
 
-@dataclass(frozen=True)
-class GateLosses:
-    """Why sampled depth map pixels did not become points: shares of the sampled pixels, 0 to 1.
-
-    Attributes
-    ----------
-    unseen : float
-        No other image has the point in view with a depth there.
-    depth, reprojection, normal : float
-        The gate that most often stopped the agreement of a pixel which finds too few others.
-    kept : float
-        Enough other pixels agree.
-    """
-
-    unseen: float
-    depth: float
-    reprojection: float
-    normal: float
-    kept: float
-
-    def sentence(self) -> str:
-        """What a user should know of it."""
-        gates = {
-            "max_depth_error": self.depth,
-            "max_reproj_error": self.reprojection,
-            "max_normal_error": self.normal,
-        }
-        worst = max(gates, key=lambda name: gates[name])
-        remedy = f"loosen {worst} or min_num_pixels first"
-        if self.unseen > sum(gates.values()):
-            remedy = "check the poses, or fuse the photometric maps, which cover more"
-        return (
-            f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
-            f"by no other depth map, and the rest fail the gates of depth ({self.depth:.0%}), reprojection "
-            f"({self.reprojection:.0%}) and normal ({self.normal:.0%}); {remedy}."
-        )
-
-
 def fuse(
     workspace: Workspace,
     options: FusionOptions,
@@ -113,6 +81,10 @@ def fuse(
     partners: Mapping[str, Sequence[str]] | None = None,
 ) -> int:
     """Fuse the workspace's maps with COLMAP's `stereo_fusion` into ``fused.ply`` and ``fused.ply.vis``.
+
+    The cloud of a model in map coordinates has 64-bit coordinates. What COLMAP's other programs, which compute
+    with 32-bit floats, need to go on is left in ``colmap_sph/local``: a workspace of links with the model and the
+    cloud near their origin, and that origin's map coordinates in ``origin.txt``.
 
     Parameters
     ----------
@@ -140,37 +112,76 @@ def fuse(
         The cloud cannot be written.
     """
     options.check()
+    _check_places(workspace)
+    model, colmap_options = _check_maps(workspace, kind), _colmap_options(options, threads)
+    origin = local_origin(model)
+    scratch = workspace.state_dir / "fusion"
+    with scratch_folder(scratch):
+        try:
+            source = workspace.root
+            if partners is not None or origin.any():
+                source = _link_workspace(workspace, model, partners, origin, scratch)
+            with quiet_colmap():
+                cloud = pycolmap.stereo_fusion(
+                    scratch / "fused.ply", source, input_type=kind, options=colmap_options, output_type="PLY"
+                )
+            _check_written(scratch / "fused.ply", scratch / "fused.ply.vis", cloud.num_points3D())
+            _move_into_place(scratch, workspace, origin)
+        except (OSError, RuntimeError, ValueError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise OutputError(
+                f"COLMAP's fusion cannot write {workspace.fused_path} ({reason}); check space and permissions."
+            ) from error
+    return int(cloud.num_points3D())
+
+
+def _check_places(workspace: Workspace) -> None:
+    """Raise `OutputError` where a folder is in the cloud's place."""
+    for name in _CLOUD_FILES:
+        if (workspace.root / name).is_dir():
+            raise OutputError(f"{workspace.root / name} is a folder; remove it, the cloud goes there.")
+
+
+def _colmap_options(options: FusionOptions, threads: int) -> pycolmap.StereoFusionOptions:
+    """Our options as COLMAP's."""
     colmap_options = pycolmap.StereoFusionOptions()
     for name in FusionOptions.__dataclass_fields__:
         value = getattr(options, name)
         if name != "mask_path" or value is not None:
             setattr(colmap_options, name, value)
     colmap_options.num_threads = threads
-    _check_maps(workspace, kind)
-    targets = [workspace.root / name for name in ("fused.ply", "fused.ply.vis")]
-    for target in targets:
-        if target.is_dir():
-            raise OutputError(f"{target} is a folder; remove it, the cloud goes there.")
-    # COLMAP derives the name of the visibility file from the cloud's: both go to temporary names first.
-    scratch = workspace.state_dir / "fusion"
-    with scratch_folder(scratch):
-        try:
-            source = workspace.root if partners is None else _link_with_tracks(workspace, partners, scratch)
-            with quiet_colmap():
-                cloud = pycolmap.stereo_fusion(
-                    scratch / "fused.ply", source, input_type=kind, options=colmap_options, output_type="PLY"
-                )
-            for target in targets:
-                (scratch / target.name).replace(target)
-        except (OSError, RuntimeError, ValueError) as error:
-            raise OutputError(
-                f"COLMAP's fusion cannot write {workspace.fused_path} ({error}); check space and permissions."
-            ) from error
-    return int(cloud.num_points3D())
+    return colmap_options
 
 
-def _check_maps(workspace: Workspace, kind: MapKind) -> None:
-    """Raise `InputError` unless every image of ``fusion.cfg`` is in the model and has both maps."""
+def _move_into_place(scratch: Path, workspace: Workspace, origin: NDArray[np.float64]) -> None:
+    """Move the cloud that was fused in `scratch` to its place, in the coordinates of the workspace's model."""
+    shutil.rmtree(workspace.local_dir, ignore_errors=True)
+    if origin.any():
+        _keep_local_workspace(workspace.local_dir, scratch, origin)
+    # A kill in between must not leave a cloud beside the visibility of another.
+    (workspace.root / _CLOUD_FILES[1]).unlink(missing_ok=True)
+    for name in _CLOUD_FILES:
+        (scratch / name).replace(workspace.root / name)
+
+
+def _check_written(cloud: Path, visibility: Path, num_points: int) -> None:
+    """Raise `OSError` for files that are cut off: COLMAP does not notice a full disk."""
+    with cloud.open("rb") as file:
+        header_bytes = file.read(1000).find(_PLY_END) + len(_PLY_END)
+    is_whole = cloud.stat().st_size == header_bytes + _PLY_POINT_BYTES * num_points
+    # Behind their number, each point has its number of images, and then these.
+    words, position = np.fromfile(visibility, dtype="<u4").data, 2
+    try:
+        for _ in range(num_points):
+            position += 1 + words[position]
+    except IndexError:
+        is_whole = False
+    if not is_whole or position != len(words):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
+    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, and these whole maps."""
     try:
         names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -178,21 +189,27 @@ def _check_maps(workspace: Workspace, kind: MapKind) -> None:
             f"{workspace.fusion_cfg_path} cannot be read ({error}); list the images in it."
         ) from error
     model = load_model(workspace.sparse_dir)
-    registered = {model.image(image_id).name for image_id in model.reg_image_ids()}
+    cameras = cameras_of_images(model)
     for name in filter(None, map(str.strip, names)):
-        if name not in registered:
+        if name not in cameras:
             raise InputError(f"{workspace.fusion_cfg_path} names {name!r}, which is not in the model; remove it.")
         for path in (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)):
             if not path.is_file():
                 raise InputError(f"The map {path} is missing; compute it, or remove {name!r} from fusion.cfg.")
+        shape = (cameras[name].height, cameras[name].width)
+        check_map(workspace.depth_map_path(name, kind), shape)
+        check_map(workspace.normal_map_path(name, kind), (*shape, 3))
+    return model
 
 
-def _link_with_tracks(workspace: Workspace, partners: Mapping[str, Sequence[str]], folder: Path) -> Path:
-    """Make a workspace of links whose model has a track for every pair of `partners`; return `folder`.
+def _with_tracks(
+    source: pycolmap.Reconstruction, partners: Mapping[str, Sequence[str]]
+) -> pycolmap.Reconstruction:
+    """Copy a model, with one track for every pair of `partners` and no others.
 
     COLMAP's fusion asks the tracks alone which images overlap, and nothing else.
     """
-    source, model = load_model(workspace.sparse_dir), pycolmap.Reconstruction()
+    model = pycolmap.Reconstruction()
     pairs = sorted({(min(a, b), max(a, b)) for a, others in partners.items() for b in others})
     tracks = [pycolmap.Track() for _ in pairs]
     for camera in source.cameras.values():
@@ -209,103 +226,35 @@ def _link_with_tracks(workspace: Workspace, partners: Mapping[str, Sequence[str]
         # Between the two centres, where a triangulation angle is defined.
         middle = (first.projection_center() + second.projection_center()) / 2
         model.add_point3D(middle, track, np.zeros(3, dtype=np.uint8))
+    return model
+
+
+def _link_workspace(
+    workspace: Workspace,
+    model: pycolmap.Reconstruction,
+    partners: Mapping[str, Sequence[str]] | None,
+    origin: NDArray[np.float64],
+    folder: Path,
+) -> Path:
+    """Make `folder` a workspace of links, but for its model, which is moved to `origin`; return it."""
     linked = Workspace(folder)
     make_dir(linked.sparse_dir)
+    if partners is not None:
+        model = _with_tracks(model, partners)
+    if origin.any():
+        move_model(model, origin)
     model.write_binary(linked.sparse_dir)
-    linked.images_dir.symlink_to(workspace.images_dir.resolve())
-    linked.stereo_dir.symlink_to(workspace.stereo_dir.resolve())
+    for link, target in ((linked.images_dir, workspace.images_dir), (linked.stereo_dir, workspace.stereo_dir)):
+        # Relative, so that the workspace can be moved as a whole.
+        link.symlink_to(os.path.relpath(target.resolve(), folder.resolve()))
     return folder
 
 
-def explain_losses(
-    workspace: Workspace,
-    scene: Scene,
-    options: FusionOptions,
-    *,
-    kind: MapKind = "geometric",
-    samples: int = 2000,
-    max_views: int = 10,
-) -> GateLosses:
-    """Find which of fusion's gates stops a sample of depth map pixels.
-
-    Every sampled pixel is projected into the views that share most points with its own, as COLMAP's fusion does
-    for the first pixel of a point; a pixel that too few others confirm is charged to the gate that most of its
-    comparisons failed.
-
-    Parameters
-    ----------
-    workspace : Workspace
-    scene : Scene
-        Views with maps.
-    options : FusionOptions
-    kind : {"geometric", "photometric"}
-    samples : int
-        Pixels per view.
-    max_views : int
-        Views to sample, evenly spread.
-
-    Returns
-    -------
-    GateLosses
-    """
-
-    def load(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        depth_path, normal_path = workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)
-        return read_depth_map(depth_path), read_normal_map(normal_path)
-
-    maps = LoadCache(load, lambda pair: pair[0].nbytes + pair[1].nbytes, _CACHE_BYTES)
-    counts = np.zeros(5)
-    for view in scene.views[:: -(-len(scene.views) // max_views)]:
-        points, normals = _sample_points(view, *maps.get(view.name), samples)
-        verdicts = np.zeros((len(points), 4), dtype=int)
-        for other in _overlapping(scene, view, min(options.check_num_images, _EXPLAINED_PARTNERS)):
-            verdicts += _verdicts(points, normals, other, *maps.get(other.name), options)
-        enough = 1 + verdicts[:, 3] >= options.min_num_pixels
-        failed = np.where(verdicts[:, :3].any(axis=1), verdicts[:, :3].argmax(axis=1) + 1, 0)
-        counts += np.bincount(np.where(enough, 4, failed), minlength=5)
-    return GateLosses(*(counts / max(counts.sum(), 1)))
-
-
-def _overlapping(scene: Scene, view: View, most: int) -> list[View]:
-    """Up to `most` other views, those which share most sparse points with `view` first."""
-    seen = np.zeros(len(scene.points), dtype=bool)
-    seen[view.point_indices] = True
-    others = [other for other in scene.views if other is not view]
-    return sorted(others, key=lambda other: -int(np.count_nonzero(seen[other.point_indices])))[:most]
-
-
-def _sample_points(
-    view: View, depth: NDArray[np.float32], normals: NDArray[np.float32], samples: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """World points and world normals of evenly spread pixels with a depth."""
-    rows, columns = np.nonzero(depth > 0)
-    chosen = np.linspace(0, len(rows) - 1, min(samples, len(rows))).astype(int)
-    rows, columns = rows[chosen], columns[chosen]
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=1) @ np.linalg.inv(view.K).T
-    points = (rays * depth[rows, columns, None] - view.t) @ view.R
-    return points, normals[rows, columns] @ view.R
-
-
-def _verdicts(
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
-    view: View,
-    depth: NDArray[np.float32],
-    view_normals: NDArray[np.float32],
-    options: FusionOptions,
-) -> NDArray[np.bool_]:
-    """(n, 4): stopped by depth, by reprojection, by normal; agrees. All false where the view has no depth."""
-    in_camera = points @ view.R.T + view.t
-    pixel = in_camera @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        uv = pixel[:, :2] / pixel[:, 2:]
-    inside = (pixel[:, 2] > 0) & (uv > -0.5).all(axis=1)
-    inside &= (uv < np.array([view.width, view.height]) - 0.5).all(axis=1)
-    columns, rows = (np.rint(np.where(inside[:, None], uv, 0)).astype(int)).T
-    z = depth[rows, columns].astype(np.float64)
-    seen = inside & (z > 0)
-    far = seen & (np.abs(in_camera[:, 2] - z) > options.max_depth_error * z)
-    off = seen & ~far & (np.hypot(*(uv - np.stack([columns, rows], axis=1)).T) > options.max_reproj_error)
-    cosine = (normals * (view_normals[rows, columns] @ view.R)).sum(axis=1)
-    turned = seen & ~far & ~off & (cosine < np.cos(np.radians(options.max_normal_error)))
-    return np.stack([far, off, turned, seen & ~far & ~off & ~turned], axis=1)
+def _keep_local_workspace(local: Path, scratch: Path, origin: NDArray[np.float64]) -> None:
+    """Keep what was fused near the origin as `local`, and leave the cloud in map coordinates in `scratch`."""
+    local.mkdir()
+    for name in ("fused.ply", "images", "stereo", "sparse"):
+        (scratch / name).rename(local / name)
+    (local / "fused.ply.vis").symlink_to(Path("..", "..", "fused.ply.vis"))
+    (local / "origin.txt").write_text(" ".join(map(repr, origin.tolist())) + "\n")
+    move_cloud(local / "fused.ply", scratch / "fused.ply", origin)

@@ -1,13 +1,34 @@
 """The log file of a workspace: everything the package logs, from the moment the workspace exists."""
 
 import logging
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 from colmap_sph.errors import OutputError
 from colmap_sph.workspace import Workspace
 
 logger = logging.getLogger(__name__)
+
+
+class _LogFile(logging.FileHandler):
+    """A file whose disk may fill up: that is said once, and the run does not end for its log."""
+
+    def __init__(self, path: Path, encoding: str) -> None:
+        super().__init__(path, encoding=encoding)
+        self._has_failed = False
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Instead of a traceback on the terminal."""
+        if not self._has_failed:
+            self._has_failed = True
+            logger.warning("%s cannot be written (%s); the log is incomplete", self.baseFilename, sys.exception())
+
+    def close(self) -> None:
+        """Close the file; what is buffered on a full disk is lost."""
+        with suppress(OSError):
+            super().close()
 
 
 class _WorkspaceLog(logging.Handler):
@@ -35,7 +56,7 @@ class _WorkspaceLog(logging.Handler):
     def _open(self) -> logging.FileHandler:
         path = self._workspace.state_dir / "log.txt"
         try:
-            file = logging.FileHandler(path, encoding="utf-8")
+            file = _LogFile(path, encoding="utf-8")
         except OSError as error:
             raise OutputError(
                 f"{path} cannot be written ({error.strerror or error}); check space and permissions."
@@ -44,6 +65,11 @@ class _WorkspaceLog(logging.Handler):
         for record in self._early:
             file.emit(record)
         return file
+
+    def flush(self) -> None:
+        """Write what is buffered."""
+        if self._file is not None:
+            self._file.flush()
 
     def close(self) -> None:
         """Close the file, if there is one."""
@@ -73,6 +99,9 @@ def workspace_log(workspace: Workspace, header: str) -> Iterator[None]:
     package.addHandler(handler)
     try:
         yield
+    except KeyboardInterrupt:
+        logger.info("Interrupted")
+        raise
     except BaseException:
         logger.info("Stopped", exc_info=True)
         raise

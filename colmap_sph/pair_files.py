@@ -1,10 +1,12 @@
-"""Disparity maps of rectified pairs on disk: one ``.npz`` per pair, with the geometry that gives them meaning.
+"""Intermediate results on disk, as ``.npz`` files that hold the key they were made under.
 
-Disparities are stored in 16 bits, 1/64 pixel apart or as fine as the pair's range allows; 0 = none.
+A pair's disparity map comes with the geometry that gives it meaning. Disparities are stored in 16 bits, 1/64 pixel
+apart or as fine as the pair's range allows; 0 = none.
 """
 
 import zipfile
-from collections.abc import Iterable
+import zlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +24,7 @@ _CODES = 65535
 _DAMAGED = (OSError, ValueError, KeyError, EOFError, RuntimeError, TypeError, MemoryError, zipfile.BadZipFile)
 
 
-def write_pair(path: Path, pair: PairDisparity) -> None:
+def write_pair(path: Path, pair: PairDisparity, key: str = "") -> None:
     """Write a pair's disparity map; `OutputError` where that fails.
 
     Parameters
@@ -30,6 +32,8 @@ def write_pair(path: Path, pair: PairDisparity) -> None:
     path : Path
         Target ``.npz`` file; its folder exists.
     pair : PairDisparity
+    key : str
+        What `stored_key` shall return.
     """
     found = np.isfinite(pair.disparity)
     least = float(pair.disparity[found].min()) if found.any() else 0.0
@@ -38,8 +42,7 @@ def write_pair(path: Path, pair: PairDisparity) -> None:
     codes = np.where(found, np.rint((pair.disparity - least) / step) + 1, 0).astype(np.uint16)
     content: dict[str, Any] = {name: getattr(pair.geometry, name) for name in RectifiedPair.__dataclass_fields__}
     content |= {"left": pair.left, "right": pair.right, "codes": codes, "scale": np.array([least, step])}
-    with atomic_file(path) as file:
-        np.savez(file, **content)
+    write_arrays(path, content, key)
 
 
 def read_pair(path: Path) -> PairDisparity:
@@ -53,11 +56,46 @@ def read_pair(path: Path) -> PairDisparity:
     return PairDisparity(str(data["left"]), str(data["right"]), RectifiedPair(**fields), disparity)
 
 
+def write_arrays(path: Path, arrays: Mapping[str, Any], key: str) -> None:
+    """Write named arrays as an ``.npz`` file under a key; `OutputError` where that fails."""
+    with atomic_file(path) as file:
+        np.savez(file, key=key, **arrays)
+
+
 def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-    """Read the arrays called `names` of an ``.npz`` file; `InputError` where one is missing or damaged."""
+    """Read the arrays called `names` of an ``.npz`` file; `InputError` where one is missing or damaged.
+
+    A damaged file is removed, so that the next run makes it anew.
+    """
     try:
         # Opened here, as NumPy leaves a damaged file open.
         with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             return {name: data[name] for name in names}
     except _DAMAGED as error:
-        raise InputError(f"{path} cannot be read ({error}); delete it and run again.") from error
+        damaged = _is_damaged(path)
+        if isinstance(error, MemoryError) and not damaged:
+            raise
+        if damaged:
+            path.unlink(missing_ok=True)
+        remedy = "it was removed, run again" if damaged else "run again, or check its permissions"
+        raise InputError(f"{path} cannot be read ({error}); {remedy}.") from error
+
+
+def stored_key(path: Path) -> str | None:
+    """The key under which a file was written, or None where it is missing or damaged, or has none."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            return str(data["key"])
+    except _DAMAGED:
+        return None
+
+
+def _is_damaged(path: Path) -> bool:
+    """Whether an archive is there, but cut off or altered; its checksums tell."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return archive.testzip() is not None
+    except OSError:  # missing, forbidden, a failing disk
+        return False
+    except (ValueError, EOFError, RuntimeError, NotImplementedError, zlib.error, zipfile.BadZipFile):
+        return True

@@ -155,6 +155,7 @@ def resample(
     pair: RectifiedPair,
     side: Side,
     interpolation: int = cv2.INTER_LINEAR,
+    mask: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     """Resample an image to the rectified surface, once and straight from its pixels.
 
@@ -167,17 +168,24 @@ def resample(
     pair : RectifiedPair
     side : {"left", "right"}
         Which of the pair's images `view` is.
+    interpolation : int
+        OpenCV's code.
+    mask : (view.height, view.width) uint8 ndarray, optional
+        255 where the image counts, 0 where it is to be ignored.
 
     Returns
     -------
     rectified : (H, W) uint8 ndarray
     valid : (H, W) uint8 ndarray
-        255 where the rectified pixel lies inside the image, else 0.
+        255 where the rectified pixel lies inside the image and no ignored pixel has a part in it, else 0.
     """
     rectified, valid = (np.empty((pair.height, pair.width(side)), dtype=np.uint8) for _ in range(2))
     for first in range(0, pair.height, _BAND_ROWS):
         band = slice(first, first + _BAND_ROWS)
-        columns, rows, valid[band] = _pixel_maps(view, pair, side, band)
+        columns, rows, inside = _pixel_maps(view, pair, side, band)
+        if mask is not None:
+            inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
+        valid[band] = inside
         rectified[band] = cv2.remap(image, columns, rows, interpolation, borderMode=cv2.BORDER_REPLICATE)
     return rectified, valid
 
@@ -225,7 +233,7 @@ def _points_in_both(scene: Scene, left: View, right: View) -> Float:
     points = scene.points[indices]
     for view in (left, right):
         pixel = (points @ view.R.T + view.t) @ view.K.T
-        with np.errstate(divide="ignore", invalid="ignore"):
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             uv = pixel[:, :2] / pixel[:, 2:]
         inside = (pixel[:, 2] > 0) & (uv > 0).all(axis=1) & (uv < [view.width, view.height]).all(axis=1)
         points = points[inside]

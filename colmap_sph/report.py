@@ -46,6 +46,8 @@ class RunReport:
         Points of the fused cloud.
     advice : str
         Where few points survived: which gate took them.
+    made, reused : dict
+        Stage → how many of its results this run worked out, and how many an earlier run had left ready.
     seconds : dict
         Stage → wall time.
     peak_memory : int
@@ -60,5 +62,7 @@ class RunReport:
     coverage: dict[str, float] = field(default_factory=dict)
     points: int = 0
     advice: str = ""
+    made: dict[str, int] = field(default_factory=dict)
+    reused: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     peak_memory: int = 0

@@ -6,7 +6,7 @@ the first pixel's centre is at (0.5, 0.5).
 """
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -15,6 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
+from colmap_sph.map_coordinates import is_plausible, local_origin
 from colmap_sph.model_check import check_binary_file
 
 logger = logging.getLogger(__name__)
@@ -79,10 +80,14 @@ class Scene:
         Sorted by name.
     points : (N, 3) float64 ndarray
         Sparse points in the world frame, in model units.
+    origin : (3,) float64 ndarray
+        Where the scene's world origin lies in the model's coordinates: zero, but for a model in map
+        coordinates, whose scene is moved near its origin.
     """
 
     views: tuple[View, ...]
     points: NDArray[np.float64]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     @cached_property
     def index_of(self) -> dict[str, int]:
@@ -99,7 +104,8 @@ class Scene:
 def read_scene(sparse_dir: Path) -> Scene:
     """Read an undistorted COLMAP model, such as the ``sparse`` folder of a dense workspace.
 
-    Views whose pose or calibration is not finite, and points that are not, are left out with a warning.
+    Views whose pose or calibration is impossible (not finite, say), and such points, are left out with a warning.
+    A model in map coordinates is moved near its origin, see `Scene.origin`.
 
     Parameters
     ----------
@@ -116,16 +122,23 @@ def read_scene(sparse_dir: Path) -> Scene:
     InputError
         No readable model in the folder, no registered image, or a distorted camera.
     """
-    model = load_model(sparse_dir)
+    return scene_of_model(load_model(sparse_dir), sparse_dir)
+
+
+def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
+    """Return the scene of a model read from `sparse_dir`; see `read_scene`."""
+    origin = local_origin(model)
+    if origin.any():
+        logger.info("%s is in map coordinates; worked on relative to %s", sparse_dir, tuple(origin.tolist()))
     points, row_of = _read_points(model)
-    views = [_read_view(model, image_id, row_of, sparse_dir) for image_id in model.reg_image_ids()]
-    usable = [view for view in views if _is_finite(view)]
+    views = [_read_view(model, image_id, row_of, sparse_dir, origin) for image_id in model.reg_image_ids()]
+    usable = [view for view in views if _is_possible(view)]
     for view in views:
-        if not _is_finite(view):
-            logger.warning("%s: the pose or calibration in %s is not finite; left out", view.name, sparse_dir)
+        if not _is_possible(view):
+            logger.warning("%s: the pose or calibration in %s is impossible; left out", view.name, sparse_dir)
     if not usable:
         raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
-    return Scene(tuple(sorted(usable, key=lambda view: view.name)), points)
+    return Scene(tuple(sorted(usable, key=lambda view: view.name)), points - origin, origin)
 
 
 def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
@@ -156,6 +169,13 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         model = pycolmap.Reconstruction()
         (model.read_binary if binary else model.read_text)(sparse_dir)
         registered = model.reg_image_ids()
+        for image_id in registered:
+            _ = model.image(image_id).name
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"The model in {sparse_dir} has the image name {error.object!r}, which is not UTF-8; "
+            "rename the image, and export the model from COLMAP again."
+        ) from error
     except (RuntimeError, ValueError, IndexError, KeyError, MemoryError) as error:
         raise InputError(
             f"The model in {sparse_dir} is damaged ({_one_line(error)}); export it from COLMAP again."
@@ -165,6 +185,17 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
             f"The model in {sparse_dir} has no registered image; run COLMAP's mapper or give another model."
         )
     return model
+
+
+def image_names(model: pycolmap.Reconstruction) -> list[str]:
+    """Sorted names of the registered images of a model."""
+    return sorted(model.image(image_id).name for image_id in model.reg_image_ids())
+
+
+def cameras_of_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Camera]:
+    """Cameras of the registered images of a model, by the image's name."""
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    return {image.name: model.camera(image.camera_id) for image in images}
 
 
 def is_pinhole(camera: pycolmap.Camera) -> bool:
@@ -209,13 +240,19 @@ def _read_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], d
     xyz_of = {point_id: point.xyz for point_id, point in model.points3D.items()}
     ids = sorted(xyz_of)
     points = np.array([xyz_of[i] for i in ids], dtype=np.float64).reshape(-1, 3)
-    kept = np.flatnonzero(np.isfinite(points).all(axis=1))
+    kept = np.flatnonzero(is_plausible(points))
     if len(kept) < len(ids):
-        logger.warning("%d sparse points are not finite; left out", len(ids) - len(kept))
+        logger.warning("%d sparse points have no possible coordinates; left out", len(ids) - len(kept))
     return points[kept], {ids[index]: row for row, index in enumerate(kept)}
 
 
-def _read_view(model: pycolmap.Reconstruction, image_id: int, row_of: dict[int, int], sparse_dir: Path) -> View:
+def _read_view(
+    model: pycolmap.Reconstruction,
+    image_id: int,
+    row_of: dict[int, int],
+    sparse_dir: Path,
+    origin: NDArray[np.float64],
+) -> View:
     image = model.image(image_id)
     camera = model.camera(image.camera_id)
     if not is_pinhole(camera):
@@ -224,6 +261,8 @@ def _read_view(model: pycolmap.Reconstruction, image_id: int, row_of: dict[int, 
             "give this folder as --model to have it undistorted, or run COLMAP's image_undistorter."
         )
     pose = np.array(image.cam_from_world().matrix(), dtype=np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):  # an impossible pose is told later
+        translation = pose[:, 3] + pose[:, :3] @ origin
     points2D = image.points2D
     rows = {row_of.get(points2D[i].point3D_id, -1) for i in image.get_observation_point2D_idxs()} - {-1}
     return View(
@@ -233,15 +272,23 @@ def _read_view(model: pycolmap.Reconstruction, image_id: int, row_of: dict[int, 
         height=camera.height,
         K=np.array(camera.calibration_matrix(), dtype=np.float64),
         R=np.ascontiguousarray(pose[:, :3]),
-        t=np.ascontiguousarray(pose[:, 3]),
+        t=translation,
         point_indices=np.array(sorted(rows), dtype=np.int64),
     )
 
 
-def _is_finite(view: View) -> bool:
-    numbers = np.concatenate([view.K.ravel(), view.R.ravel(), view.t])
-    sizes = min(view.width, view.height, view.K[0, 0], view.K[1, 1])
-    return bool(np.isfinite(numbers).all() and sizes > 0 and abs(np.linalg.det(view.R) - 1.0) < 1e-3)
+def _is_possible(view: View) -> bool:
+    size, focal = max(view.width, view.height), np.array([view.K[0, 0], view.K[1, 1]])
+    return bool(
+        min(view.width, view.height) > 0
+        # Fields of view from half a second of arc to just under 180 degrees.
+        and (focal > 1e-3 * size).all()
+        and (focal < 1e6 * size).all()
+        and (np.abs(view.K[:2, 2]) < 1e3 * size).all()
+        and is_plausible(view.t[None])[0]
+        and (np.abs(view.R) < 1.01).all()
+        and abs(np.linalg.det(view.R) - 1.0) < 1e-3
+    )
 
 
 def _one_line(error: BaseException) -> str:

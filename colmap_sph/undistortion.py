@@ -1,35 +1,48 @@
 """Sparse model and original images → COLMAP dense workspace of undistorted images; or open an existing one.
 
-COLMAP itself undistorts (`pycolmap.undistort_images`). This module checks what goes in, because COLMAP ends
-the process at some bad input, and mends what comes out, because COLMAP leaves images which it did not
-undistort, and cameras without distortion but of a distorted model, in the model it writes.
+COLMAP itself undistorts (`pycolmap.undistort_images`). What goes in is checked before (see `originals`), because
+COLMAP ends the process at some bad input. What comes out is mended here, because COLMAP leaves images which it did
+not undistort, and cameras without distortion but of a distorted model, in the model it writes.
 """
 
-import hashlib
 import logging
 import shutil
-from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 
 from colmap_sph.colmap_log import quiet_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
-from colmap_sph.scene import Scene, is_pinhole, load_model, make_pinhole, model_files
-from colmap_sph.staging import is_finished, move_into_place, read_marker, scratch_folder, write_marker
-from colmap_sph.workspace import (
-    Workspace,
-    make_dir,
-    write_fusion_cfg,
-    write_patch_match_cfg,
+from colmap_sph.masks import check_masks, undistort_mask
+from colmap_sph.originals import Originals, read_originals
+from colmap_sph.scene import (
+    Scene,
+    cameras_of_images,
+    is_pinhole,
+    load_model,
+    make_pinhole,
+    model_files,
+    scene_of_model,
 )
+from colmap_sph.staging import (
+    check_discardable,
+    discard_workspace,
+    is_finished,
+    move_into_place,
+    read_marker,
+    scratch_folder,
+    write_marker,
+)
+from colmap_sph.workspace import Workspace, make_dir, mask_path, write_fusion_cfg, write_patch_match_cfg
 
 logger = logging.getLogger(__name__)
 
 _FULL_DISK_BYTES = 64 << 20
+# Space that undistortion is given, relative to the files it starts from; JPEGs come out up to 1.6 times larger.
+_SPACE_FACTOR = 2
 
 
 @dataclass(frozen=True)
@@ -47,29 +60,14 @@ class UndistortionOptions:
             )
 
 
-def find_images(model_dir: Path, names: Sequence[str]) -> Path:
-    """Find the image folder of a model by COLMAP's usual layouts.
-
-    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
-    folder that holds most of the model's images is taken, the first among equals.
-
-    Raises
-    ------
-    InputError
-        None of the folders holds any image of the model; the message lists them.
-    """
-    absolute, resolved = Path.cwd() / model_dir, Path(model_dir).resolve()
-    parents = [p for model in (absolute, resolved) for p in (model.parent.parent, model.parent, model)]
-    folders = list(dict.fromkeys(parent / "images" for parent in parents))
-    found = [sum((folder / name).is_file() for name in names) for folder in folders]
-    if max(found) == 0:
-        tried = ", ".join(str(folder) for folder in folders)
-        raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
-    return folders[found.index(max(found))]
-
-
 def prepare_workspace(
-    model_dir: Path, image_dir: Path | None, output: Path, options: UndistortionOptions
+    model_dir: Path,
+    image_dir: Path | None,
+    output: Path,
+    options: UndistortionOptions,
+    masks: Path | None = None,
+    *,
+    overwrite: bool = False,
 ) -> Workspace:
     """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
 
@@ -82,65 +80,107 @@ def prepare_workspace(
     model_dir : Path
         COLMAP model, binary or text, any camera model that has a pinhole equivalent.
     image_dir : Path or None
-        Original images; None: found by `find_images`.
+        Original images; None: found by `originals.find_images`.
     output : Path
         The dense workspace; created where missing.
     options : UndistortionOptions
+    masks : Path, optional
+        Folder of masks of the original images, see `colmap_sph.masks`; they are undistorted, too.
+    overwrite : bool
+        Discard what an earlier run has made, once it is clear that this one can start.
 
     Returns
     -------
     Workspace
-        With ``images``, ``sparse`` and ``stereo``.
+        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
 
     Raises
     ------
     InputError
-        No usable model or image, or `output` holds a workspace made from something else.
+        No usable model or image, a mask that does not fit its image, or `output` holds a workspace made from
+        something else.
     OutputError
         `output` cannot be written.
     """
     options.check()
-    model = load_model(model_dir)
-    names = sorted(model.image(image_id).name for image_id in model.reg_image_ids())
-    if image_dir is None:
-        image_dir = find_images(model_dir, names)
-    elif not image_dir.is_dir():
-        raise InputError(f"The image folder {image_dir} does not exist; check --images.")
-    workspace = Workspace(output)
-    marker = {
-        "version": 1,
-        "options": asdict(options),
-        "model": _hash_model(model_dir),
-        "images": _hash_images(image_dir, names),
-    }
+    originals = read_originals(model_dir, image_dir, masks)
+    marker, workspace = _marker(originals, options), Workspace(output)
     scratch = workspace.state_dir / "undistorting"
-    if read_marker(scratch) == marker:
-        move_into_place(scratch, workspace)
-    if is_finished(workspace, marker):
-        logger.info("The undistorted images in %s are up to date", output)
+    if not overwrite and _is_made(workspace, scratch, marker):
         return workspace
-    good = _usable_images(model, image_dir)
+    usable = originals.usable()
+    if overwrite:
+        discard_workspace(workspace)
+    _check_space(originals, usable.images, output, options)
     with scratch_folder(scratch):
-        kept = _undistort(model, model_dir, image_dir, good, scratch, options)
+        kept = _undistort(originals, usable.images, scratch, options)
+        _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
         Workspace(scratch).create_stereo_dirs(kept)
         shutil.rmtree(Workspace(scratch).state_dir)
         write_marker(scratch, marker)
         move_into_place(scratch, workspace)
-    logger.info("Undistorted %d of %d images into %s", len(kept), len(names), output)
+    logger.info("Undistorted %d of %d images into %s", len(kept), originals.model.num_reg_images(), output)
     return workspace
 
 
-def open_workspace(root: Path) -> Workspace:
-    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and create the folders for our maps.
+@dataclass(frozen=True)
+class Foreseen:
+    """A workspace that is not there yet: its scene, and the pixels of all original images together."""
+
+    scene: Scene
+    original_pixels: int
+
+
+def foresee_workspace(
+    model_dir: Path,
+    image_dir: Path | None,
+    output: Path,
+    options: UndistortionOptions,
+    masks: Path | None = None,
+    *,
+    overwrite: bool,
+) -> Foreseen | None:
+    """Return what `prepare_workspace` would make, without making it; None where it is made already.
+
+    Parameters
+    ----------
+    model_dir, image_dir, output, options, masks
+        As for `prepare_workspace`, which raises the same.
+    overwrite : bool
+        The workspace that is there will be discarded first.
+    """
+    options.check()
+    originals = read_originals(model_dir, image_dir, masks)
+    if overwrite:
+        check_discardable(Workspace(output))
+    elif is_finished(Workspace(output), _marker(originals, options)):
+        return None
+    model = _submodel(originals.model, set(originals.usable().images))
+    cameras = [model.camera(image.camera_id) for image in model.images.values()]
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    _replace_ideal_fisheyes(model)
+    for camera in model.cameras.values():
+        undistorted = pycolmap.undistort_camera(_camera_options(options), camera)
+        camera.model, camera.params = undistorted.model, undistorted.params
+        camera.width, camera.height = undistorted.width, undistorted.height
+    return Foreseen(scene_of_model(model, model_dir), pixels)
+
+
+def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
+    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and write nothing there.
+
+    Parameters
+    ----------
+    root : Path
+    masks : Path, optional
+        Folder of masks of the undistorted images; without it those in the workspace's own ``masks``.
 
     Raises
     ------
     InputError
-        The folder is missing or is not a dense workspace.
-    OutputError
-        The folders for the maps cannot be created.
+        The folder is missing or is not a dense workspace, or a mask does not fit its image.
     """
-    workspace = Workspace(root)
+    workspace = Workspace(root, masks)
     if not root.is_dir():
         raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
     for folder in (workspace.images_dir, workspace.sparse_dir):
@@ -150,7 +190,8 @@ def open_workspace(root: Path) -> Workspace:
                 "run COLMAP's image_undistorter, or give the sparse model with --model."
             )
     model = load_model(workspace.sparse_dir)
-    workspace.create_stereo_dirs(model.image(image_id).name for image_id in model.reg_image_ids())
+    if masks is not None or workspace.masks_dir.is_dir():
+        check_masks(workspace.masks_dir, cameras_of_images(model))
     return workspace
 
 
@@ -176,49 +217,60 @@ def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
     return replace(scene, views=tuple(good))
 
 
-def _usable_images(model: pycolmap.Reconstruction, image_dir: Path) -> list[str]:
-    """Return the sorted names of the registered images that are fit for undistortion; report the others."""
-    source, good = Workspace(image_dir), []
-    for image in sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name):
-        camera = model.camera(image.camera_id)
-        source.image_path(image.name)  # refuses a name that leads out of the folder
-        problem = image_problem(image_dir / image.name, camera.width, camera.height)
-        if problem is None:
-            good.append(image.name)
-        else:
-            logger.warning("%s %s; left out", image_dir / image.name, problem)
-    if not good:
-        raise InputError(
-            f"None of the model's {model.num_reg_images()} images in {image_dir} is usable; check --images."
-        )
-    return good
+def _is_made(workspace: Workspace, scratch: Path, marker: dict[str, Any]) -> bool:
+    """Whether the workspace is there, once a move into place that was interrupted is finished."""
+    if read_marker(scratch) == marker:
+        move_into_place(scratch, workspace)
+    finished = is_finished(workspace, marker)
+    if finished:
+        logger.info("The undistorted images in %s are up to date", workspace.root)
+    return finished
 
 
-def _undistort(
-    model: pycolmap.Reconstruction,
-    model_dir: Path,
-    image_dir: Path,
-    names: list[str],
-    scratch: Path,
-    options: UndistortionOptions,
-) -> list[str]:
+def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any]:
+    """What a workspace is made from."""
+    return {"version": 1, "options": asdict(options), **originals.fingerprint()}
+
+
+def _undistort(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> list[str]:
     """Let COLMAP undistort images `names` into `scratch`; return the names that came out well."""
-    if _replace_ideal_fisheyes(model):
+    model_dir = originals.model_dir
+    if _replace_ideal_fisheyes(originals.model):
         model_dir = scratch / "model"
         make_dir(model_dir)
-        model.write_binary(model_dir)
-    camera_options = pycolmap.UndistortCameraOptions()
-    camera_options.max_image_size = options.max_image_size
+        originals.model.write_binary(model_dir)
     logger.info("Undistorting %d images", len(names))
     try:
         with quiet_colmap():
             pycolmap.undistort_images(
-                scratch, model_dir, image_dir, image_names=names, undistort_options=camera_options
+                scratch,
+                model_dir,
+                originals.image_dir,
+                image_names=names,
+                undistort_options=_camera_options(options),
             )
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
         raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {error}") from error
     return _mend_workspace(Workspace(scratch), names)
+
+
+def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
+    """Our options as COLMAP's."""
+    camera_options = pycolmap.UndistortCameraOptions()
+    camera_options.max_image_size = options.max_image_size
+    return camera_options
+
+
+def _undistort_masks(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> None:
+    """Undistort the masks of images `names` into `scratch`."""
+    if originals.mask_dir is None:
+        return
+    logger.info("Undistorting %d masks", len(names))
+    cameras = cameras_of_images(originals.model)
+    for name in names:
+        target = Workspace(scratch).mask_path(name)
+        undistort_mask(mask_path(originals.mask_dir, name), cameras[name], _camera_options(options), target)
 
 
 def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
@@ -244,9 +296,8 @@ def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
 
 def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     """Leave only undistorted images and PINHOLE cameras in the model; write the configuration for them."""
-    model = load_model(workspace.sparse_dir)
-    cameras = {image.name: model.camera(image.camera_id) for image in model.images.values()}
-    kept = []
+    model = _load_written_model(workspace)
+    cameras, kept = cameras_of_images(model), []
     for name in names:
         problem = image_problem(workspace.image_path(name), cameras[name].width, cameras[name].height)
         if problem is None:
@@ -263,6 +314,7 @@ def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     shutil.rmtree(workspace.sparse_dir)
     make_dir(workspace.sparse_dir)
     model.write_binary(workspace.sparse_dir)
+    _load_written_model(workspace)
     write_fusion_cfg(workspace.fusion_cfg_path, kept)
     write_patch_match_cfg(workspace.patch_match_cfg_path, dict.fromkeys(kept, 20))
     return kept
@@ -289,22 +341,30 @@ def _submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Recon
     return part
 
 
-def _hash_model(model_dir: Path) -> str:
-    digest = hashlib.sha256()
-    for path in model_files(model_dir):
-        with path.open("rb") as file:
-            digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
-    return digest.hexdigest()
-
-
-def _hash_images(image_dir: Path, names: list[str]) -> str:
-    """Hash names, sizes and times of the images: their content would take as long to read as to undistort."""
-    digest = hashlib.sha256()
+def _check_space(originals: Originals, names: list[str], output: Path, options: UndistortionOptions) -> None:
+    """Raise `OutputError` unless the undistorted images will fit: COLMAP may not notice a full disk."""
+    needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
+    cameras, limit = cameras_of_images(originals.model), options.max_image_size
     for name in names:
-        with suppress(OSError):
-            status = (image_dir / name).stat()
-            digest.update(f"{name}\n{status.st_size} {status.st_mtime_ns}\n".encode())
-    return digest.hexdigest()
+        longest = max(cameras[name].width, cameras[name].height)
+        scale = min(1.0, limit / longest) if limit > 0 else 1.0
+        needed += int(scale**2 * (originals.image_dir / name).stat().st_size)
+    needed *= _SPACE_FACTOR
+    free = shutil.disk_usage(next(path for path in (output, *output.absolute().parents) if path.exists())).free
+    if free < needed:
+        raise OutputError(
+            f"The undistorted images need about {needed / 1e6:.0f} MB, but on the disk of {output} only "
+            f"{free / 1e6:.0f} MB are free; free some space or choose another --output."
+        )
+
+
+def _load_written_model(workspace: Workspace) -> pycolmap.Reconstruction:
+    """Read a model that COLMAP has just written, without noticing whether the disk took it."""
+    try:
+        return load_model(workspace.sparse_dir)
+    except InputError:
+        _raise_if_disk_is_full(workspace.root)
+        raise
 
 
 def _raise_if_disk_is_full(folder: Path) -> None:

@@ -8,7 +8,7 @@ import os
 import re
 import threading
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, Literal
@@ -21,6 +21,7 @@ from colmap_sph.errors import InputError, OutputError
 MapKind = Literal["photometric", "geometric"]
 SourceImages = list[str] | int | Literal["__all__"]
 
+_MAX_HEADER = 30
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
 
 
@@ -32,9 +33,12 @@ class Workspace:
     ----------
     root : Path
         The workspace's folder, usually called ``dense``.
+    given_masks : Path, optional
+        Where the masks of its images are, if not in the workspace itself.
     """
 
     root: Path
+    given_masks: Path | None = None
 
     @property
     def images_dir(self) -> Path:
@@ -71,9 +75,23 @@ class Workspace:
         """Our own state, report and log, which COLMAP never looks at."""
         return self.root / "colmap_sph"
 
+    @property
+    def local_dir(self) -> Path:
+        """For a model in map coordinates: a workspace near its origin, for COLMAP's own programs to go on."""
+        return self.state_dir / "local"
+
     def image_path(self, name: str) -> Path:
         """Undistorted image `name`."""
         return self.images_dir / _checked_name(name)
+
+    @property
+    def masks_dir(self) -> Path:
+        """Masks of the undistorted images; need not exist."""
+        return self.given_masks or self.root / "masks"
+
+    def mask_path(self, name: str) -> Path:
+        """Mask of undistorted image `name`; need not exist."""
+        return mask_path(self.masks_dir, name)
 
     def depth_map_path(self, name: str, kind: MapKind) -> Path:
         """Depth map of image `name`."""
@@ -102,6 +120,11 @@ class Workspace:
             folders.add(self.normal_map_path(name, "geometric").parent)
         for folder in sorted(folders):
             make_dir(folder)
+
+
+def mask_path(folder: Path, name: str) -> Path:
+    """Where COLMAP looks for the mask of image `name` in a folder of masks."""
+    return folder / f"{_checked_name(name)}.png"
 
 
 def make_dir(folder: Path) -> None:
@@ -137,7 +160,8 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
             f"{path} cannot be written ({error.strerror or error}); check space and permissions."
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # not there, or on a disk that has become read-only
+            temporary.unlink()
 
 
 def write_depth_map(path: Path, depth: NDArray[np.float32]) -> None:
@@ -199,6 +223,41 @@ def _write_planes(path: Path, planes: NDArray[np.floating]) -> None:
         file.write(np.ascontiguousarray(planes, dtype="<f4").data)
 
 
+def check_map(path: Path, shape: tuple[int, ...]) -> None:
+    """Raise `InputError` unless a map file is whole and its map has this shape: (H, W) or (H, W, 3).
+
+    COLMAP's fusion trusts the files: it fuses one that is cut off or of another size without a word, or raises an
+    error that does not name it.
+    """
+    try:
+        with path.open("rb") as file:
+            start, size = file.read(_MAX_HEADER), path.stat().st_size
+    except OSError as error:
+        raise InputError(
+            f"The map {path} cannot be read ({error.strerror or error}); compute it again."
+        ) from error
+    channels = shape[2] if len(shape) == 3 else 1
+    found, _ = _parse_header(path, start, size, channels)
+    if found != shape[:2]:
+        raise InputError(
+            f"The map {path} has {found[1]} x {found[0]} pixels, but its image {shape[1]} x {shape[0]}; "
+            "delete it and compute it again."
+        )
+
+
+def _parse_header(path: Path, start: bytes, size: int, channels: int) -> tuple[tuple[int, int], int]:
+    """Return (height, width) and the header's length, from the first bytes of a map file of `size` bytes."""
+    header = _HEADER.match(start)
+    if header is None:
+        raise InputError(f"{path} is not a COLMAP depth or normal map; delete it and compute it again.")
+    width, height, found = (int(number) for number in header.groups())
+    if found != channels:
+        raise InputError(f"{path} has {found} channels where {channels} are expected; compute it again.")
+    if size - header.end() != 4 * width * height * channels:
+        raise InputError(f"{path} is truncated or damaged; delete it and compute it again.")
+    return (height, width), header.end()
+
+
 def _read_planes(path: Path, *, channels: int) -> NDArray[np.float32]:
     """Read a map file as a (channels, H, W) array."""
     try:
@@ -207,15 +266,8 @@ def _read_planes(path: Path, *, channels: int) -> NDArray[np.float32]:
         raise InputError(
             f"The map {path} cannot be read ({error.strerror or error}); compute it again."
         ) from error
-    header = _HEADER.match(data)
-    if header is None:
-        raise InputError(f"{path} is not a COLMAP depth or normal map; delete it and compute it again.")
-    width, height, found = (int(number) for number in header.groups())
-    if found != channels:
-        raise InputError(f"{path} has {found} channels where {channels} are expected; compute it again.")
-    if len(data) - header.end() != 4 * width * height * channels:
-        raise InputError(f"{path} is truncated or damaged; delete it and compute it again.")
-    planes = np.frombuffer(data, dtype="<f4", offset=header.end()).astype(np.float32)
+    (height, width), start = _parse_header(path, data[:_MAX_HEADER], len(data), channels)
+    planes = np.frombuffer(data, dtype="<f4", offset=start).astype(np.float32)
     return planes.reshape(channels, height, width)
 
 

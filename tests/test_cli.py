@@ -4,6 +4,7 @@ import json
 import logging
 import os
 import re
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -160,7 +161,7 @@ def test_the_log_of_a_second_run_follows_the_first(small: Path, capsys: pytest.C
 def test_as_a_program(small: Path) -> None:
     """A process of its own, without a terminal, with Python's warnings as errors."""
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "colmap_sph.cli", "run", "--model", "sparse/0", *FAST],
+        [sys.executable, "-W", "error", "-m", "colmap_sph", "run", "--model", "sparse/0", *FAST],
         capture_output=True,
         text=True,
         timeout=120,
@@ -170,7 +171,7 @@ def test_as_a_program(small: Path) -> None:
     assert re.search(r"cloud +[\d,]+ points in \S", done.stderr)
     assert done.stdout == ""
     done = subprocess.run(
-        [sys.executable, "-m", "colmap_sph.cli", "run", "--model", "nowhere"], capture_output=True, text=True
+        [sys.executable, "-m", "colmap_sph", "run", "--model", "nowhere"], capture_output=True, text=True
     )
     assert done.returncode == 2
     assert "nowhere does not exist" in error_sentence(done.returncode, done.stderr)
@@ -178,13 +179,16 @@ def test_as_a_program(small: Path) -> None:
 
 def test_interruption(small: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGTERM)
 
+    before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(cli, "run", interrupted)
     code, output = command(capsys, "run", "--model", "sparse/0")
-    assert code == 130
-    assert "interrupted" in output
+    assert code == 143
+    assert output.splitlines()[-1].startswith("interrupted; ")
+    assert "run the same command again" in output
     assert "Traceback" not in output
+    assert signal.getsignal(signal.SIGTERM) is before
 
 
 # ---- images that are left out ------------------------------------------------------------------------------
@@ -372,3 +376,79 @@ def test_wrong_kernels(small: Path, capsys: pytest.CaptureFixture[str], monkeypa
     assert code == 2
     assert "COLMAP_SPH_KERNELS=sse9" in error_sentence(code, output)
     assert tree(small) == before
+
+
+# ---- what is done already ----------------------------------------------------------------------------------
+
+
+def test_dry_run_writes_nothing(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = tree(small)
+    code, output = command(capsys, *RUN, *FAST, "--dry-run")
+    assert code == 0
+    assert tree(small) == before
+    words = " ".join(output.split())
+    for line in ("undistort to do", "pairs 3 to do, 0 done", "images 3 to do, 0 done", "cloud 1 to do, 0 done"):
+        assert line in words
+    assert re.search(
+        r"time about \d+ s memory about \d+\.\d MB disk about \d+\.\d MB more, of [\d.]+ \wB free", words
+    )
+    assert "estimates" in words
+    assert command(capsys, *RUN, *FAST)[0] == 0
+    before = {path: path.stat().st_mtime_ns for path in small.rglob("*")}
+    code, output = command(capsys, *RUN, *FAST, "--dry-run", "--fusion.min-num-pixels", "3")
+    assert code == 0
+    words = " ".join(output.split())
+    for line in ("undistort done", "pairs 0 to do, 3 done", "images 0 to do, 3 done", "cloud 1 to do, 0 done"):
+        assert line in words
+    assert {path: path.stat().st_mtime_ns for path in small.rglob("*")} == before
+
+
+@pytest.mark.parametrize("case", ["neither", "no model", "wrong images", "not a workspace", "pairs", "threads"])
+def test_dry_run_finds_the_same_mistakes(case: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments, expected, words = BAD[case]
+    before = tree(small)
+    code, output = command(capsys, *arguments, "--dry-run")
+    assert words in error_sentence(code, output)
+    assert code == expected
+    assert tree(small) == before
+
+
+def test_a_second_run_says_what_was_up_to_date(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = command(capsys, *RUN, *FAST)[1]
+    assert "up to date" not in first
+    code, output = command(capsys, *RUN, *FAST)
+    assert code == 0
+    words = " ".join(output.split())
+    assert "up to date match pairs 3, estimate depth 3, check consistency 3, fuse 1" in words
+    code, output = command(capsys, *RUN, *FAST, "--overwrite")
+    assert code == 0
+    assert "up to date" not in output
+
+
+@pytest.mark.parametrize(
+    ("error", "expected", "words"),
+    [
+        (MemoryError(), 6, "not enough memory"),
+        (
+            OSError(28, "No space left on device", "some/file"),
+            3,
+            "some/file cannot be used (No space left on device)",
+        ),
+        (OSError(28, "No space left on device"), 3, "No space left on device"),
+    ],
+)
+def test_what_the_system_refuses(
+    error: Exception,
+    expected: int,
+    words: str,
+    small: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refused(*_: object, **__: object) -> None:
+        raise error
+
+    monkeypatch.setattr(cli, "run", refused)
+    code, output = command(capsys, *RUN)
+    assert words in error_sentence(code, output)
+    assert code == expected

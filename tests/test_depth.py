@@ -1,6 +1,7 @@
 """Depth from disparities against exact geometry, the vote and the consistency check against the oracle."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from types import SimpleNamespace
 
 import numpy as np
 import oracle
@@ -20,6 +21,8 @@ from rendered import (
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.depth import (
+    CHECK_OPTIONS,
+    VOTE_OPTIONS,
     DepthEstimate,
     DepthOptions,
     PairDisparity,
@@ -541,3 +544,25 @@ def test_options_out_of_bounds_are_refused(name, value):
     DepthOptions().check()
     with pytest.raises(OptionError, match=name):
         DepthOptions(**{name: value}).check()
+
+
+# ---- options -----------------------------------------------------------------------------------------------
+
+
+def test_vote_and_check_read_their_own_options():
+    """Their keys hold no others: each works without those of the other."""
+    assert sorted([*VOTE_OPTIONS, *CHECK_OPTIONS]) == sorted(field.name for field in fields(DepthOptions))
+    vote, checked = (
+        SimpleNamespace(**{name: getattr(OPTIONS, name) for name in names})
+        for names in (VOTE_OPTIONS, CHECK_OPTIONS)
+    )
+    synthetic = RENDERED["convergent"]
+    scene, left, right = scene_of_pair(synthetic)
+    pair = rectify_pair(scene, left, right, SPHERE)
+    exact, _ = exact_disparity(synthetic.surfaces, left, right, pair, "left")
+    disparity = PairDisparity(left.name, right.name, pair, exact.astype(np.float32))
+    found, expected = (estimate_depth(left, [disparity], options).depth for options in (vote, OPTIONS))
+    assert expected.any()
+    np.testing.assert_array_equal(found, expected)
+    views, maps = wall_views(3)
+    np.testing.assert_array_equal(check(views, maps, checked).depth, check(views, maps).depth)

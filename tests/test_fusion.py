@@ -16,7 +16,8 @@ from clouds import read_fused, read_visibility
 
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.fusion import FusionOptions, explain_losses, fuse
+from colmap_sph.fusion import FusionOptions, fuse
+from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.scene import read_scene
 from colmap_sph.workspace import (
     Workspace,
@@ -298,3 +299,16 @@ def test_fusion_cfg_that_does_not_fit(workspace):
     workspace.fusion_cfg_path.unlink()
     with pytest.raises(InputError, match=r"fusion\.cfg"):
         fuse(workspace, FusionOptions())
+
+
+@pytest.mark.parametrize("kind", ["cut off", "other size", "no header"])
+def test_a_damaged_map_is_named(workspace, kind):
+    """COLMAP itself would fuse it without a word, or not say which it is."""
+    path = workspace.depth_map_path("c.png", "geometric")
+    if kind == "other size":
+        write_depth_map(path, np.ones((HEIGHT, WIDTH - 1), np.float32))
+    else:
+        path.write_bytes(path.read_bytes()[:-100] if kind == "cut off" else b"\0" * 100)
+    with pytest.raises(InputError, match=str(path)):
+        fuse(workspace, FusionOptions())
+    assert not workspace.fused_path.exists()

@@ -15,23 +15,18 @@ from conftest import FinishedRun, keep_images
 import colmap_sph
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
+from colmap_sph.context import Context
 from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.fusion import FusionOptions
+from colmap_sph.keys import Keys
 from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairOptions, select_pairs
-from colmap_sph.pipeline import (
-    check_views,
-    estimate_views,
-    find_database,
-    fuse_views,
-    match_pairs,
-    workspace_root,
-)
+from colmap_sph.pipeline import find_database, workspace_root
 from colmap_sph.rectification import RectificationOptions
-from colmap_sph.report import RunReport, Silent
 from colmap_sph.scene import read_scene
+from colmap_sph.stages import check_views, estimate_views, fuse_views, match_pairs
 from colmap_sph.synthetic import DemoBlock
 from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.workspace import (
@@ -153,17 +148,13 @@ def test_stages_one_by_one(project: Path) -> None:
     workspace = prepare_workspace(project / "sparse/0", None, project / "stages", UndistortionOptions())
     scene = read_scene(workspace.sparse_dir)
     selection = select_pairs(scene, FEW_PAIRS.pairs)
-    report, progress = RunReport(), Silent()
-    pairs = match_pairs(workspace, scene, selection.unique_pairs(), FEW_PAIRS, progress, report)
-    assert pairs == selection.unique_pairs()
-    partners: dict[str, list[str]] = {view.name: [] for view in scene.views}
-    for left, right in pairs:
-        partners[left].append(right)
-        partners[right].append(left)
-    partners = {name: sorted(others) for name, others in partners.items()}
-    estimate_views(workspace, scene, partners, FEW_PAIRS, progress, report)
-    check_views(workspace, scene, partners, FEW_PAIRS, progress, report)
-    fuse_views(workspace, scene, partners, FEW_PAIRS, progress, report)
+    context = Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS))
+    pairs = match_pairs(context, selection.unique_pairs())
+    assert list(pairs) == selection.unique_pairs()
+    votes = estimate_views(context, pairs)
+    geometric = check_views(context, pairs, votes)
+    fuse_views(context, pairs, geometric)
+    report = context.report
     assert maps(project / "stages") == maps(project / "whole")
     assert report.coverage == whole.coverage
     assert report.points == pytest.approx(whole.points, rel=0.01)

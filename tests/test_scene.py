@@ -92,7 +92,7 @@ def test_pose_that_is_not_finite_is_left_out(tmp_path: Path, caplog: pytest.LogC
     scene = read_scene(write(model, tmp_path / "sparse", text=False))
     assert [view.image_id for view in scene.views] == [4, 3, 1]
     assert scene.points.shape == (29, 3) and np.isfinite(scene.points).all()
-    assert "sub/2.png" in caplog.text and "1 sparse points are not finite" in caplog.text
+    assert "sub/2.png" in caplog.text and "1 sparse points have no possible coordinates" in caplog.text
 
 
 def test_distorted_camera_is_refused(tmp_path: Path) -> None:
@@ -152,3 +152,32 @@ def test_real_model(data_dir: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(view.cam_from_world, same.cam_from_world, atol=1e-9)
         np.testing.assert_array_equal(view.point_indices, same.point_indices)
     shutil.rmtree(old)
+
+
+def test_image_name_that_is_not_utf8(tmp_path: Path) -> None:
+    make_model().write_binary(tmp_path)
+    path = tmp_path / "images.bin"
+    path.write_bytes(path.read_bytes().replace(b"sub/1.png", b"sub/\xe9.png"))
+    with pytest.raises(InputError, match=r"image name b'sub/\\xe9\.png', which is not UTF-8"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("coordinate", [1e300, -1e200, np.inf, np.nan])
+def test_impossible_points_are_left_out(tmp_path: Path, coordinate: float) -> None:
+    """Also those whose squares are beyond floats; no warning of NumPy's comes up."""
+    model = make_model()
+    expected = len(model.points3D)
+    model.point3D(min(model.points3D)).xyz = [0.0, coordinate, 0.0]
+    model.write_binary(tmp_path)
+    scene = read_scene(tmp_path)
+    assert len(scene.points) == expected - 1
+    assert np.abs(scene.points).max() < 10
+
+
+@pytest.mark.parametrize("params", [[1e300, 320, 240], [500, 1e300, 240], [1e-30, 320, 240], [np.inf, 320, 240]])
+def test_impossible_calibrations_are_told(tmp_path: Path, params: list[float]) -> None:
+    model = make_model("SIMPLE_PINHOLE")
+    model.camera(1).params = params
+    model.write_binary(tmp_path)
+    with pytest.raises(InputError, match="No image of the model"):
+        read_scene(tmp_path)

@@ -11,10 +11,10 @@ import pytest
 from colmap_sph import staging
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.image_check import image_problem
+from colmap_sph.originals import find_images
 from colmap_sph.scene import read_scene
 from colmap_sph.undistortion import (
     UndistortionOptions,
-    find_images,
     leave_out_bad_images,
     open_workspace,
     prepare_workspace,
@@ -179,17 +179,21 @@ def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytes
     assert len(read_scene(workspace.sparse_dir).views) == 4
 
 
-@pytest.mark.parametrize("num_moved", range(6))
+@pytest.mark.parametrize("num_moved", range(7))
 def test_interrupted_move_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_moved: int) -> None:
     sparse, dense = make_project(tmp_path), tmp_path / "dense"
-    finished = prepare_workspace(sparse, None, tmp_path / "other", OPTIONS)
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    assert cv2.imwrite(str(masks / "a.png.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    finished = prepare_workspace(sparse, None, tmp_path / "other", OPTIONS, masks)
     scratch = dense / "colmap_sph" / "undistorting"
     scratch.mkdir(parents=True)
     (finished.state_dir / "undistortion.json").rename(scratch / "undistortion.json")
     for index, part in enumerate(staging._PARTS):
         (finished.root / part).rename((dense if index < num_moved else scratch) / part)
     monkeypatch.setattr(pycolmap, "undistort_images", None)
-    workspace = prepare_workspace(sparse, None, dense, OPTIONS)
+    workspace = prepare_workspace(sparse, None, dense, OPTIONS, masks)
+    assert workspace.mask_path("a.png").is_file()
     assert len(leave_out_bad_images(read_scene(workspace.sparse_dir), workspace).views) == 4
     assert not scratch.exists()
 
@@ -247,8 +251,9 @@ def test_options() -> None:
 def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     sparse = make_project(tmp_path, "OPENCV", (0.0, 0.0, 0.0, 0.0))
     pycolmap.undistort_images(tmp_path / "dense", sparse, tmp_path / "images")
+    before = sorted(tmp_path.rglob("*"))
     workspace = open_workspace(tmp_path / "dense")
-    assert workspace.normal_map_path("cam/c.png", "photometric").parent.is_dir()
+    assert sorted(tmp_path.rglob("*")) == before
     scene = read_scene(workspace.sparse_dir)  # an OPENCV camera without distortion
     workspace.image_path("a.png").unlink()
     assert [view.name for view in leave_out_bad_images(scene, workspace).views] == NAMES[1:]

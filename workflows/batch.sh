@@ -4,7 +4,8 @@
 #     workflows/batch.sh ROOT [options of `colmap_sph run`]
 #
 # A project is a folder, at any depth below ROOT, with a sparse model in sparse/0; its result goes to dense/ beside
-# sparse/. A failure does not stop the batch. The exit code is 1 where a project has no complete result.
+# sparse/. A failure does not stop the batch. The exit code is 1 where a project has no complete result. Run it again
+# to try those once more: what is finished is not done again.
 set -u
 root=${1:?usage: batch.sh ROOT [options of colmap_sph run]}
 shift
@@ -20,13 +21,14 @@ for model in "${models[@]}"; do
     echo "==== $project"
     colmap_sph run --model "$model" --output "$project/dense" "$@"
     code=$?
-    [ "$code" -eq 130 ] && { echo "interrupted at $project" >&2; exit 130; }
     case $code in
+        130 | 143) echo "interrupted at $project; the same command goes on there" >&2; exit "$code" ;;
         0) result="$(points "$project") points" ;;
         5) result="$(points "$project") points, but some images have no depth map" ;;
         2) result="FAILED: input or options" ;;
         3) result="FAILED: cannot write" ;;
         4) result="FAILED: nothing to reconstruct" ;;
+        6) result="FAILED: not enough memory" ;;
         *) result="FAILED: exit code $code" ;;
     esac
     [ "$code" -eq 0 ] || failed=$((failed + 1))

@@ -5,7 +5,8 @@
 #     sbatch --array=1-$(wc -l < models.txt) workflows/slurm_array.sh models.txt [options of `colmap_sph run`]
 #
 # models.txt names one sparse model per line; the results go to dense/ beside each sparse/. `sacct -j JOB` tells
-# which tasks failed; submit those again with --array=3,7. A task uses the cores that it is given below.
+# which tasks failed or ran out of time; submit those again with --array=3,7, and they go on where they stopped. A
+# task uses the cores that it is given below.
 #SBATCH --job-name=colmap_sph
 #SBATCH --nodes=1
 #SBATCH --ntasks=1

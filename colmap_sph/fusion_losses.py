@@ -1,0 +1,147 @@
+"""Which of fusion's gates stops the pixels that do not become points: what to advise where the cloud is thin."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.fusion import FusionOptions
+from colmap_sph.load_cache import LoadCache
+from colmap_sph.scene import Scene, View
+from colmap_sph.workspace import MapKind, Workspace, read_depth_map, read_normal_map
+
+# Partners of a view to look at, and bytes of maps to keep in memory.
+_EXPLAINED_PARTNERS = 20
+_CACHE_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class GateLosses:
+    """Why sampled depth map pixels did not become points: shares of the sampled pixels, 0 to 1.
+
+    Attributes
+    ----------
+    unseen : float
+        No other image has the point in view with a depth there.
+    depth, reprojection, normal : float
+        The gate that most often stopped the agreement of a pixel which finds too few others.
+    kept : float
+        Enough other pixels agree.
+    """
+
+    unseen: float
+    depth: float
+    reprojection: float
+    normal: float
+    kept: float
+
+    def sentence(self) -> str:
+        """What a user should know of it."""
+        gates = {
+            "max_depth_error": self.depth,
+            "max_reproj_error": self.reprojection,
+            "max_normal_error": self.normal,
+        }
+        worst = max(gates, key=lambda name: gates[name])
+        remedy = f"loosen {worst} or min_num_pixels first"
+        if self.unseen > sum(gates.values()):
+            remedy = "check the poses, or fuse the photometric maps, which cover more"
+        return (
+            f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
+            f"by no other depth map, and the rest fail the gates of depth ({self.depth:.0%}), reprojection "
+            f"({self.reprojection:.0%}) and normal ({self.normal:.0%}); {remedy}."
+        )
+
+
+def explain_losses(
+    workspace: Workspace,
+    scene: Scene,
+    options: FusionOptions,
+    *,
+    kind: MapKind = "geometric",
+    samples: int = 2000,
+    max_views: int = 10,
+) -> GateLosses:
+    """Find which of fusion's gates stops a sample of depth map pixels.
+
+    Every sampled pixel is projected into the views that share most points with its own, as COLMAP's fusion does
+    for the first pixel of a point; a pixel that too few others confirm is charged to the gate that most of its
+    comparisons failed.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    scene : Scene
+        Views with maps.
+    options : FusionOptions
+    kind : {"geometric", "photometric"}
+    samples : int
+        Pixels per view.
+    max_views : int
+        Views to sample, evenly spread.
+
+    Returns
+    -------
+    GateLosses
+    """
+
+    def load(name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        depth_path, normal_path = workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)
+        return read_depth_map(depth_path), read_normal_map(normal_path)
+
+    maps = LoadCache(load, lambda pair: pair[0].nbytes + pair[1].nbytes, _CACHE_BYTES)
+    counts = np.zeros(5)
+    for view in scene.views[:: -(-len(scene.views) // max_views)]:
+        points, normals = _sample_points(view, *maps.get(view.name), samples)
+        verdicts = np.zeros((len(points), 4), dtype=int)
+        for other in _overlapping(scene, view, min(options.check_num_images, _EXPLAINED_PARTNERS)):
+            verdicts += _verdicts(points, normals, other, *maps.get(other.name), options)
+        enough = 1 + verdicts[:, 3] >= options.min_num_pixels
+        failed = np.where(verdicts[:, :3].any(axis=1), verdicts[:, :3].argmax(axis=1) + 1, 0)
+        counts += np.bincount(np.where(enough, 4, failed), minlength=5)
+    return GateLosses(*(counts / max(counts.sum(), 1)))
+
+
+def _overlapping(scene: Scene, view: View, most: int) -> list[View]:
+    """Up to `most` other views, those which share most sparse points with `view` first."""
+    seen = np.zeros(len(scene.points), dtype=bool)
+    seen[view.point_indices] = True
+    others = [other for other in scene.views if other is not view]
+    return sorted(others, key=lambda other: -int(np.count_nonzero(seen[other.point_indices])))[:most]
+
+
+def _sample_points(
+    view: View, depth: NDArray[np.float32], normals: NDArray[np.float32], samples: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """World points and world normals of evenly spread pixels with a depth."""
+    rows, columns = np.nonzero(depth > 0)
+    chosen = np.linspace(0, len(rows) - 1, min(samples, len(rows))).astype(int)
+    rows, columns = rows[chosen], columns[chosen]
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=1) @ np.linalg.inv(view.K).T
+    points = (rays * depth[rows, columns, None] - view.t) @ view.R
+    return points, normals[rows, columns] @ view.R
+
+
+def _verdicts(
+    points: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    view: View,
+    depth: NDArray[np.float32],
+    view_normals: NDArray[np.float32],
+    options: FusionOptions,
+) -> NDArray[np.bool_]:
+    """(n, 4): stopped by depth, by reprojection, by normal; agrees. All false where the view has no depth."""
+    in_camera = points @ view.R.T + view.t
+    pixel = in_camera @ view.K.T
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        uv = pixel[:, :2] / pixel[:, 2:]
+    inside = (pixel[:, 2] > 0) & (uv > -0.5).all(axis=1)
+    inside &= (uv < np.array([view.width, view.height]) - 0.5).all(axis=1)
+    columns, rows = (np.rint(np.where(inside[:, None], uv, 0)).astype(int)).T
+    z = depth[rows, columns].astype(np.float64)
+    seen = inside & (z > 0)
+    far = seen & (np.abs(in_camera[:, 2] - z) > options.max_depth_error * z)
+    off = seen & ~far & (np.hypot(*(uv - np.stack([columns, rows], axis=1)).T) > options.max_reproj_error)
+    cosine = (normals * (view_normals[rows, columns] @ view.R)).sum(axis=1)
+    turned = seen & ~far & ~off & (cosine < np.cos(np.radians(options.max_normal_error)))
+    return np.stack([far, off, turned, seen & ~far & ~off & ~turned], axis=1)

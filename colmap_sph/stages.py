@@ -1,0 +1,348 @@
+"""The stages that compute: disparity maps of pairs, photometric and geometric maps of images, the cloud.
+
+Every stage asks for each of its results first whether an earlier run has made the very same; `pair_state`,
+`vote_state` and `check_state` answer that without computing anything.
+"""
+
+import logging
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.context import Context, Done
+from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate_depth
+from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.fusion import fuse
+from colmap_sph.fusion_losses import explain_losses
+from colmap_sph.load_cache import LoadCache
+from colmap_sph.masks import read_mask
+from colmap_sph.matching import RectifiedImage, Scratch, match_pair
+from colmap_sph.normals import fit_normals
+from colmap_sph.pair_files import read_arrays, read_pair, stored_key, write_arrays, write_pair
+from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
+from colmap_sph.scene import View
+from colmap_sph.state import forget, vouch, vouched_facts
+from colmap_sph.workspace import (
+    MapKind,
+    Workspace,
+    make_dir,
+    write_depth_map,
+    write_fusion_cfg,
+    write_normal_map,
+)
+
+logger = logging.getLogger(__name__)
+
+Pair = tuple[str, str]
+
+# Fewer points than this share of the pixels with a geometric depth calls for an explanation.
+_FEW_POINTS = 0.02
+_CACHE_BYTES = 512 << 20
+
+
+# ---- matching ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PairState:
+    """Geometry and key of a pair, and whether its disparity map is there."""
+
+    geometry: RectifiedPair
+    key: str
+    is_done: bool
+
+
+def pair_state(context: Context, pair: Pair) -> PairState:
+    """Rectify a pair of image names; `RectificationError` where that is impossible."""
+    left, right = (context.scene.view(name) for name in pair)
+    geometry = rectify_pair(context.scene, left, right, context.options.rectification)
+    key = context.keys.pair(left, right, geometry)
+    return PairState(geometry, key, stored_key(context.pair_path(*pair)) == key)
+
+
+def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
+    """Rectify and match pairs of image names, each once.
+
+    Writes their disparity maps; returns the keys of the pairs that could be matched, by pair.
+    """
+    report = context.report
+    make_dir(context.pairs_dir)
+    thread = threading.local()
+    images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
+    masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, _CACHE_BYTES)
+
+    def rectified(name: str, geometry: RectifiedPair, side: Side) -> RectifiedImage:
+        view, mask = context.scene.view(name), masks.get(name)
+        return RectifiedImage(*resample(images.get(name), view, geometry, side, mask=mask))
+
+    def work(pair: Pair) -> Done:
+        state = pair_state(context, pair)
+        if state.is_done:
+            return Done(state.key, made=False)
+        geometry, (left, right) = state.geometry, pair
+        if not hasattr(thread, "scratch"):
+            thread.scratch = Scratch()
+        disparity = match_pair(
+            rectified(left, geometry, "left"),
+            rectified(right, geometry, "right"),
+            geometry.min_disparity,
+            geometry.max_disparity,
+            context.options.matching,
+            thread.scratch,
+        )
+        write_pair(context.pair_path(*pair), PairDisparity(*pair, geometry, disparity), state.key)
+        return Done(state.key, made=True)
+
+    def skip(pair: Pair, reason: str) -> None:
+        report.skipped_pairs[" - ".join(pair)] = reason
+        logger.warning("%s - %s skipped: %s", *pair, reason)
+
+    matched = context.for_all("match pairs", work, pairs, skip)
+    if not matched:
+        reason = next(iter(report.skipped_pairs.values()), "no pair")
+        raise NoResultError(f"None of the {len(pairs)} pairs could be matched ({reason}).")
+    report.pairs = len(matched)
+    return {pair: matched[pair].key for pair in sorted(matched)}
+
+
+# ---- photometric maps --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class VoteState:
+    """Key of a view's photometric depth; whether that, and the maps made from it, are there."""
+
+    key: str
+    is_voted: bool
+    is_done: bool
+
+
+def vote_state(context: Context, pair_keys: Mapping[Pair, str], view: View) -> VoteState:
+    """See `VoteState`; `pair_keys` are those of all pairs, by pair."""
+    keys = [pair_keys[pair] for pair in _pairs_of(pair_keys, view.name)]
+    key = context.keys.vote(view, keys)
+    voted = stored_key(context.estimate_path(view.name)) == key
+    coverage = _finished_coverage(context, view.name, "photometric", context.keys.photometric(key))
+    return VoteState(key, voted, voted and coverage is not None)
+
+
+def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str, str]:
+    """Vote the photometric depth of every view; writes depth, normal and sigma maps.
+
+    Returns the keys of the votes by image name, without those of views that failed.
+    """
+    for view in context.scene.views:
+        make_dir(context.estimate_path(view.name).parent)
+
+    def work(view: View) -> Done:
+        state = vote_state(context, pair_keys, view)
+        if not state.is_done:
+            estimate = _read_estimate(context, view.name) if state.is_voted else _vote(view, state.key)
+            _write_maps(context, view, estimate, "photometric", context.keys.photometric(state.key))
+        return Done(state.key, made=not state.is_done)
+
+    def _vote(view: View, key: str) -> DepthEstimate:
+        files = (context.pair_path(*pair) for pair in _pairs_of(pair_keys, view.name))
+        estimate = estimate_depth(view, (read_pair(file) for file in files), context.options.depth)
+        mask = _read_mask(context, view.name)
+        if mask is not None:
+            # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
+            estimate.depth[mask == 0] = 0
+        arrays = {"depth": estimate.depth, "sigma": estimate.sigma, "support": estimate.support}
+        write_arrays(context.estimate_path(view.name), arrays, key)
+        return estimate
+
+    results = context.for_all("estimate depth", work, context.scene.views, _skip_view(context))
+    return {view.name: done.key for view, done in results.items()}
+
+
+# ---- geometric maps ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CheckState:
+    """Key of a view's geometric maps, and the share of pixels with a depth where they are there."""
+
+    key: str
+    coverage: float | None
+
+
+def check_state(context: Context, partners: Sequence[str], votes: Mapping[str, str], view: View) -> CheckState:
+    """See `CheckState`; `votes` are the keys of the votes by image name, of `partners` and the view's own."""
+    key = context.keys.geometric(votes[view.name], [votes[name] for name in partners])
+    return CheckState(key, _finished_coverage(context, view.name, "geometric", key))
+
+
+def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str]) -> dict[str, str]:
+    """Check every view's depth against its partners'; writes the geometric depth and normal maps.
+
+    `votes` are what `estimate_views` returned. Returns the keys of the maps by image name.
+    """
+    report, partners = context.report, partners_of(pairs)
+    estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, _CACHE_BYTES)
+
+    def work(view: View) -> Done:
+        names = [name for name in partners.get(view.name, []) if name in votes]
+        state = check_state(context, names, votes, view)
+        if state.coverage is not None:
+            return Done(state.key, made=False, coverage=state.coverage)
+        others = ((context.scene.view(name), estimates.get(name)) for name in names)
+        checked = check_depth(view, estimates.get(view.name), others, context.options.depth)
+        coverage = _write_maps(context, view, checked, "geometric", state.key)
+        return Done(state.key, made=True, coverage=coverage)
+
+    views = [view for view in context.scene.views if view.name in votes]
+    results = context.for_all("check consistency", work, views, _skip_view(context))
+    coverage = {view.name: done.coverage for view, done in results.items()}
+    report.coverage = {view.name: coverage.get(view.name, 0.0) for view in context.scene.views}
+    report.images = sum(share > 0 for share in report.coverage.values())
+    failures = [report.skipped_images[name] for name in report.coverage if name in report.skipped_images]
+    if failures and not report.images:
+        raise NoResultError(f"No image has a depth map ({failures[0]})")
+    for name in (name for name, share in report.coverage.items() if share == 0):
+        known = "no depth of it is confirmed by another image"
+        report.skipped_images.setdefault(name, known if name in partners else "no pair of it could be matched")
+    if not report.images:
+        raise NoResultError(
+            "No depth was confirmed by a second image; are the model's poses right for these images?"
+        )
+    return {view.name: done.key for view, done in results.items()}
+
+
+# ---- the cloud ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CloudState:
+    """Key of the cloud, and what is known of it where it is there.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Images to fuse: those with any depth.
+    partners : dict, optional
+        Where the model has no tracks, from which COLMAP's fusion knows what overlaps: partners of each image.
+    key : str
+    facts : dict, optional
+        Its number of points and the advice to give; None where it must be made.
+    """
+
+    names: tuple[str, ...]
+    partners: dict[str, list[str]] | None
+    key: str
+    facts: dict[str, Any] | None
+
+
+def cloud_state(
+    context: Context, pairs: Iterable[Pair], maps: Mapping[str, str], coverage: Mapping[str, float]
+) -> CloudState:
+    """See `CloudState`; `maps` and `coverage` are keys and coverage of the geometric maps by image name."""
+    names = tuple(view.name for view in context.scene.views if coverage.get(view.name, 0) > 0)
+    tracked = any(len(view.point_indices) for view in context.scene.views)
+    partners = None if tracked else partners_of(pairs)
+    key = context.keys.cloud({name: maps[name] for name in names}, partners or {}, context.scene.origin)
+    return CloudState(names, partners, key, vouched_facts(context.cloud_record, key, context.cloud_paths))
+
+
+def fuse_views(context: Context, pairs: Iterable[Pair], maps: Mapping[str, str]) -> None:
+    """Fuse the maps into the cloud; writes ``fused.ply`` and ``fused.ply.vis``.
+
+    `maps` are what `check_views` returned.
+    """
+    options, report = context.options, context.report
+    with context.stage("fuse", 1):
+        state = cloud_state(context, pairs, maps, report.coverage)
+        facts = state.facts
+        write_fusion_cfg(context.workspace.fusion_cfg_path, state.names)
+        if facts is None:
+            forget(context.cloud_record)
+            points = fuse(
+                context.workspace,
+                options.fusion,
+                threads=options.num_threads,
+                kind=options.fusion_input,
+                partners=state.partners,
+            )
+            facts = {"points": points, "advice": _advice(context, points)}
+            vouch(context.cloud_record, state.key, context.cloud_paths, **facts)
+        context.progress.advance()
+    context.count("fuse", [Done(state.key, made=state.facts is None)])
+    report.points, report.advice = facts["points"], facts["advice"]
+    if report.advice:
+        logger.warning("Only %d points survived fusion. %s", report.points, report.advice)
+
+
+def partners_of(pairs: Iterable[Pair]) -> dict[str, list[str]]:
+    """Partners of each image, sorted."""
+    partners: dict[str, list[str]] = {}
+    for left, right in pairs:
+        partners.setdefault(left, []).append(right)
+        partners.setdefault(right, []).append(left)
+    return {name: sorted(others) for name, others in partners.items()}
+
+
+# ---- helpers -----------------------------------------------------------------------------------------------
+
+
+def _advice(context: Context, points: int) -> str:
+    """Which gate of the fusion to loosen, where few points survived."""
+    coverage, scene = context.report.coverage, context.scene
+    pixels = sum(coverage[view.name] * view.width * view.height for view in scene.views)
+    if points >= _FEW_POINTS * pixels:
+        return ""
+    options = context.options
+    return explain_losses(context.workspace, scene, options.fusion, kind=options.fusion_input).sentence()
+
+
+def _pairs_of(pairs: Iterable[Pair], name: str) -> list[Pair]:
+    """Pairs of an image, by the name of its partner."""
+    return sorted((pair for pair in pairs if name in pair), key=lambda pair: [n for n in pair if n != name])
+
+
+def _skip_view(context: Context) -> Callable[[View, str], None]:
+    def skip(view: View, reason: str) -> None:
+        context.report.skipped_images[view.name] = reason
+        logger.warning("%s skipped: %s", view.name, reason)
+
+    return skip
+
+
+def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:
+    path = workspace.image_path(name)
+    # Undistorted images have their camera's orientation; an EXIF tag must not turn them.
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _read_mask(context: Context, name: str) -> NDArray[np.uint8] | None:
+    view = context.scene.view(name)
+    return read_mask(context.workspace.mask_path(name), view.width, view.height)
+
+
+def _read_estimate(context: Context, name: str) -> DepthEstimate:
+    return DepthEstimate(**read_arrays(context.estimate_path(name), ("depth", "sigma", "support")))
+
+
+def _write_maps(context: Context, view: View, estimate: DepthEstimate, kind: MapKind, key: str) -> float:
+    """Fit normals, write both maps (depth is that of the fitted planes), return the share of pixels with one."""
+    record, (depth_path, normal_path) = context.maps_record(view.name, kind), context.map_paths(view.name, kind)
+    normals, depth = fit_normals(view, estimate, context.options.normals)
+    forget(record)
+    write_depth_map(depth_path, depth)
+    write_normal_map(normal_path, normals)
+    coverage = float((depth > 0).mean())
+    vouch(record, key, [depth_path, normal_path], coverage=coverage)
+    return coverage
+
+
+def _finished_coverage(context: Context, name: str, kind: MapKind, key: str) -> float | None:
+    """Share of pixels with a depth in an image's maps, or None where they must be made."""
+    facts = vouched_facts(context.maps_record(name, kind), key, context.map_paths(name, kind))
+    return None if facts is None else facts["coverage"]

@@ -1,0 +1,293 @@
+"""Call every C function, and the reader of depth maps, with random arguments, right and wrong ones.
+
+Whatever comes in, a call must return or raise one of Python's own errors. Worth most in a build with
+sanitizers (see CONTRIBUTING.md), which turn a stray read or write into the end of the process; the seed of the
+call is printed then, and ``--seed N --calls 1`` repeats it.
+
+A new C function needs one entry in `FUNCTIONS`: valid arguments of random size.
+"""
+
+import argparse
+import multiprocessing
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from colmap_sph import _native
+from colmap_sph.errors import InputError
+from colmap_sph.workspace import read_depth_map, read_normal_map
+
+Random = np.random.Generator
+Arguments = list[Any]
+
+ALLOWED = (TypeError, ValueError, OverflowError, MemoryError)
+DTYPES = (np.uint8, np.int8, np.uint16, np.int32, np.uint64, np.float32, np.float64, np.complex64, np.bool_)
+FLOATS = (np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 0.5, 1e-300, 5e-324, 1e30, -1e300)
+INTEGERS = (-(2**63), -(2**31), -1, 0, 1, 17, 255, 256, 2**31 - 1, 2**31, 2**63, 2**70)
+ODD_OBJECTS = (None, "text", b"bytes", [1, 2], (), {}, 1.5, 3, True)
+
+
+# ---- valid arguments ---------------------------------------------------------------------------------------
+
+
+def filled(rng: Random, shape: tuple[int, ...], dtype: type) -> np.ndarray:
+    """Random bits, or small numbers, or one number out of this world among small ones."""
+    kind = rng.integers(3)
+    if kind == 0:
+        return (
+            np.frombuffer(rng.bytes(int(np.prod(shape)) * np.dtype(dtype).itemsize), dtype).reshape(shape).copy()
+        )
+    array = rng.integers(0, 60, shape).astype(dtype)
+    if kind == 1 and array.size and array.dtype.kind == "f":
+        with np.errstate(over="ignore"):
+            array.flat[int(rng.integers(array.size))] = FLOATS[int(rng.integers(len(FLOATS)))]
+    return array
+
+
+def size(rng: Random) -> tuple[int, int]:
+    """Height and width, either of which may be 0."""
+    return int(rng.integers(0, 12)), int(rng.integers(0, 70))
+
+
+def census(rng: Random) -> Arguments:
+    h, w = size(rng)
+    padded = filled(rng, (h + 6, w + 8), np.uint8)
+    return [backend(rng), padded, filled(rng, (h, w), np.uint8), np.zeros((h, w), np.uint64)]
+
+
+def matching_cost(rng: Random) -> Arguments:
+    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
+    words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
+    return [backend(rng), *words, filled(rng, (h, w), np.int32), np.zeros((h, w, depth), np.uint8)]
+
+
+def aggregation(rng: Random) -> Arguments:
+    (h, w), depth, p1 = size(rng), 32 * int(rng.integers(1, 4)), int(rng.integers(0, 30))
+    cost, image = filled(rng, (h, w, depth), np.uint8), filled(rng, (h, w), np.uint8)
+    p2 = rng.integers(p1, 194, 256).astype(np.uint8)
+    base, sums = filled(rng, (h, w), np.int32), np.zeros((h, w, depth), np.uint16)
+    return [backend(rng), cost, base, image, p1, p2, int(rng.integers(0, 5)), sums]
+
+
+def selection(rng: Random) -> Arguments:
+    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
+    sums, base = filled(rng, (h, w, depth), np.uint16), filled(rng, (h, w), np.int32)
+    words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
+    return [backend(rng), sums, base, *words, int(rng.integers(0, 5)), np.zeros((h, w), np.int32)]
+
+
+def match(rng: Random) -> Arguments:
+    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
+    words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
+    base, image, p1 = filled(rng, (h, w), np.int32), filled(rng, (h, w), np.uint8), int(rng.integers(0, 30))
+    p2, limits = rng.integers(p1, 194, 256).astype(np.uint8), (int(rng.integers(0, 5)), int(rng.integers(0, 5)))
+    scratch = np.zeros((3, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
+    return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
+
+
+def refine_offsets(rng: Random) -> Arguments:
+    (h, w), target = size(rng), int(rng.integers(0, 70))
+    offset = filled(rng, (h, w), np.int32)
+    if rng.random() < 0.7:  # one surface within the target, in 1/256 pixel
+        offset = (256 * rng.integers(-20, 20) + rng.integers(-300, 300, (h, w))).astype(np.int32)
+    words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
+    return [backend(rng), offset, *words, np.zeros((h, w), np.int32)]
+
+
+def transfer_disparity(rng: Random) -> Arguments:
+    (h, w), target = size(rng), int(rng.integers(0, 70))
+    return [filled(rng, (h, w), np.float32), number(rng), np.zeros((h, target), np.float32)]
+
+
+def depth_candidates(rng: Random) -> Arguments:
+    maps = [np.zeros(size(rng), np.float32)] * 2
+    geometry = [filled(rng, (3, 3), np.float64), (number(rng), number(rng)), (number(rng), number(rng))]
+    numbers = [number(rng) for _ in range(4)]
+    flags = [bool(rng.integers(2)), bool(rng.integers(2)), int(rng.integers(0, 9))]
+    disparity = filled(rng, size(rng), np.float32)
+    return [backend(rng), disparity, *geometry, *numbers, *flags, maps[0], maps[1].copy()]
+
+
+def vote_depth(rng: Random) -> Arguments:
+    (h, w), pairs = size(rng), int(rng.integers(0, 12))
+    inputs = [filled(rng, (pairs, h, w), np.float32) for _ in range(2)]
+    return [*inputs, number(rng), *(np.zeros((h, w), kind) for kind in (np.float32, np.float32, np.uint8))]
+
+
+def check_consistency(rng: Random) -> Arguments:
+    sizes = [size(rng)] * 2 + [size(rng)] * 2
+    inputs = [filled(rng, shape, np.float32) for shape in (*sizes[:2], *sizes[2:])]
+    matrices = [filled(rng, (3, 4), np.float64) for _ in range(2)]
+    counts = [filled(rng, sizes[0], np.uint8) for _ in range(3)]
+    sums = [filled(rng, sizes[0], np.float32) for _ in range(2)]
+    return [*inputs, *matrices, number(rng), number(rng), *counts, *sums]
+
+
+def fit_planes(rng: Random) -> Arguments:
+    h, w = size(rng)
+    inputs = [filled(rng, (h, w), np.float32) for _ in range(2)]
+    outputs = [np.zeros((h, w, 3), np.float32), np.zeros((h, w), np.float32)]
+    K = filled(rng, (3, 3), np.float64)
+    return [backend(rng), *inputs, K, int(rng.integers(1, 17)), number(rng), *outputs]
+
+
+def backend(rng: Random) -> str:
+    """A name of kernels that this processor has."""
+    return str(rng.choice(_native.backends()))
+
+
+def number(rng: Random) -> float:
+    """A likely number, or an odd one."""
+    return float(rng.uniform(0, 10)) if rng.random() < 0.7 else float(rng.choice(FLOATS))
+
+
+FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
+    function.__name__: function
+    for function in (
+        census,
+        matching_cost,
+        aggregation,
+        selection,
+        match,
+        refine_offsets,
+        transfer_disparity,
+        depth_candidates,
+        vote_depth,
+        check_consistency,
+        fit_planes,
+    )
+}
+
+
+# ---- wrong arguments ---------------------------------------------------------------------------------------
+
+
+def spoiled(value: Any, others: Arguments, rng: Random) -> Any:
+    """Another value in the place of a valid one: mostly of the right kind, but wrong."""
+    if rng.random() < 0.1:
+        return ODD_OBJECTS[int(rng.integers(len(ODD_OBJECTS)))]
+    if isinstance(value, np.ndarray):
+        return spoiled_array(value, others, rng)
+    if isinstance(value, bool | int):
+        return INTEGERS[int(rng.integers(len(INTEGERS)))]
+    if isinstance(value, float):
+        return FLOATS[int(rng.integers(len(FLOATS)))]
+    if isinstance(value, tuple):
+        return [value[:1], (*value, 1.0), (None, None), list(value), (np.nan, np.inf)][int(rng.integers(5))]
+    return ["", "avx512", "scalar\0", "é" * 1000][int(rng.integers(4))]
+
+
+def spoiled_array(array: np.ndarray, others: Arguments, rng: Random) -> Any:
+    """Another item type, shape, layout or memory."""
+    arrays = [other for other in others if isinstance(other, np.ndarray)]
+    longer = tuple(n + int(rng.integers(-1, 2)) if n else n for n in array.shape)
+    with np.errstate(all="ignore"):
+        ways: list[Callable[[], np.ndarray]] = [
+            lambda: np.zeros(array.shape, DTYPES[int(rng.integers(len(DTYPES)))]),
+            lambda: np.zeros(longer, array.dtype),
+            lambda: np.zeros(array.shape[::-1], array.dtype),
+            lambda: array.ravel(),
+            lambda: array[None],
+            lambda: array[..., ::-1],
+            lambda: np.repeat(array, 2, axis=-1)[..., ::2],
+            lambda: np.asfortranarray(array),
+            lambda: np.broadcast_to(np.zeros((), array.dtype), array.shape),
+            lambda: np.broadcast_to(np.zeros((), array.dtype), (2**31,) * array.ndim)[:0],
+            lambda: np.zeros((*array.shape[:-1], 0), array.dtype),
+            lambda: np.zeros((0, *array.shape[1:-1], 2**40), array.dtype),
+            lambda: array.astype(array.dtype.newbyteorder()),
+            lambda: np.frombuffer(bytes(array.nbytes + 1), np.uint8)[1:].view(array.dtype).reshape(array.shape),
+            lambda: arrays[int(rng.integers(len(arrays)))],
+            lambda: (
+                arrays[int(rng.integers(len(arrays)))].ravel().view(np.uint8)[: array.nbytes].view(array.dtype)
+            ),
+        ]
+        try:
+            return ways[int(rng.integers(len(ways)))]()
+        except (ValueError, TypeError):  # such an array cannot be had of this one
+            return None
+
+
+def call_function(rng: Random) -> None:
+    """One call of a C function, half of them with one to three wrong arguments."""
+    name = str(rng.choice(list(FUNCTIONS)))
+    arguments = FUNCTIONS[name](rng)
+    if rng.random() < 0.5:
+        for place in rng.integers(len(arguments), size=int(rng.integers(1, 4))):
+            arguments[place] = spoiled(arguments[place], arguments, rng)
+    try:
+        result = getattr(_native, name)(*arguments)
+    except ALLOWED:
+        return
+    if result is not None:
+        raise AssertionError(f"{name} returned {result!r}")
+
+
+def read_map(rng: Random) -> None:
+    """One file of random content, mostly with a header, through the readers of maps."""
+    words = [b"%d" % INTEGERS[int(rng.integers(len(INTEGERS)))] if rng.random() < 0.3 else b"2" for _ in range(3)]
+    header = b"&".join(words) + (b"&" if rng.random() < 0.9 else b"")
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "map.bin"
+        path.write_bytes((header if rng.random() < 0.9 else b"") + rng.bytes(int(rng.choice([0, 3, 16, 32, 48]))))
+        for read in (read_depth_map, read_normal_map):
+            try:
+                read(path)
+            except InputError:
+                continue
+
+
+# ---- the loop ----------------------------------------------------------------------------------------------
+
+
+def work(first: int, calls: int, seconds: float, current: Any) -> None:
+    """Call until the time is over, telling the seed before each call."""
+    end = time.monotonic() + seconds
+    for seed in range(first, first + calls):
+        if time.monotonic() > end:
+            break
+        current.value = seed
+        rng = np.random.default_rng(seed)
+        if rng.random() < 0.02:
+            read_map(rng)
+        else:
+            call_function(rng)
+    else:
+        seed += 1
+    print(f"{seed - first} calls, seeds {first} to {seed - 1}: no failure")
+
+
+def main() -> int:
+    """Entry point; 1 where a call failed."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--seconds", type=float, default=30, help="time to spend (default: 30)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first call (default: 0)")
+    parser.add_argument("--calls", type=int, default=10**9, help="number of calls, at most")
+    options = parser.parse_args()
+    missing = {name for name in dir(_native) if not name.startswith("_")} - {"backends", *FUNCTIONS}
+    if missing:
+        print(f"{', '.join(sorted(missing))}: no entry in FUNCTIONS of {Path(__file__).name}")
+        return 1
+    context = multiprocessing.get_context("fork")
+    current = context.Value("Q", options.seed, lock=False)
+    child = context.Process(target=work, args=(options.seed, options.calls, options.seconds, current))
+    child.start()
+    # A call that hangs holds the process longer than any of them takes.
+    child.join(options.seconds + 60)
+    if child.is_alive():
+        child.kill()
+        child.join()
+    if child.exitcode:
+        seed = current.value
+        print(f"seed {seed} failed (exit code {child.exitcode}); repeat it with --seed {seed} --calls 1")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,296 @@
+"""Kills, signals and full disks: what is finished is kept, and the run that follows completes the work."""
+
+import importlib
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from conftest import keep_images
+
+NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+
+
+def start(*arguments: object) -> "subprocess.Popen[str]":
+    command = [sys.executable, "-m", "colmap_sph", "run", *map(str, arguments), "--threads", "2"]
+    return started(command)
+
+
+def started(command: list[str]) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        command,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        # The tests themselves may run in the background of a shell that has SIGINT ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+
+
+def maps(dense: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(dense)): path.read_bytes() for path in dense.glob("stereo/*_maps/*.bin")}
+
+
+def wait_for(process: "subprocess.Popen[str]", pattern: str, folder: Path, number: int = 1) -> None:
+    """Wait until that many files are there; the process must not end before."""
+    limit = time.monotonic() + 60
+    while len(list(folder.glob(pattern))) < number:
+        assert process.poll() is None, process.communicate()[0]
+        assert time.monotonic() < limit
+        time.sleep(0.005)
+
+
+# ---- kills -------------------------------------------------------------------------------------------------
+
+
+def test_kills_cost_only_the_work_in_flight(
+    project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    script = importlib.import_module("check_interruptions")
+    keep_images(project, NAMES)
+    check = script.Check(project / "out", model=project / "sparse/0", kills=4, seed=3)
+    assert script.main(check) == 0
+    assert "4 kills, 0 files made again or different" in capsys.readouterr().out
+    assert len(maps(project / "out/whole")) == 4 * len(NAMES)
+
+
+def test_the_check_of_kills_finds_faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work that was done again, a map that differs, a map that is missing, a leftover."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    script = importlib.import_module("check_interruptions")
+    for root in ("killed", "whole"):
+        for folder in ("depth_maps", "normal_maps"):
+            path = tmp_path / root / "stereo" / folder / "cam" / "a.jpg.geometric.bin"
+            path.parent.mkdir(parents=True)
+            path.write_bytes(b"1")
+    killed, whole = tmp_path / "killed", tmp_path / "whole"
+    files = {
+        "pairs/1-2.npz": "pairs",
+        "photometric/cam/a.jpg.npz": "votes",
+        "state/cam/a.jpg.geometric.json": None,
+    }
+    for name in files:
+        (killed / "colmap_sph" / name).parent.mkdir(parents=True, exist_ok=True)
+        (killed / "colmap_sph" / name).write_bytes(b"1")
+    finished = script.finished_files(killed)
+    kill = script.judge(1.0, finished, killed, whole)
+    assert kill.finished == {"pairs": 1, "votes": 1, "maps": 2, "cloud": 0}
+    assert (kill.remade, kill.different) == (0, 0)
+    os.utime(killed / "colmap_sph/pairs/1-2.npz", ns=(5, 5))
+    (killed / "stereo/normal_maps/cam/a.jpg.geometric.bin").write_bytes(b"2")
+    (killed / "stereo/depth_maps/cam/a.jpg.geometric.bin").unlink()
+    (killed / "stereo/.1-2.tmp").touch()
+    kill = script.judge(1.0, finished, killed, whole)
+    assert kill.remade == 3
+    assert kill.different == 3
+
+
+# ---- signals -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("moment", "number", "code"),
+    [
+        ("colmap_sph/pairs/*.npz", *STOPS[0]),
+        ("stereo/depth_maps/*.photometric.bin", *STOPS[1]),
+        ("stereo/depth_maps/*.geometric.bin", *STOPS[0]),
+    ],
+)
+def test_signals_stop_a_run_which_then_goes_on(
+    number: signal.Signals, code: int, moment: str, project: Path
+) -> None:
+    dense = project / "dense"
+    with start("--model", project / "sparse/0") as process:
+        wait_for(process, moment, dense, 2)
+        before = time.monotonic()
+        process.send_signal(number)
+        said, _ = process.communicate()
+        assert time.monotonic() - before < 2
+    assert process.returncode == code
+    assert "Traceback" not in said
+    assert said.splitlines()[-1].startswith("interrupted; what is finished is kept")
+    assert not (dense / "fused.ply").exists()
+    assert not list(dense.rglob(".*.tmp"))
+    kept = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.npz")}
+    assert len(kept) >= 2
+    with start("--model", project / "sparse/0") as process:
+        said, _ = process.communicate()
+    assert process.returncode == 0, said
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+    assert (dense / "fused.ply.vis").exists()
+    log = (dense / "colmap_sph/log.txt").read_text()
+    assert "Interrupted" in log
+    assert "Traceback" not in log
+
+
+BUSY = """
+    import hashlib, sys, concurrent.futures
+    from colmap_sph.interruption import stop_on_signals
+
+    def long_work():  # in C, with the interpreter's lock released, for half a minute or more
+        hashlib.pbkdf2_hmac("sha256", b"", b"", 200_000_000)
+
+    with stop_on_signals(lambda stop: print("last words", stop.exit_code, flush=True)):
+        print("ready", flush=True)
+        if sys.argv[1] == "main":
+            long_work()
+        with concurrent.futures.ThreadPoolExecutor() as pool:
+            pool.submit(long_work).result()
+"""
+
+
+@pytest.mark.parametrize(("number", "code"), STOPS)
+@pytest.mark.parametrize("thread", ["main", "worker"])
+def test_signals_end_long_calls(number: signal.Signals, code: int, thread: str) -> None:
+    """What cannot be interrupted is ended with the process."""
+    with started([sys.executable, "-c", textwrap.dedent(BUSY), thread]) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(0.2)
+        before = time.monotonic()
+        process.send_signal(number)
+        said, _ = process.communicate()
+        assert time.monotonic() - before < 2
+    assert process.returncode == code
+    assert said == f"last words {code}\n"
+
+
+def test_signals_that_are_ignored_stay_ignored(project: Path) -> None:
+    """As a shell's background jobs and nohup want it."""
+    code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + textwrap.dedent("""
+        from colmap_sph.interruption import stop_on_signals
+        with stop_on_signals(print):
+            signal.raise_signal(signal.SIGINT)
+        print("went on")
+    """)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout) == (0, "went on\n"), done.stderr
+
+
+def test_interruption_while_the_program_loads() -> None:
+    code = textwrap.dedent("""
+        import signal, sys
+        class Late:
+            def find_spec(self, name, *_):
+                if name == "colmap_sph.cli":
+                    signal.raise_signal(signal.SIGINT)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        sys.meta_path.insert(0, Late())
+        from colmap_sph.__main__ import main
+        sys.exit(main())
+    """)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+
+
+# ---- full disks --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of 64 MiB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=64m", "tmpfs", str(folder)]
+    if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+        pytest.skip("this user may not mount a small file system (needs root)")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(block, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Finished workspace of four images."""
+    project = tmp_path_factory.mktemp("uninterrupted")
+    shutil.copytree(block.images_dir, project / "images")
+    shutil.copytree(block.root / "sparse", project / "sparse")
+    keep_images(project, NAMES)
+    with start("--model", project / "sparse/0") as process:
+        said, _ = process.communicate()
+    assert process.returncode == 0, said
+    return project / "dense"
+
+
+def size_of(dense: Path, *patterns: str) -> int:
+    return sum(path.stat().st_size for pattern in patterns for path in dense.glob(pattern) if path.is_file())
+
+
+# What fits, as a part of what the stage writes, for each stage in its turn.
+WRITTEN = [
+    ("undistort", ["images/*", "sparse/*"]),
+    ("pairs", ["colmap_sph/pairs/*"]),
+    ("photometric maps", ["colmap_sph/photometric/*", "stereo/*/*.photometric.bin"]),
+    ("geometric maps", ["stereo/*/*.geometric.bin"]),
+    ("cloud", ["fused*"]),
+]
+
+
+@pytest.mark.parametrize("stage", range(len(WRITTEN)), ids=[name for name, _ in WRITTEN])
+def test_full_disk(stage: int, uninterrupted: Path, small_disk: Path) -> None:
+    """One sentence, nothing half-written, and the work goes on when there is space."""
+    model, dense = uninterrupted.parent / "sparse/0", small_disk / "dense"
+    fits = sum(size_of(uninterrupted, *patterns) for _, patterns in WRITTEN[:stage])
+    # Files take whole pages, and the state some more.
+    room = fits + size_of(uninterrupted, *WRITTEN[stage][1]) // 2 + 60 * 4096
+    ballast = small_disk / "ballast"
+    ballast.write_bytes(bytes(shutil.disk_usage(small_disk).free - room))
+    with start("--model", model, "--output", dense) as process:
+        said, _ = process.communicate()
+    assert process.returncode == 3, said
+    assert "Traceback" not in said
+    assert said.splitlines()[-1].startswith("error: ")
+    assert "free some space" in said or "No space left" in said
+    assert not list(small_disk.rglob("*.tmp"))
+    assert not (dense / "fused.ply").exists()
+    truth = maps(uninterrupted)
+    assert {name: content for name, content in maps(dense).items() if truth[name] != content} == {}
+    done = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.npz")}
+    assert len(done) >= [0, 1, 6, 10, 10][stage]
+    ballast.unlink()
+    with start("--model", model, "--output", dense) as process:
+        said, _ = process.communicate()
+    assert process.returncode == 0, said
+    assert maps(dense) == truth
+    assert {path: path.stat().st_mtime_ns for path in done} == done
+
+
+def test_read_only_disk(uninterrupted: Path, small_disk: Path) -> None:
+    dense = small_disk / "dense"
+    shutil.copytree(uninterrupted, dense)
+    subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
+    for more in ([], ["--overwrite"], ["--normals.radius", "3"]):
+        with start("--workspace", dense, *more) as process:
+            said, _ = process.communicate()
+        assert process.returncode == 3, said
+        assert "Read-only file system" in said.splitlines()[-1]
+        assert "Traceback" not in said
+    assert maps(dense) == maps(uninterrupted)
+
+
+def test_files_that_may_not_grow(uninterrupted: Path, tmp_path: Path) -> None:
+    """A limit on the size of a file, which the normal maps exceed, for those who cannot mount a full disk."""
+    model, dense = uninterrupted.parent / "sparse/0", tmp_path / "dense"
+    command = [sys.executable, "-m", "colmap_sph", "run", "--model", str(model), "--output", str(dense)]
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (800_000, 800_000))
+
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit)
+    assert done.returncode == 3, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "normal_maps" in done.stderr.splitlines()[-1]
+    assert "File too large" in done.stderr.splitlines()[-1]
+    assert not list(dense.rglob("*.tmp"))
+    assert not list(dense.glob("stereo/normal_maps/*.bin"))
+    assert subprocess.run(command, capture_output=True).returncode == 0
+    assert maps(dense) == maps(uninterrupted)

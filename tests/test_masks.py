@@ -1,0 +1,257 @@
+"""Masks: undistorted exactly as the images, and what they ignore appears neither in maps nor in the cloud."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from conftest import keep_images
+from PIL import Image
+from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
+
+import colmap_sph
+from colmap_sph import cli
+from colmap_sph.errors import InputError
+from colmap_sph.evaluation import compare_depth_map, read_geometry
+from colmap_sph.masks import read_mask, undistort_mask
+from colmap_sph.options import RunOptions
+from colmap_sph.pairs import PairOptions
+from colmap_sph.synthetic import Camera, DemoBlock
+from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.workspace import Workspace, read_depth_map, read_normal_map
+
+NADIR = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
+OPTIONS = RunOptions(threads=1, pairs=PairOptions(num_pairs=2))
+DISTORTION = (0.1, 0.02, 2e-3, -1e-3)
+
+
+def blobs(seed: int, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    """A mask of random blobs, half of it black."""
+    noise = np.random.default_rng(seed).standard_normal((height, width))
+    return np.where(cv2.GaussianBlur(noise, (0, 0), 3) > 0, 255, 0).astype(np.uint8)
+
+
+def write_masks(folder: Path, names: list[str], height: int = HEIGHT, width: int = WIDTH) -> None:
+    for seed, name in enumerate(names):
+        path = folder / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(path), blobs(seed, height, width))
+
+
+# ---- undistortion ------------------------------------------------------------------------------------------
+
+
+def test_undistorted_mask_is_exact(tmp_path: Path) -> None:
+    """White where all four original pixels around an undistorted pixel's centre are there and white."""
+    camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", 90.0, WIDTH, HEIGHT)
+    camera.params = [90.0, 91.0, WIDTH / 2, HEIGHT / 2, *DISTORTION]
+    mask, options = blobs(5), pycolmap.UndistortCameraOptions()
+    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    undistort_mask(tmp_path / "mask.png", camera, options, tmp_path / "sub" / "out.png")
+    found = cv2.imread(str(tmp_path / "sub" / "out.png"), cv2.IMREAD_UNCHANGED)
+    pinhole = pycolmap.undistort_camera(options, camera)
+    assert found.shape == (pinhole.height, pinhole.width)
+    x, y = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
+    rays = pinhole.cam_from_img(np.stack([x.ravel(), y.ravel()], axis=1))
+    source = camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))])) - 0.5
+    low, share = np.floor(source).astype(int), source % 1
+    # Off the pixels' centres, and off the image's rim, where a weight of nothing decides.
+    certain = ((share > 0.01) & (share < 0.99)).all(axis=1)
+    inside = ((low >= 0) & (low < [WIDTH - 1, HEIGHT - 1])).all(axis=1)
+    column, row = np.clip(low, 0, [WIDTH - 2, HEIGHT - 2]).T
+    corners = [mask[row + dy, column + dx] for dy in (0, 1) for dx in (0, 1)]
+    expected = inside & (np.min(corners, axis=0) == 255)
+    assert certain.mean() > 0.85
+    assert 0.3 < expected.mean() < 0.7
+    np.testing.assert_array_equal((found.ravel() == 255)[certain], expected[certain])
+    assert set(np.unique(found)) == {0, 255}
+
+
+def test_masks_of_a_workspace(tmp_path: Path) -> None:
+    """In the geometry of the undistorted images, reduced with them, and only for images that have one."""
+    sparse = make_project(tmp_path, "OPENCV", DISTORTION)
+    masked = [NAMES[0], NAMES[2]]
+    for name in masked:
+        path = tmp_path / "masks" / f"{name}.png"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        mask[:, : WIDTH // 2] = 0
+        cv2.imwrite(str(path), mask)
+        image = np.full((HEIGHT, WIDTH, 3), 255, np.uint8)
+        image[:, : WIDTH // 2] = 0
+        cv2.imwrite(str(tmp_path / "images" / name), image)
+    for size in (-1, 48):
+        output = tmp_path / f"dense{size}"
+        workspace = prepare_workspace(sparse, None, output, UndistortionOptions(size), tmp_path / "masks")
+        found = sorted(str(path.relative_to(output / "masks")) for path in (output / "masks").rglob("*.png"))
+        assert found == [f"{name}.png" for name in masked]
+        for name in masked:
+            image = cv2.imread(str(workspace.image_path(name)), cv2.IMREAD_GRAYSCALE)
+            mask = cv2.imread(str(workspace.mask_path(name)), cv2.IMREAD_GRAYSCALE)
+            # The image is white where its mask is: the undistorted mask keeps what is purely white.
+            np.testing.assert_array_equal(mask == 255, image == 255)
+            assert 0.3 < np.mean(mask == 255) < 0.55
+
+
+def test_a_mask_undistorts_with_ideal_fisheyes(tmp_path: Path) -> None:
+    """COLMAP copies images of such cameras; ours are undistorted, and their masks with them."""
+    sparse = make_project(tmp_path, "OPENCV_FISHEYE", (0.0, 0.0, 0.0, 0.0))
+    write_masks(tmp_path / "masks", NAMES)
+    workspace = prepare_workspace(sparse, None, tmp_path / "dense", UndistortionOptions(), tmp_path / "masks")
+    for seed, name in enumerate(NAMES):
+        image = cv2.imread(str(workspace.image_path(name)), cv2.IMREAD_GRAYSCALE)
+        mask = cv2.imread(str(workspace.mask_path(name)), cv2.IMREAD_GRAYSCALE)
+        assert mask.shape == image.shape
+        assert not np.array_equal(mask, blobs(seed))
+
+
+def test_other_masks_are_another_workspace(tmp_path: Path) -> None:
+    sparse, options = make_project(tmp_path), UndistortionOptions()
+    write_masks(tmp_path / "masks", NAMES)
+    prepare_workspace(sparse, None, tmp_path / "dense", options, tmp_path / "masks")
+    prepare_workspace(sparse, None, tmp_path / "dense", options, tmp_path / "masks")
+    with pytest.raises(InputError, match="different masks"):
+        prepare_workspace(sparse, None, tmp_path / "dense", options)
+    (tmp_path / "masks" / f"{NAMES[0]}.png").unlink()
+    with pytest.raises(InputError, match="different masks"):
+        prepare_workspace(sparse, None, tmp_path / "dense", options, tmp_path / "masks")
+
+
+@pytest.mark.parametrize("kind", ["grey", "16 bits", "colour", "alpha", "palette"])
+def test_any_png_is_a_mask(tmp_path: Path, kind: str) -> None:
+    """What is not black counts, however dark."""
+    shape = {"colour": (4, 6, 3), "alpha": (4, 6, 4)}.get(kind, (4, 6))
+    mask = np.zeros(shape, np.uint16 if kind == "16 bits" else np.uint8)
+    mask[1:3, 2:5] = 2
+    if kind == "alpha":
+        mask[..., 3] = 255
+    if kind == "palette":
+        image = Image.fromarray(mask).convert("P")
+        image.save(tmp_path / "mask.png")
+    else:
+        cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    expected = np.zeros((4, 6), np.uint8)
+    expected[1:3, 2:5] = 255
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png", 6, 4), expected)
+    assert read_mask(tmp_path / "none.png", 6, 4) is None
+
+
+# ---- a run -------------------------------------------------------------------------------------------------
+
+
+def world_x(camera: Camera, depth: np.ndarray, origin: float) -> np.ndarray:
+    """World x of every pixel's exact surface point; `depth` is that at (col + origin, row + origin)."""
+    columns, rows = np.meshgrid(np.arange(camera.width) + origin, np.arange(camera.height) + origin)
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.K).T
+    return ((rays * depth[..., None] - camera.t) @ camera.R)[..., 0]
+
+
+def mask_the_east(block: DemoBlock, folder: Path, border: float) -> None:
+    """Masks which ignore all surface east of x = `border`, by exact depth; none for the last image."""
+    folder.mkdir()
+    for name in NADIR[:-1]:
+        camera = block.cameras[block.names.index(name)]
+        west = world_x(camera, block.truth(name)[0], 0.0) < border
+        # The truth is that of the pixels' corners: a pixel is ignored with any of its four.
+        west = cv2.erode(np.where(west, 255, 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+        assert cv2.imwrite(str(folder / f"{name}.png"), west)
+
+
+@pytest.mark.parametrize("from_workspace", [False, True], ids=["model", "workspace"])
+def test_what_is_masked_is_not_reconstructed(block: DemoBlock, project: Path, from_workspace: bool) -> None:
+    keep_images(project, NADIR)
+    middle = float(np.mean([c.centre[0] for n, c in zip(block.names, block.cameras, strict=True) if n in NADIR]))
+    mask_the_east(block, project / "masks", middle)
+    dense = project / "dense"
+    if from_workspace:
+        pycolmap.undistort_images(dense, project / "sparse" / "0", project / "images")
+        report = colmap_sph.run(workspace=dense, masks=project / "masks", options=OPTIONS)
+    else:
+        report = colmap_sph.run(project / "sparse" / "0", masks=project / "masks", options=OPTIONS)
+    assert report.images == len(NADIR)
+    workspace, gsd = Workspace(dense), block.gsd
+    for name in NADIR:
+        camera = block.cameras[block.names.index(name)]
+        truth = block.truth(name)[0]
+        for kind in ("photometric", "geometric"):
+            depth = read_depth_map(workspace.depth_map_path(name, kind))
+            if name in NADIR[:-1]:
+                mask = cv2.imread(str(project / "masks" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+                assert (mask == 0).mean() > 0.1
+                assert not depth[mask == 0].any()
+                assert not read_normal_map(workspace.normal_map_path(name, kind))[mask == 0].any()
+                assert (depth[mask > 0] > 0).mean() > 0.4
+            scores = compare_depth_map(depth, truth, gsd=truth / camera.K[0, 0])
+            assert scores.within[0] > 0.85, (name, kind)
+    # Its partners ignore the east: the image without a mask has nothing to compare its own with.
+    x = read_geometry(dense / "fused.ply").points[:, 0]
+    assert len(x) == report.points > 5000
+    assert np.mean(x > middle + 2 * gsd) < 1e-3
+    assert np.percentile(x, 99.5) > middle - 20 * gsd
+
+
+def test_a_black_mask_leaves_its_image_out(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keep_images(project, NADIR)
+    (project / "masks").mkdir()
+    cv2.imwrite(str(project / "masks" / f"{NADIR[0]}.png"), np.zeros((240, 320), np.uint8))
+    arguments = ["run", "--model", str(project / "sparse/0"), "--masks", str(project / "masks")]
+    assert cli.main([*arguments, "--threads", "1"]) == cli.PARTIAL_EXIT_CODE
+    assert f"image skipped: {NADIR[0]}: " in capsys.readouterr().err
+    depth = read_depth_map(Workspace(project / "dense").depth_map_path(NADIR[0], "photometric"))
+    assert not depth.any()
+
+
+def spoil_nothing(folder: Path) -> None:
+    shutil.rmtree(folder)
+
+
+def spoil_names(folder: Path) -> None:
+    for path in folder.iterdir():
+        path.rename(path.with_name(path.name.replace(".jpg.png", ".png")))
+
+
+def spoil_size(folder: Path) -> None:
+    cv2.imwrite(str(folder / f"{NADIR[1]}.png"), np.zeros((320, 240), np.uint8))
+
+
+def spoil_content(folder: Path) -> None:
+    (folder / f"{NADIR[1]}.png").write_bytes(b"\x89PNG\r\n\x1a\n no mask")
+
+
+def spoil_kind(folder: Path) -> None:
+    (folder / f"{NADIR[1]}.png").unlink()
+    (folder / f"{NADIR[1]}.png").mkdir()
+
+
+@pytest.mark.parametrize("from_workspace", [False, True], ids=["model", "workspace"])
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (spoil_nothing, "does not exist; check --masks"),
+        (spoil_names, f"that of {NADIR[0]} must be "),
+        (spoil_size, "has 240 x 320 pixels, but its image 320 x 240"),
+        (spoil_content, f"{NADIR[1]}.png cannot be read as an image"),
+        (spoil_kind, f"{NADIR[1]}.png cannot be read as an image"),
+    ],
+)
+def test_masks_that_cannot_be_used(
+    spoil, words: str, from_workspace: bool, project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One sentence, before anything is written."""
+    keep_images(project, NADIR)
+    write_masks(project / "masks", NADIR, 240, 320)
+    spoil(project / "masks")
+    dense = project / "dense"
+    arguments = ["--model", str(project / "sparse" / "0")]
+    if from_workspace:
+        pycolmap.undistort_images(dense, project / "sparse" / "0", project / "images")
+        arguments = ["--workspace", str(dense)]
+    before = sorted(project.rglob("*"))
+    assert cli.main(["run", *arguments, "--masks", str(project / "masks")]) == 2
+    output = capsys.readouterr().err
+    assert words in output
+    assert output.count("error: ") == 1
+    assert "Traceback" not in output
+    assert sorted(project.rglob("*")) == before

@@ -1,0 +1,551 @@
+"""A second run redoes what is missing or would differ, nothing else; damage and failures cost what they hit."""
+
+import json
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from conftest import keep_images
+
+import colmap_sph
+from colmap_sph import stages
+from colmap_sph.claim import claimed
+from colmap_sph.depth import DepthOptions
+from colmap_sph.errors import InputError, NoResultError, OutputError
+from colmap_sph.fusion import FusionOptions
+from colmap_sph.keys import Keys
+from colmap_sph.matching import MatchingOptions
+from colmap_sph.normals import NormalOptions
+from colmap_sph.options import RunOptions
+from colmap_sph.pairs import PairOptions, select_pairs
+from colmap_sph.plan import make_plan
+from colmap_sph.rectification import RectificationOptions
+from colmap_sph.report import RunReport
+from colmap_sph.scene import read_scene
+from colmap_sph.synthetic import DemoBlock
+from colmap_sph.undistortion import UndistortionOptions
+from colmap_sph.workspace import Workspace
+
+# Four images of one strip, and the pairs among them: all six.
+NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
+OPTIONS = RunOptions(threads=2)
+NOTHING = {"match pairs": 0, "estimate depth": 0, "check consistency": 0, "fuse": 0}
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A finished run on four images, and its report."""
+
+    project: Path
+    report: RunReport
+
+    @property
+    def dense(self) -> Path:
+        return self.project / "dense"
+
+    @property
+    def ids(self) -> dict[str, int]:
+        return {view.name: view.image_id for view in read_scene(self.dense / "sparse").views}
+
+    def rerun(self, **changes: object) -> RunReport:
+        return colmap_sph.run(self.project / "sparse/0", options=replace(OPTIONS, **changes))
+
+
+@pytest.fixture(scope="module")
+def pristine(block: DemoBlock, tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """Not to be changed."""
+    project = tmp_path_factory.mktemp("resume")
+    shutil.copytree(block.images_dir, project / "images")
+    shutil.copytree(block.root / "sparse", project / "sparse")
+    keep_images(project, NAMES)
+    return Finished(project, colmap_sph.run(project / "sparse/0", options=OPTIONS))
+
+
+@pytest.fixture
+def finished(pristine: Finished, tmp_path: Path) -> Iterator[Finished]:
+    """A copy to do with as a test likes."""
+    shutil.copytree(pristine.project, tmp_path / "project", symlinks=True)
+    yield Finished(tmp_path / "project", pristine.report)
+
+
+def results(dense: Path) -> dict[str, tuple[int, bytes]]:
+    """Time stamp and content of everything that a stage wrote, but for the cloud's and the maps' records."""
+    files = [*dense.glob("stereo/*_maps/*.bin"), *dense.glob("fused*")]
+    files += [*dense.glob("colmap_sph/pairs/*"), *dense.glob("colmap_sph/photometric/*")]
+    assert len(files) == 4 * 4 + 2 + 6 + 4
+    return {str(path.relative_to(dense)): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
+
+
+def rewritten(before: dict[str, tuple[int, bytes]], dense: Path) -> set[str]:
+    after = results(dense)
+    return {name for name in before if after[name][0] != before[name][0]}
+
+
+def expected_files(*, pairs: int, votes: int, photometric: int, geometric: int, cloud: bool) -> dict[str, int]:
+    return {
+        "pairs": pairs,
+        "votes": votes,
+        "photometric maps": 2 * photometric,
+        "geometric maps": 2 * geometric,
+        "cloud": 2 * cloud,
+    }
+
+
+def counted(files: set[str]) -> dict[str, int]:
+    return {
+        "pairs": sum(name.startswith("colmap_sph/pairs/") for name in files),
+        "votes": sum(name.startswith("colmap_sph/photometric/") for name in files),
+        "photometric maps": sum(name.endswith(".photometric.bin") for name in files),
+        "geometric maps": sum(name.endswith(".geometric.bin") for name in files),
+        "cloud": sum(name.startswith("fused") for name in files),
+    }
+
+
+# ---- nothing changed ---------------------------------------------------------------------------------------
+
+
+def test_a_second_run_redoes_nothing(finished: Finished) -> None:
+    first, before = finished.report, results(finished.dense)
+    assert first.made == {"match pairs": 6, "estimate depth": 4, "check consistency": 4, "fuse": 1}
+    assert first.reused == NOTHING
+    second = finished.rerun()
+    assert second.made == NOTHING
+    assert second.reused == first.made
+    assert rewritten(before, finished.dense) == set()
+    for fact in ("images", "coverage", "points", "advice", "pairs", "skipped_images", "skipped_pairs"):
+        assert getattr(second, fact) == getattr(first, fact), fact
+
+
+def test_time_stamps_threads_and_place_do_not_matter(finished: Finished) -> None:
+    """A workspace that was copied elsewhere, without its time stamps, is as good."""
+    moved = finished.project.with_name("moved")
+    shutil.copytree(finished.dense, moved, copy_function=shutil.copyfile)
+    report = colmap_sph.run(workspace=moved, options=replace(OPTIONS, threads=1))
+    assert report.made == NOTHING
+
+
+# ---- options and inputs that changed -----------------------------------------------------------------------
+
+EVERYTHING = expected_files(pairs=6, votes=4, photometric=4, geometric=4, cloud=True)
+CHANGES = {
+    "matching": ({"matching": MatchingOptions(p1=12)}, EVERYTHING),
+    "rectification": ({"rectification": RectificationOptions(near_margin=2.2)}, EVERYTHING),
+    "depth": (
+        {"depth": DepthOptions(vote_tolerance=2.5)},
+        expected_files(pairs=0, votes=4, photometric=4, geometric=4, cloud=True),
+    ),
+    "consistency": (
+        {"depth": DepthOptions(max_contradiction=0.5)},
+        expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
+    ),
+    "normals": (
+        {"normals": NormalOptions(radius=3)},
+        expected_files(pairs=0, votes=0, photometric=4, geometric=4, cloud=True),
+    ),
+    "fusion": (
+        {"fusion": FusionOptions(max_reproj_error=0.7)},
+        expected_files(pairs=0, votes=0, photometric=0, geometric=0, cloud=True),
+    ),
+    "fusion input": (
+        {"fusion_input": "photometric"},
+        expected_files(pairs=0, votes=0, photometric=0, geometric=0, cloud=True),
+    ),
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+def test_changed_options_redo_what_depends_on_them(what: str, finished: Finished) -> None:
+    changes, expected = CHANGES[what]
+    plan = make_plan(finished.project / "sparse/0", options=replace(OPTIONS, **changes))
+    before = results(finished.dense)
+    report = finished.rerun(**changes)
+    assert counted(rewritten(before, finished.dense)) == expected
+    assert (plan.pairs - plan.pairs_done, plan.fuse) == (report.made["match pairs"], bool(report.made["fuse"]))
+    assert plan.images - plan.images_done == report.made["check consistency"]
+    # And back: the same files again, made anew; the cloud's order of points varies with threads.
+    finished.rerun()
+    after = results(finished.dense)
+    assert {name for name in before if after[name][1] != before[name][1] and "fused" not in name} == set()
+
+
+def test_fewer_pairs_keep_their_disparity_maps(finished: Finished) -> None:
+    fewer = PairOptions(num_pairs=1)
+    left = select_pairs(read_scene(finished.dense / "sparse"), fewer).unique_pairs()
+    report = finished.rerun(pairs=fewer)
+    assert (report.made["match pairs"], report.reused["match pairs"]) == (0, len(left))
+    assert len(left) < 6
+    # An image that keeps its three partners keeps its votes.
+    lost = [name for name in NAMES if sum(name in pair for pair in left) < 3]
+    assert report.made["estimate depth"] == len(lost) > 0
+    assert finished.rerun().made["match pairs"] == 0
+
+
+def test_a_changed_image_redoes_its_pairs(finished: Finished) -> None:
+    before = results(finished.dense)
+    path = finished.dense / "images" / NAMES[0]
+    image = cv2.imread(str(path))
+    assert cv2.imwrite(str(path), cv2.add(image, 3))
+    finished.rerun()
+    files = rewritten(before, finished.dense)
+    number = f"{finished.ids[NAMES[0]]:06d}"
+    assert {name for name in files if "pairs/" in name} == {
+        name for name in before if "pairs/" in name and number in name
+    }
+    assert counted(files) == expected_files(pairs=3, votes=4, photometric=4, geometric=4, cloud=True)
+
+
+def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> None:
+    """As a changed image does; and without it everything is as before."""
+    masks, number = finished.project / "masks", f"{finished.ids[NAMES[0]]:06d}"
+    masks.mkdir()
+    mask = np.full((240, 320), 255, np.uint8)
+    before = results(finished.dense)
+
+    def rerun(*, given: bool = True) -> RunReport:
+        cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
+        plan = make_plan(workspace=finished.dense, masks=masks if given else None, options=OPTIONS)
+        report = colmap_sph.run(workspace=finished.dense, masks=masks if given else None, options=OPTIONS)
+        assert plan.pairs - plan.pairs_done == report.made["match pairs"]
+        return report
+
+    for columns in (100, 200):
+        state = results(finished.dense)
+        mask[:, :columns] = 0
+        assert rerun().made == {"match pairs": 3, "estimate depth": 4, "check consistency": 4, "fuse": 1}
+        assert all(number in name for name in rewritten(state, finished.dense) if "pairs/" in name)
+        assert rerun().made == NOTHING
+    assert rerun(given=False).made["match pairs"] == 3
+    after = results(finished.dense)
+    assert {name for name in before if after[name][1] != before[name][1] and "fused" not in name} == set()
+
+
+def test_the_cloud_depends_on_the_origin(finished: Finished) -> None:
+    keys = Keys(Workspace(finished.dense), OPTIONS)
+    near, far = (keys.cloud({}, {}, np.full(3, height)) for height in (0.0, 1e6))
+    assert near != far == keys.cloud({}, {}, np.full(3, 1e6))
+
+
+def test_a_changed_mask_redoes_the_cloud(finished: Finished) -> None:
+    masks = finished.project / "masks"
+    masks.mkdir()
+    mask = np.full((240, 320), 255, np.uint8)
+    options = {"fusion": FusionOptions(mask_path=masks)}
+    cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
+    first = finished.rerun(**options)
+    mask[:, :160] = 0
+    cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
+    second = finished.rerun(**options)
+    assert second.made == NOTHING | {"fuse": 1}
+    assert second.points < first.points
+
+
+def test_a_changed_program_redoes_everything(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("colmap_sph.keys.program_digest", lambda: "of another version")
+    assert finished.rerun().made == finished.report.made
+
+
+# ---- files that were damaged -------------------------------------------------------------------------------
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def empty(path: Path) -> None:
+    path.write_bytes(b"")
+
+
+def remove(path: Path) -> None:
+    path.unlink()
+
+
+def garble(path: Path) -> None:
+    path.write_bytes(np.random.default_rng(0).bytes(path.stat().st_size))
+
+
+def alter(path: Path) -> None:
+    """One byte in the middle: in a state file, one that changes what it says."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+DAMAGED = {
+    "disparity map": ("colmap_sph/pairs/*.npz", {"match pairs": 1}),
+    "estimate": ("colmap_sph/photometric/*.npz", {"estimate depth": 1}),
+    "photometric map": ("stereo/depth_maps/*.photometric.bin", {"estimate depth": 1}),
+    "geometric map": ("stereo/normal_maps/*.geometric.bin", {"check consistency": 1}),
+    "cloud": ("fused.ply", {"fuse": 1}),
+    "visibility": ("fused.ply.vis", {"fuse": 1}),
+    "record of maps": ("colmap_sph/state/*.geometric.json", {"check consistency": 1}),
+    "record of the cloud": ("colmap_sph/cloud.json", {"fuse": 1}),
+}
+
+
+@pytest.mark.parametrize("damage", [cut, empty, remove, garble])
+@pytest.mark.parametrize("what", DAMAGED)
+def test_what_is_damaged_is_made_again(what: str, damage: Callable[[Path], None], finished: Finished) -> None:
+    pattern, made = DAMAGED[what]
+    before = results(finished.dense)
+    damage(sorted(finished.dense.glob(pattern))[0])
+    report = finished.rerun()
+    assert report.made == NOTHING | made
+    assert report.skipped_images == {}
+    after = results(finished.dense)
+    assert {name for name in before if after[name][1] != before[name][1] and "fused" not in name} == set()
+
+
+def test_a_record_with_one_altered_byte_does_not_vouch(finished: Finished) -> None:
+    alter(finished.dense / "colmap_sph/cloud.json")
+    assert finished.rerun().made == NOTHING | {"fuse": 1}
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", "7", "null", "{}", '{"check": 1}', '{"check": "", "key": 1, "facts": 2}', "[" * 100_000]
+)
+def test_json_of_other_content_does_not_vouch(content: str, finished: Finished) -> None:
+    (finished.dense / "colmap_sph/cloud.json").write_text(content)
+    assert finished.rerun().made == NOTHING | {"fuse": 1}
+
+
+def spoil_disparities(path: Path) -> None:
+    """Damage the content of an archive, but leave its key and its directory as they are."""
+    with zipfile.ZipFile(path) as archive:
+        info = archive.getinfo("codes.npy")
+    data = bytearray(path.read_bytes())
+    middle = info.header_offset + info.file_size // 2
+    data[middle : middle + 100] = bytes(100 * [0xA5])
+    path.write_bytes(data)
+
+
+def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Finished) -> None:
+    ids = finished.ids
+    path = finished.dense / f"colmap_sph/pairs/{ids[NAMES[0]]:06d}-{ids[NAMES[1]]:06d}.npz"
+    spoil_disparities(path)
+    changed = {"depth": DepthOptions(vote_tolerance=2.5)}
+    report = finished.rerun(**changed)
+    # Whichever of the two read it first removed it; the other finds it missing.
+    assert sorted(report.skipped_images) == NAMES[:2]
+    assert all(path.name in reason for reason in report.skipped_images.values())
+    assert report.images == 2
+    assert (finished.dense / "stereo/fusion.cfg").read_text().split() == NAMES[2:]
+    again = finished.rerun(**changed)
+    assert again.skipped_images == {}
+    assert again.made["match pairs"] == 1
+    assert again.images == 4
+
+
+# ---- failures of single items ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("stage", ["match_pair", "estimate_depth", "check_depth", "fit_normals"])
+def test_memory_refused_once(stage: str, finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One item fails, the rest goes on, and the next run completes the work."""
+    original, calls = getattr(stages, stage), []
+
+    def refused_first(*arguments: object) -> object:
+        calls.append(stage)
+        if len(calls) == 1:
+            np.empty(1 << 60, np.uint8)
+        return original(*arguments)
+
+    monkeypatch.setattr(stages, stage, refused_first)
+    changes = {"matching": MatchingOptions(p1=12)}
+    report = colmap_sph.run(finished.project / "sparse/0", options=replace(OPTIONS, threads=1, **changes))
+    failed = report.skipped_pairs if stage == "match_pair" else report.skipped_images
+    assert len(failed) == 1
+    assert "not enough memory" in next(iter(failed.values()))
+    assert len(report.skipped_pairs) + len(report.skipped_images) == 1
+    monkeypatch.undo()
+    again = finished.rerun(**changes)
+    assert again.images == 4
+    assert again.skipped_pairs == again.skipped_images == {}
+    assert again.made["match pairs"] == (1 if stage == "match_pair" else 0)
+
+
+def test_memory_refused_for_all(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(stages, "estimate_depth", refused)
+    with pytest.raises(NoResultError, match="not enough memory"):
+        finished.rerun(depth=DepthOptions(vote_tolerance=2.5))
+
+
+# ---- starting afresh ---------------------------------------------------------------------------------------
+
+
+def overwrite(finished: Finished) -> RunReport:
+    return colmap_sph.run(finished.project / "sparse/0", options=OPTIONS, overwrite=True)
+
+
+def test_overwrite_does_everything_again(finished: Finished) -> None:
+    before = results(finished.dense)
+    mesh = finished.dense / "meshed.ply"
+    mesh.write_text("of the user")
+    assert overwrite(finished).made == finished.report.made
+    assert len(rewritten(before, finished.dense)) == len(before)
+    assert mesh.read_text() == "of the user"
+
+
+def test_overwrite_takes_other_undistortion_options(finished: Finished) -> None:
+    smaller = replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=200))
+    with pytest.raises(InputError, match=r"different options; .*--overwrite"):
+        colmap_sph.run(finished.project / "sparse/0", options=smaller)
+    colmap_sph.run(finished.project / "sparse/0", options=smaller, overwrite=True)
+    assert {view.width for view in read_scene(finished.dense / "sparse").views} == {200}
+
+
+def test_overwrite_with_masks(finished: Finished) -> None:
+    """Undistorted masks go with the images, but not where someone has put a file among them."""
+    masks, model = finished.project / "masks", finished.project / "sparse/0"
+    masks.mkdir()
+    with pytest.raises(InputError, match="holds no mask for any image"):
+        colmap_sph.run(model, masks=masks, options=OPTIONS, overwrite=True)
+    assert colmap_sph.run(model, options=OPTIONS).made == NOTHING
+    mask = np.full((240, 320), 255, np.uint8)
+    mask[:, :100] = 0
+    cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
+    with pytest.raises(InputError, match=r"different masks; .*--overwrite"):
+        colmap_sph.run(model, masks=masks, options=OPTIONS)
+    assert make_plan(model, masks=masks, options=OPTIONS, overwrite=True).undistort
+    colmap_sph.run(model, masks=masks, options=OPTIONS, overwrite=True)
+    assert [path.name for path in (finished.dense / "masks").iterdir()] == [f"{NAMES[0]}.png"]
+    (finished.dense / "masks/mine.png").write_text("mine")
+    with pytest.raises(InputError, match=r"mine\.png was not made by this program"):
+        overwrite(finished)
+    (finished.dense / "masks/mine.png").unlink()
+    overwrite(finished)
+    assert not (finished.dense / "masks").exists()
+
+
+@pytest.mark.parametrize("place", ["images/mine.jpg", "stereo/depth_maps/notes.txt", "sparse/new/a.txt"])
+def test_overwrite_leaves_files_of_others(place: str, finished: Finished) -> None:
+    path = finished.dense / place
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("mine")
+    before = results(finished.dense)
+    with pytest.raises(InputError, match=path.name):
+        overwrite(finished)
+    assert rewritten(before, finished.dense) == set()
+    assert path.read_text() == "mine"
+
+
+def test_overwrite_leaves_linked_images(finished: Finished) -> None:
+    """Someone has moved the images to another disk."""
+    elsewhere = finished.project / "elsewhere"
+    (finished.dense / "images").rename(elsewhere)
+    (finished.dense / "images").symlink_to(elsewhere)
+    with pytest.raises(InputError, match="images was not made by this program"):
+        overwrite(finished)
+    assert len(list(elsewhere.iterdir())) == 4
+
+
+def test_overwrite_leaves_workspaces_of_others(finished: Finished) -> None:
+    (finished.dense / "colmap_sph/undistortion.json").unlink()
+    before = results(finished.dense)
+    with pytest.raises(InputError, match="which this program did not make"):
+        overwrite(finished)
+    assert rewritten(before, finished.dense) == set()
+
+
+def test_overwrite_of_a_given_workspace_keeps_its_images(finished: Finished) -> None:
+    def given() -> dict[Path, tuple[int, int]]:
+        files = [*finished.dense.glob("images/*"), *finished.dense.glob("sparse/*")]
+        return {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
+
+    images_and_model = given()
+    before = results(finished.dense)
+    report = colmap_sph.run(workspace=finished.dense, options=OPTIONS, overwrite=True)
+    assert report.made == finished.report.made
+    assert len(rewritten(before, finished.dense)) == len(before)
+    assert given() == images_and_model
+
+
+def test_overwrite_where_nothing_is(project: Path) -> None:
+    keep_images(project, NAMES[:2])
+    assert colmap_sph.run(project / "sparse/0", options=OPTIONS, overwrite=True).images == 2
+
+
+# ---- what a killed run leaves, and a running one -----------------------------------------------------------
+
+
+def test_leftovers_of_killed_runs_are_removed(finished: Finished) -> None:
+    leftovers = [
+        finished.dense / "stereo/depth_maps/.123-4567.tmp",
+        finished.dense / "colmap_sph/.99-1.tmp",
+        finished.dense / "colmap_sph/pairs/.99-140001.tmp",
+        finished.dense / "colmap_sph/fusion/fused.ply",
+    ]
+    mine = [finished.dense / "stereo/.mine.tmp", finished.dense / "stereo/depth_maps/1-2.tmp"]
+    (finished.dense / "colmap_sph/fusion").mkdir()
+    for path in [*leftovers, *mine]:
+        path.write_bytes(b"half")
+    assert finished.rerun().made == NOTHING
+    assert not any(path.exists() for path in leftovers)
+    assert all(path.exists() for path in mine)
+    assert not (finished.dense / "colmap_sph/fusion").exists()
+
+
+def test_two_runs_in_one_workspace(finished: Finished) -> None:
+    with claimed(Workspace(finished.dense)), pytest.raises(OutputError, match="Another run is at work"):
+        finished.rerun()
+    assert finished.rerun().made == NOTHING
+
+
+# ---- dry run -----------------------------------------------------------------------------------------------
+
+
+def test_plan_of_a_new_workspace(project: Path) -> None:
+    """Before undistortion: from the model's cameras, and nothing is written."""
+    keep_images(project, NAMES)
+    before = sorted(project.rglob("*"))
+    plan = make_plan(project / "sparse/0", options=OPTIONS)
+    assert sorted(project.rglob("*")) == before
+    assert plan.undistort and plan.fuse
+    assert (plan.pairs_done, plan.images_done) == (0, 0)
+    report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    assert (plan.pairs, plan.images, plan.pair_source) == (report.pairs, report.images, report.pair_source)
+    used = sum(path.stat().st_size for path in (project / "dense").rglob("*") if path.is_file())
+    assert 0.6 < plan.disk / used < 1.5
+    # The clock of a busy machine says little: only the order of magnitude.
+    assert 0.05 < plan.seconds / sum(report.seconds.values()) < 10
+
+
+def test_plan_of_reduced_images(project: Path) -> None:
+    keep_images(project, NAMES)
+    whole = make_plan(project / "sparse/0", options=OPTIONS)
+    half = make_plan(
+        project / "sparse/0", options=replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=160))
+    )
+    assert half.disk == pytest.approx(whole.disk / 4, rel=0.15)
+    assert half.pairs == whole.pairs
+
+
+def test_plan_of_a_finished_workspace(finished: Finished) -> None:
+    before, state = results(finished.dense), sorted(finished.dense.rglob("*"))
+    for arguments in ({"model": finished.project / "sparse/0"}, {"workspace": finished.dense}):
+        plan = make_plan(**arguments, options=OPTIONS)
+        assert not plan.undistort and not plan.fuse
+        assert plan.pairs == plan.pairs_done == 6
+        assert plan.images == plan.images_done == 4
+        assert plan.seconds == plan.disk == 0
+        fresh = make_plan(**arguments, options=OPTIONS, overwrite=True)
+        assert fresh.undistort == ("model" in arguments)
+        assert fresh.fuse and fresh.pairs_done == fresh.images_done == 0
+        assert fresh.disk > 1e7
+    assert rewritten(before, finished.dense) == set()
+    assert sorted(finished.dense.rglob("*")) == state
+
+
+def test_report_tells_what_was_done(finished: Finished) -> None:
+    finished.rerun(normals=NormalOptions(radius=3))
+    written = json.loads((finished.dense / "colmap_sph/report.json").read_text())
+    assert written["made"]["match pairs"] == 0
+    assert written["reused"]["match pairs"] == 6
+    assert written["made"]["fuse"] == 1
