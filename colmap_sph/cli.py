@@ -66,6 +66,8 @@ class RunCommand:
     """Existing dense workspace, instead of --model, --images and --output."""
     threads: int = 0
     """Worker threads; 0: all cores."""
+    memory: str = ""
+    """Memory to use at most, such as 6GiB. Default: a safe share of what is free."""
     fusion_input: MapKind = "geometric"
     """Maps to fuse: those confirmed by other views, or the unchecked ones."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False

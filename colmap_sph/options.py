@@ -8,6 +8,7 @@ from colmap_sph.errors import OptionError
 from colmap_sph.fusion import FusionOptions
 from colmap_sph.kernels import backend
 from colmap_sph.matching import MatchingOptions
+from colmap_sph.memory import budget, parse_memory
 from colmap_sph.normals import NormalOptions
 from colmap_sph.pairs import PairOptions
 from colmap_sph.rectification import RectificationOptions
@@ -21,6 +22,8 @@ class RunOptions:
 
     threads: int = 0
     """Worker threads; 0: as many as the process may use cores."""
+    memory: str = ""
+    """Memory the run may use, such as "6GiB"; empty: a safe share of what is free."""
     fusion_input: MapKind = "geometric"
     """Maps to fuse: "geometric" (confirmed by other views) or "photometric"."""
     undistortion: UndistortionOptions = field(default_factory=UndistortionOptions)
@@ -35,6 +38,7 @@ class RunOptions:
         """Raise `OptionError` for a value out of bounds, in any stage."""
         if not 0 <= self.threads <= 1024:
             raise OptionError(f"threads must lie in 0..1024, not {self.threads}.")
+        parse_memory(self.memory)
         if self.fusion_input not in ("geometric", "photometric"):
             raise OptionError(f"fusion_input must be 'geometric' or 'photometric', not {self.fusion_input!r}.")
         for stage in (
@@ -53,3 +57,8 @@ class RunOptions:
     def num_threads(self) -> int:
         """Worker threads to use."""
         return self.threads or len(os.sched_getaffinity(0))
+
+    @property
+    def memory_budget(self) -> int:
+        """Bytes of memory the run may use."""
+        return budget(parse_memory(self.memory))

@@ -20,6 +20,7 @@ from colmap_sph.pipeline import check_arguments, choose_pairs, find_database, wa
 from colmap_sph.rectification import rectify_pair
 from colmap_sph.scene import read_scene
 from colmap_sph.stages import (
+    FUSION_BYTES,
     Pair,
     PairState,
     check_state,
@@ -37,9 +38,9 @@ logger = logging.getLogger(__name__)
 # 0.1 to 0.4 megapixels, between which they differed by up to a third.
 _UNDISTORT_SECONDS = 0.12  # of the original image
 _MATCH_SECONDS = 0.14  # of both rectified images
-_VOTE_SECONDS = 0.13  # of the image, per pair
+_VOTE_SECONDS = 0.07  # of the image, per pair
 _CHECK_SECONDS = 0.05  # of the image, per partner
-_NORMALS_SECONDS = 1.4  # of the image, for each of its two kinds of maps
+_NORMALS_SECONDS = 0.25  # of the image, for each of its two kinds of maps
 _FUSE_SECONDS = 0.9
 # Bytes per pixel on disk, measured at the same time.
 _UNDISTORTED_BYTES = 1.0
@@ -50,8 +51,7 @@ _CLOUD_BYTES = 9.0
 # Bytes in memory: of the libraries, per left rectified pixel and worker, per pixel of all images in fusion, and
 # there, for a moment, per squared pixel of one image.
 _BASE_MEMORY = 200e6
-_MATCH_MEMORY = 100.0
-_FUSION_MEMORY = 30.0
+_MATCH_MEMORY = 170.0
 _FUSION_MASK_MEMORY = 0.1
 
 
@@ -234,9 +234,10 @@ def _survey_votes(context: Context, keys: Mapping[Pair, str], survey: _Survey) -
 def _memory(context: Context, survey: _Survey) -> float:
     matching = _MATCH_MEMORY * survey.largest_pair * min(context.options.num_threads, max(survey.pairs, 1))
     views, fusion, options = context.scene.views, 0.0, context.options.fusion
+    most = context.options.memory_budget
     if survey.fuse:
-        fusion = _FUSION_MEMORY * sum(view.width * view.height for view in views)
+        fusion = FUSION_BYTES * sum(view.width * view.height for view in views)
         if options.use_cache:
             fusion = min(fusion, options.cache_size * 1e9)
         fusion += _FUSION_MASK_MEMORY * max(view.width * view.height**2 for view in views)
-    return _BASE_MEMORY + max(matching, fusion)
+    return min(_BASE_MEMORY + max(matching, fusion), most)

@@ -22,6 +22,7 @@ from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.load_cache import LoadCache
 from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, Scratch, match_pair
+from colmap_sph.memory import MemoryGate, format_memory, resident
 from colmap_sph.normals import fit_normals
 from colmap_sph.pair_files import read_arrays, read_pair, stored_key, write_arrays, write_pair
 from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
@@ -43,6 +44,12 @@ Pair = tuple[str, str]
 # Fewer points than this share of the pixels with a geometric depth calls for an explanation.
 _FEW_POINTS = 0.02
 _CACHE_BYTES = 512 << 20
+# Scratch memory of a matching thread: more is no faster.
+_SCRATCH_BYTES = 256 << 20
+# Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
+# of a view while its depth is voted, without its pairs' maps, or checked; per pixel of all images in fusion.
+_MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 70.0, 65.0, 90.0
+FUSION_BYTES = 80.0
 
 
 # ---- matching ----------------------------------------------------------------------------------------------
@@ -72,9 +79,12 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
     """
     report = context.report
     make_dir(context.pairs_dir)
-    thread = threading.local()
-    images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
-    masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, _CACHE_BYTES)
+    thread, threads, total = threading.local(), context.options.num_threads, context.options.memory_budget
+    spare = max(total - resident(), 0)
+    scratch_bytes, cache_bytes = min(_SCRATCH_BYTES, spare // (3 * threads)), min(_CACHE_BYTES, spare // 12)
+    gate = MemoryGate(total, kept=threads * scratch_bytes + 2 * cache_bytes)
+    images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
+    masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, cache_bytes)
 
     def rectified(name: str, geometry: RectifiedPair, side: Side) -> RectifiedImage:
         view, mask = context.scene.view(name), masks.get(name)
@@ -86,16 +96,17 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
             return Done(state.key, made=False)
         geometry, (left, right) = state.geometry, pair
         if not hasattr(thread, "scratch"):
-            thread.scratch = Scratch()
-        disparity = match_pair(
-            rectified(left, geometry, "left"),
-            rectified(right, geometry, "right"),
-            geometry.min_disparity,
-            geometry.max_disparity,
-            context.options.matching,
-            thread.scratch,
-        )
-        write_pair(context.pair_path(*pair), PairDisparity(*pair, geometry, disparity), state.key)
+            thread.scratch = Scratch(scratch_bytes)
+        with gate.reserve(_MATCH_BYTES * geometry.height * geometry.left_width, f"the pair {left} - {right}"):
+            disparity = match_pair(
+                rectified(left, geometry, "left"),
+                rectified(right, geometry, "right"),
+                geometry.min_disparity,
+                geometry.max_disparity,
+                context.options.matching,
+                thread.scratch,
+            )
+            write_pair(context.pair_path(*pair), PairDisparity(*pair, geometry, disparity), state.key)
         return Done(state.key, made=True)
 
     def skip(pair: Pair, reason: str) -> None:
@@ -139,11 +150,16 @@ def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str,
     for view in context.scene.views:
         make_dir(context.estimate_path(view.name).parent)
 
+    gate = MemoryGate(context.options.memory_budget)
+
     def work(view: View) -> Done:
         state = vote_state(context, pair_keys, view)
         if not state.is_done:
-            estimate = _read_estimate(context, view.name) if state.is_voted else _vote(view, state.key)
-            _write_maps(context, view, estimate, "photometric", context.keys.photometric(state.key))
+            # A pair's file has two bytes per pixel, its map four.
+            maps = sum(2 * context.pair_path(*pair).stat().st_size for pair in _pairs_of(pair_keys, view.name))
+            with gate.reserve(maps + _VOTE_BYTES * view.width * view.height, view.name):
+                estimate = _read_estimate(context, view.name) if state.is_voted else _vote(view, state.key)
+                _write_maps(context, view, estimate, "photometric", context.keys.photometric(state.key))
         return Done(state.key, made=not state.is_done)
 
     def _vote(view: View, key: str) -> DepthEstimate:
@@ -184,16 +200,20 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
     `votes` are what `estimate_views` returned. Returns the keys of the maps by image name.
     """
     report, partners = context.report, partners_of(pairs)
-    estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, _CACHE_BYTES)
+    total = context.options.memory_budget
+    cache_bytes = min(_CACHE_BYTES, max(total - resident(), 0) // 3)
+    gate = MemoryGate(total, kept=cache_bytes)
+    estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, cache_bytes)
 
     def work(view: View) -> Done:
         names = [name for name in partners.get(view.name, []) if name in votes]
         state = check_state(context, names, votes, view)
         if state.coverage is not None:
             return Done(state.key, made=False, coverage=state.coverage)
-        others = ((context.scene.view(name), estimates.get(name)) for name in names)
-        checked = check_depth(view, estimates.get(view.name), others, context.options.depth)
-        coverage = _write_maps(context, view, checked, "geometric", state.key)
+        with gate.reserve(_CHECK_BYTES * view.width * view.height, view.name):
+            others = ((context.scene.view(name), estimates.get(name)) for name in names)
+            checked = check_depth(view, estimates.get(view.name), others, context.options.depth)
+            coverage = _write_maps(context, view, checked, "geometric", state.key)
         return Done(state.key, made=True, coverage=coverage)
 
     views = [view for view in context.scene.views if view.name in votes]
@@ -260,6 +280,7 @@ def fuse_views(context: Context, pairs: Iterable[Pair], maps: Mapping[str, str])
         facts = state.facts
         write_fusion_cfg(context.workspace.fusion_cfg_path, state.names)
         if facts is None:
+            _warn_of_memory(context, state.names)
             forget(context.cloud_record)
             points = fuse(
                 context.workspace,
@@ -287,6 +308,19 @@ def partners_of(pairs: Iterable[Pair]) -> dict[str, list[str]]:
 
 
 # ---- helpers -----------------------------------------------------------------------------------------------
+
+
+def _warn_of_memory(context: Context, names: Iterable[str]) -> None:
+    """COLMAP's fusion holds all maps at once; its cache bounds that, but makes it many times slower."""
+    total = context.options.memory_budget
+    needed = resident() + FUSION_BYTES * sum(v.width * v.height for v in map(context.scene.view, names))
+    if needed > total and not context.options.fusion.use_cache:
+        logger.warning(
+            "COLMAP's fusion will take about %s of memory, more than the %s allowed; "
+            "--fusion.use-cache True bounds it, but takes hours.",
+            format_memory(needed),
+            format_memory(total),
+        )
 
 
 def _advice(context: Context, points: int) -> str:
