@@ -30,6 +30,20 @@ def selection(
     offset: Array,
     /,
 ) -> None: ...
+def match(
+    backend: str,
+    reference: Array,
+    target: Array,
+    base: Array,
+    image: Array,
+    p1: int,
+    p2: Array,
+    max_slant: int,
+    max_difference: int,
+    scratch: Array,
+    offset: Array,
+    /,
+) -> None: ...
 def refine_offsets(backend: str, offset: Array, reference: Array, target: Array, refined: Array, /) -> None: ...
 def transfer_disparity(left: Array, max_step: float, right: Array, /) -> None: ...
 def depth_candidates(

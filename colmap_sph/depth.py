@@ -20,6 +20,9 @@ from colmap_sph.kernels import backend
 from colmap_sph.rectification import RectifiedPair, Side, rectified_ray_from_pixel
 from colmap_sph.scene import View
 
+# Candidates of all pairs are voted on in bands of rows of about this size.
+_BAND_BYTES = 8 << 20
+
 
 @dataclass(frozen=True)
 class DepthOptions:
@@ -114,7 +117,12 @@ def right_disparity(pair: PairDisparity, max_step: float) -> NDArray[np.float32]
 
 
 def depth_candidates(
-    view: View, disparity: NDArray[np.float32], geometry: RectifiedPair, side: Side, options: DepthOptions
+    view: View,
+    disparity: NDArray[np.float32],
+    geometry: RectifiedPair,
+    side: Side,
+    options: DepthOptions,
+    rows: slice = slice(None),
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Triangulate a pair's disparities along the rays of one of its images.
 
@@ -130,13 +138,16 @@ def depth_candidates(
     geometry : RectifiedPair
     side : {"left", "right"}
     options : DepthOptions
+    rows : slice, optional
+        Rows of the view to do, h of them.
 
     Returns
     -------
-    depth, sigma : (view.height, view.width) float32 ndarray
+    depth, sigma : (h, view.width) float32 ndarray
         z-depth and its standard deviation, model units; 0 = none.
     """
-    depth = np.empty((view.height, view.width), dtype=np.float32)
+    first, end, _ = rows.indices(view.height)
+    depth = np.empty((end - first, view.width), dtype=np.float32)
     sigma = np.empty_like(depth)
     _native.depth_candidates(
         backend(),
@@ -150,7 +161,7 @@ def depth_candidates(
         options.max_disparity_step,
         geometry.model == "spherical",
         side == "left",
-        0,
+        first,
         depth,
         sigma,
     )
@@ -171,23 +182,25 @@ def estimate_depth(view: View, pairs: Iterable[PairDisparity], options: DepthOpt
     -------
     DepthEstimate
     """
-    depths, sigmas = [], []
+    sources: list[tuple[NDArray[np.float32], RectifiedPair, Side]] = []
     for pair in pairs:
-        side: Side = "left" if pair.left == view.name else "right"
-        disparity = pair.disparity if side == "left" else right_disparity(pair, options.max_disparity_step)
-        depth, sigma = depth_candidates(view, disparity, pair.geometry, side, options)
-        depths.append(depth)
-        sigmas.append(sigma)
+        if pair.left == view.name:
+            sources.append((pair.disparity, pair.geometry, "left"))
+        else:
+            sources.append((right_disparity(pair, options.max_disparity_step), pair.geometry, "right"))
     shape = (view.height, view.width)
     voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
-    if depths:
+    step = max(_BAND_BYTES // (8 * view.width * max(len(sources), 1)), 1)
+    for first in range(0, view.height if sources else 0, step):
+        rows = slice(first, first + step)
+        candidates = [depth_candidates(view, *source, options, rows) for source in sources]
         _native.vote_depth(
-            np.stack(depths),
-            np.stack(sigmas),
+            np.stack([depth for depth, _ in candidates]),
+            np.stack([sigma for _, sigma in candidates]),
             options.vote_tolerance,
-            voted.depth,
-            voted.sigma,
-            voted.support,
+            voted.depth[rows],
+            voted.sigma[rows],
+            voted.support[rows],
         )
     voted.depth[voted.support < options.min_support] = 0
     return voted

@@ -25,6 +25,7 @@ _MAX_DEPTH = 1024
 # Within 3 x 3 pixels of a coarser level, offsets on one surface differ by no more (in pixels of the finer one).
 _MAX_SURFACE_STEP = 4
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
+_BYTES_PER_SLOT = 3  # of a level's cost and aggregated volumes
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,30 @@ class MatchingOptions:
                 raise OptionError(f"{name} must not be negative, not {getattr(self, name)}.")
 
 
+class Scratch:
+    """Working memory of one matching thread, kept from level to level and from pair to pair.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Levels that need more are worked in bands of rows, with the same result. One row is the least.
+    """
+
+    def __init__(self, max_bytes: int = 1 << 30) -> None:
+        self.max_bytes = max_bytes
+        self._memory = np.empty(0, dtype=np.uint8)
+
+    def volume(self, shape: tuple[int, ...], depth: int) -> NDArray[np.uint8]:
+        """(3, pixels, depth) uint8 array for an image or for as many of its rows as `max_bytes` allow."""
+        height, width = shape
+        rows = min(max(self.max_bytes // (_BYTES_PER_SLOT * width * depth), 1), height)
+        size = _BYTES_PER_SLOT * rows * width * depth
+        if size > self._memory.size:
+            self._memory = np.empty(0, dtype=np.uint8)  # the old one goes first
+            self._memory = np.empty(size, dtype=np.uint8)
+        return self._memory[:size].reshape(_BYTES_PER_SLOT, rows * width, depth)
+
+
 @dataclass(frozen=True, eq=False)
 class RectifiedImage:
     """One image of a rectified pair: (H, W) uint8 grey values, and 255 where they are image content."""
@@ -87,6 +112,7 @@ def match_pair(
     min_disparity: float,
     max_disparity: float,
     options: MatchingOptions,
+    scratch: Scratch | None = None,
 ) -> NDArray[np.float32]:
     """Match the left image of a rectified pair in the right one.
 
@@ -97,6 +123,8 @@ def match_pair(
     min_disparity, max_disparity : float
         Range to search, pixels; disparity = left column − right column.
     options : MatchingOptions
+    scratch : Scratch, optional
+        Working memory to use again.
 
     Returns
     -------
@@ -109,6 +137,7 @@ def match_pair(
     doi:10.1109/TPAMI.2007.1166. M. Rothermel et al., SURE: photogrammetric surface reconstruction from imagery,
     LC3D Workshop 2012.
     """
+    scratch = scratch or Scratch()
     least, most = int(np.floor(-max_disparity)) - 1, int(np.ceil(-min_disparity)) + 1
     levels = _num_levels(most - least, min(left.image.shape + right.image.shape), options)
     lefts, rights = _pyramid(left, levels), _pyramid(right, levels)
@@ -121,7 +150,7 @@ def match_pair(
         else:
             depth = min(depth, options.disparities if level == 0 else options.coarse_disparities)
             base = _propagate(offset, shape, depth, low, high, options)
-        offset = _match_level(lefts[level], rights[level], base, depth, options, refine=level == 0)
+        offset = _match_level(lefts[level], rights[level], base, depth, options, scratch, refine=level == 0)
         _remove_small_segments(offset, max(options.min_segment >> level, 4))
     assert offset is not None
     disparity = offset.astype(np.float32)
@@ -181,21 +210,26 @@ def _match_level(
     base: NDArray[np.int32],
     depth: int,
     options: MatchingOptions,
+    scratch: Scratch,
     *,
     refine: bool,
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest are refined from the raw costs."""
     kernels = backend()
-    height, width = left.image.shape
     left_census, right_census = _census(left), _census(right)
-    cost = np.empty((height, width, depth), dtype=np.uint8)
-    _native.matching_cost(kernels, left_census, right_census, base, cost)
-    aggregated = np.empty((height, width, depth), dtype=np.uint16)
-    image = np.ascontiguousarray(left.image)
-    _native.aggregation(kernels, cost, base, image, options.p1, _p2_table(options), options.max_slant, aggregated)
-    offset = np.empty((height, width), dtype=np.int32)
-    _native.selection(
-        kernels, aggregated, base, left_census, right_census, options.max_left_right_difference, offset
+    offset = np.empty(base.shape, dtype=np.int32)
+    _native.match(
+        kernels,
+        left_census,
+        right_census,
+        base,
+        np.ascontiguousarray(left.image),
+        options.p1,
+        _p2_table(options),
+        options.max_slant,
+        options.max_left_right_difference,
+        scratch.volume(base.shape, depth),
+        offset,
     )
     if not refine:
         return offset

@@ -31,6 +31,8 @@ _MIN_RANGE_POINTS = 8
 _SIDE_SAMPLES = 33
 # cv2.remap takes no more rows or columns.
 _MAX_SIDE = 32766
+# Images are resampled in bands of this many rows, which bounds the memory for their maps.
+_BAND_ROWS = 128
 
 
 @dataclass(frozen=True)
@@ -177,11 +179,15 @@ def resample(
     valid : (H, W) uint8 ndarray
         255 where the rectified pixel lies inside the image and no ignored pixel has a part in it, else 0.
     """
-    columns, rows, inside = _pixel_maps(view, pair, side)
-    if mask is not None:
-        inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
-    rectified = cv2.remap(image, columns, rows, interpolation, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(rectified, dtype=np.uint8), inside
+    rectified, valid = (np.empty((pair.height, pair.width(side)), dtype=np.uint8) for _ in range(2))
+    for first in range(0, pair.height, _BAND_ROWS):
+        band = slice(first, first + _BAND_ROWS)
+        columns, rows, inside = _pixel_maps(view, pair, side, band)
+        if mask is not None:
+            inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
+        valid[band] = inside
+        rectified[band] = cv2.remap(image, columns, rows, interpolation, borderMode=cv2.BORDER_REPLICATE)
+    return rectified, valid
 
 
 def pixel_from_rectified_ray(view: View, pair: RectifiedPair) -> Float:
@@ -447,15 +453,15 @@ def _checked_size(pair: RectifiedPair, left: View, right: View, options: Rectifi
 
 
 def _pixel_maps(
-    view: View, pair: RectifiedPair, side: Side
+    view: View, pair: RectifiedPair, side: Side, band: slice
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Source columns and rows (pixel centres at whole numbers) of every rectified pixel, and the valid mask.
+    """Source columns and rows (pixel centres at whole numbers) of a band of rectified rows, and the valid mask.
 
     The ray is a sum of products of one row table and one column table: no trigonometry per pixel.
     """
     A = pixel_from_rectified_ray(view, pair)
     along = (np.arange(pair.width(side)) + pair.column_origin(side)) / pair.columns_per_radian
-    across = (np.arange(pair.height) + pair.row_origin) / pair.rows_per_radian
+    across = (np.arange(pair.height)[band] + pair.row_origin) / pair.rows_per_radian
     if pair.model == "spherical":
         column_table, column_weight = np.sin(along), np.cos(along)
         row_table = np.outer(A[:, 1], np.sin(across)) + np.outer(A[:, 2], np.cos(across))

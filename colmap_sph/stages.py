@@ -5,6 +5,7 @@ Every stage asks for each of its results first whether an earlier run has made t
 """
 
 import logging
+import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,7 +21,7 @@ from colmap_sph.fusion import fuse
 from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.load_cache import LoadCache
 from colmap_sph.masks import read_mask
-from colmap_sph.matching import RectifiedImage, match_pair
+from colmap_sph.matching import RectifiedImage, Scratch, match_pair
 from colmap_sph.normals import fit_normals
 from colmap_sph.pair_files import read_arrays, read_pair, stored_key, write_arrays, write_pair
 from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
@@ -71,6 +72,7 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
     """
     report = context.report
     make_dir(context.pairs_dir)
+    thread = threading.local()
     images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, _CACHE_BYTES)
     masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, _CACHE_BYTES)
 
@@ -83,12 +85,15 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
         if state.is_done:
             return Done(state.key, made=False)
         geometry, (left, right) = state.geometry, pair
+        if not hasattr(thread, "scratch"):
+            thread.scratch = Scratch()
         disparity = match_pair(
             rectified(left, geometry, "left"),
             rectified(right, geometry, "right"),
             geometry.min_disparity,
             geometry.max_disparity,
             context.options.matching,
+            thread.scratch,
         )
         write_pair(context.pair_path(*pair), PairDisparity(*pair, geometry, disparity), state.key)
         return Done(state.key, made=True)

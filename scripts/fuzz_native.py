@@ -81,6 +81,15 @@ def selection(rng: Random) -> Arguments:
     return [backend(rng), sums, base, *words, int(rng.integers(0, 5)), np.zeros((h, w), np.int32)]
 
 
+def match(rng: Random) -> Arguments:
+    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
+    words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
+    base, image, p1 = filled(rng, (h, w), np.int32), filled(rng, (h, w), np.uint8), int(rng.integers(0, 30))
+    p2, limits = rng.integers(p1, 194, 256).astype(np.uint8), (int(rng.integers(0, 5)), int(rng.integers(0, 5)))
+    scratch = np.zeros((3, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
+    return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
+
+
 def refine_offsets(rng: Random) -> Arguments:
     (h, w), target = size(rng), int(rng.integers(0, 70))
     offset = filled(rng, (h, w), np.int32)
@@ -144,6 +153,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         matching_cost,
         aggregation,
         selection,
+        match,
         refine_offsets,
         transfer_disparity,
         depth_candidates,

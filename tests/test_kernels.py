@@ -332,20 +332,28 @@ def test_refinement_finds_the_tip_between_whole_pixels(backend, position):
 # ---- the whole chain ---------------------------------------------------------------------------------------
 
 
+def run_match(backend, reference, target, base, image, p1, p2, max_slant, max_difference, depth, rows):
+    scratch = np.full((3, rows * base.shape[1], depth), 77, dtype=np.uint8)
+    offset = np.full(base.shape, 5, dtype=np.int32)
+    _native.match(backend, reference, target, base, image, p1, p2, max_slant, max_difference, scratch, offset)
+    return offset
+
+
+@every_backend
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("depth", DEPTHS)
-def test_the_chain_does_not_depend_on_the_backend(size, depth):
+@pytest.mark.parametrize("kind", ["smooth", "rough", "jumps"])
+def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, kind):
     rng = np.random.default_rng(depth + size[1])
     left, right = (images(rng, (size[0] + 6, width + 8), "full") for width in (size[1], size[1] + 5))
-    base = bases(rng, size, "rough")
-    results = []
-    for backend in BACKENDS:
-        a = run_census(backend, left, np.ones(size, dtype=np.uint8))
-        b = run_census(backend, right, np.ones((size[0], size[1] + 5), dtype=np.uint8))
-        cost = run_cost(backend, a, b, base, depth)
-        image = np.ascontiguousarray(left[3:-3, 4:-4])
-        sums = run_aggregation(backend, cost, base, image, 10, np.full(256, 60, dtype=np.uint8))
-        results.append((cost, sums, run_selection(backend, sums, base, a, b, 2)))
-    for other in results[1:]:
-        for first, second in zip(results[0], other, strict=True):
-            np.testing.assert_array_equal(first, second)
+    base = bases(rng, size, kind)
+    valid = [np.where(rng.random(shape) < 0.1, 0, 1).astype(np.uint8) for shape in (size, (size[0], size[1] + 5))]
+    reference, target = oracle.census(left, valid[0]), oracle.census(right, valid[1])
+    np.testing.assert_array_equal(run_census(backend, right, valid[1]), target)
+    image, p2 = np.ascontiguousarray(left[3:-3, 4:-4]), p2_table(rng, 10, 30, 120)
+    sums = oracle.aggregation(oracle.matching_cost(reference, target, base, depth), base, image, 10, p2, 2)
+    expected = oracle.selection(sums, base, reference, target, 2)
+    # In one piece, and in bands of rows: to the bit the same.
+    for rows in {1, 2, 3, size[0], size[0] + 1}:
+        offset = run_match(backend, reference, target, base, image, 10, p2, 2, 2, depth, rows)
+        np.testing.assert_array_equal(offset, expected)

@@ -48,6 +48,18 @@ def arguments(function):
             "max_difference": 2,
             "out offset": np.zeros((H, W), np.int32),
         },
+        "match": {
+            "backend": "scalar",
+            **census_pair,
+            "base": np.zeros((H, W), np.int32),
+            "image": np.zeros((H, W), u8),
+            "p1": 10,
+            "p2": np.full(256, 60, u8),
+            "max_slant": 2,
+            "max_difference": 2,
+            "out scratch": np.zeros((3, H * W, DEPTH), u8),
+            "out offset": np.zeros((H, W), np.int32),
+        },
         "refine_offsets": {
             "backend": "scalar",
             "offset": np.zeros((H, W), np.int32),
@@ -117,6 +129,7 @@ FUNCTIONS = [
     "matching_cost",
     "aggregation",
     "selection",
+    "match",
     "refine_offsets",
     "transfer_disparity",
     "depth_candidates",
@@ -124,7 +137,7 @@ FUNCTIONS = [
     "check_consistency",
     "fit_planes",
 ]
-MATCHING = FUNCTIONS[:5]
+MATCHING = FUNCTIONS[:6]
 
 
 def call(function, values):
@@ -141,6 +154,7 @@ OUTPUTS = [(function, name) for function, name in ARRAYS if name.startswith("out
 FREE = {
     ("matching_cost", "target"): {1},
     ("selection", "target"): {1},
+    ("match", "target"): {1},
     ("refine_offsets", "target"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
@@ -282,11 +296,12 @@ def test_number_of_disparities_out_of_bounds_is_refused(depth):
         "matching_cost": ["out cost"],
         "selection": ["aggregated"],
         "aggregation": ["cost", "out aggregated"],
+        "match": ["out scratch"],
     }
     for function, names in volumes.items():
         values = arguments(function)
         for name in names:
-            values[name] = np.zeros((H, W, depth), values[name].dtype)
+            values[name] = np.zeros((*values[name].shape[:-1], depth), values[name].dtype)
         with pytest.raises(ValueError, match="multiple of 32"):
             call(function, values)
 

@@ -7,9 +7,10 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "rows_avx2.h"
+#include "rows.h"
 
 enum {
+    VERTICAL_PATHS = 3,
     GAP = DEPTH_STEP,
     MINIMUM = GAP / 2,            /* where in the gap a pixel's least slot is kept */
     MAX_VECTORS = MAX_DEPTH / 32, /* registers per pixel */
@@ -21,27 +22,22 @@ enum {
 /* The pixel before the image's edge: it makes L = C. */
 static const uint8_t edge[MAX_DEPTH + 2 * GAP];
 
-int sweep_begin(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
-                path_penalties penalties, int backward) {
-    *state = (sweep_state){.base = base,
-                           .image = image,
-                           .size = size,
-                           .penalties = penalties,
-                           .backward = backward,
-                           .stride = size.depth + GAP};
-    const size_t row_size = (size_t)(size.width * state->stride + GAP);
-    state->memory = aligned_alloc(64, (VERTICAL_PATHS * row_size + 63) / 64 * 64);
+/* Bytes from pixel to pixel and from path to path in `memory`. */
+static inline ptrdiff_t pixel_stride(match_size size) { return size.depth + GAP; }
+static inline ptrdiff_t path_stride(match_size size) { return size.width * pixel_stride(size) + GAP; }
+
+int sweep_begin_avx2(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
+                     path_penalties penalties, int backward) {
+    *state =
+        (sweep_state){.base = base, .image = image, .size = size, .penalties = penalties, .backward = backward};
+    state->memory_size = ((size_t)(VERTICAL_PATHS * path_stride(size)) + 63) / 64 * 64;
+    state->memory = aligned_alloc(64, state->memory_size);
     if (!state->memory) {
         return -1;
     }
-    memset(state->memory, 255, VERTICAL_PATHS * row_size);
-    for (int k = 0; k < VERTICAL_PATHS; k++) {
-        state->rows[k] = state->memory + (size_t)k * row_size + GAP;
-    }
+    memset(state->memory, 255, state->memory_size);
     return 0;
 }
-
-void sweep_end(sweep_state *state) { free(state->memory); }
 
 ALWAYS_INLINE __m256i load(const uint8_t *p) { return _mm256_loadu_si256((const __m256i *)p); }
 
@@ -149,6 +145,7 @@ ALWAYS_INLINE step begin_along(const sweep_state *s, ptrdiff_t p, __m256i least,
 ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
                                 uint16_t *sums_out, const ptrdiff_t depth) {
     const ptrdiff_t direction = s->backward ? -1 : 1, width = s->size.width, vectors = depth / 32;
+    const ptrdiff_t turned = width > 0 ? s->done % width : 0;
     const __m256i p1 = _mm256_set1_epi8((char)s->penalties.p1), zero = _mm256_setzero_si256();
     uint8_t scratch[VERTICAL_PATHS][MAX_DEPTH + 2 * GAP];
     along_row along;
@@ -164,9 +161,9 @@ ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost
         step steps[VERTICAL_PATHS];
         for (int k = 0; k < VERTICAL_PATHS; k++) {
             /* Row n of path k has pixel x at x + (k - 1) n, going round: its predecessor's place in row n - 1. */
-            ptrdiff_t place = x + (k - 1) * direction * s->turned;
+            ptrdiff_t place = x + (k - 1) * direction * turned;
             place += place < 0 ? width : place >= width ? -width : 0;
-            places[k] = s->rows[k] + place * s->stride;
+            places[k] = s->memory + k * path_stride(s->size) + GAP + place * (depth + GAP);
             steps[k] = begin_vertical(s, y, x, k, places[k], depth, scratch[k]);
         }
         if (m > 0) {
@@ -202,10 +199,10 @@ ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost
         horizontal.least = horizontal_min(horizontal.minimum);
     }
     s->done++;
-    s->turned = s->turned + 1 < width ? s->turned + 1 : 0;
 }
 
-void sweep_row(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in, uint16_t *sums_out) {
+void sweep_row_avx2(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
+                    uint16_t *sums_out) {
     /* The usual numbers of disparities as constants, for which the compiler keeps slots in registers. */
     switch (s->size.depth) {
     case 32:
@@ -220,20 +217,4 @@ void sweep_row(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t 
     default:
         sweep_row_of(s, y, cost, sums_in, sums_out, s->size.depth);
     }
-}
-
-int aggregation_avx2(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                     path_penalties penalties, uint16_t *aggregated) {
-    for (int backward = 0; backward < 2; backward++) {
-        sweep_state state;
-        if (sweep_begin(&state, base, image, size, penalties, backward)) {
-            return -1;
-        }
-        for (ptrdiff_t n = 0; n < size.height; n++) {
-            const ptrdiff_t y = backward ? size.height - 1 - n : n, row = y * size.width * size.depth;
-            sweep_row(&state, y, cost + row, backward ? aggregated + row : NULL, aggregated + row);
-        }
-        sweep_end(&state);
-    }
-    return 0;
 }

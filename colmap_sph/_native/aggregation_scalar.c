@@ -11,7 +11,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#include "kernels.h"
+#include "rows.h"
 
 static uint8_t slot_or_max(const uint8_t *slots, ptrdiff_t depth, ptrdiff_t i) {
     return i >= 0 && i < depth ? slots[i] : 255;
@@ -39,51 +39,44 @@ static void path_step(const uint8_t *cost, const uint8_t *before, ptrdiff_t dept
     }
 }
 
-/* One sweep: the four paths that come from pixels already visited, top-left to bottom-right or back. */
-static void sweep(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                  path_penalties penalties, int backward, uint8_t *scratch, uint16_t *aggregated) {
-    const ptrdiff_t step = backward ? -1 : 1;
-    const ptrdiff_t row_size = size.width * size.depth;
-    uint8_t *rows[2][4]; /* [current or previous row][path] */
-    for (int k = 0; k < 8; k++) {
-        rows[k / 4][k % 4] = scratch + k * row_size;
+int sweep_begin_scalar(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
+                       path_penalties penalties, int backward) {
+    *state =
+        (sweep_state){.base = base, .image = image, .size = size, .penalties = penalties, .backward = backward};
+    /* This row and the one before, of four paths. */
+    state->memory_size = (size_t)(8 * size.width * size.depth) + 1;
+    state->memory = malloc(state->memory_size);
+    return state->memory ? 0 : -1;
+}
+
+/* The four paths that come from pixels already visited, top-left to bottom-right or back. */
+void sweep_row_scalar(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
+                      uint16_t *sums_out) {
+    const ptrdiff_t step = s->backward ? -1 : 1, width = s->size.width, depth = s->size.depth;
+    uint8_t *rows[2][4]; /* [this row or the one before][path] */
+    for (ptrdiff_t k = 0; k < 8; k++) {
+        rows[(k / 4 + s->done) & 1][k % 4] = s->memory + k * width * depth;
     }
-    for (ptrdiff_t n = 0; n < size.height; n++) {
-        const ptrdiff_t y = backward ? size.height - 1 - n : n;
-        const int now = n & 1;
-        for (ptrdiff_t m = 0; m < size.width; m++) {
-            const ptrdiff_t x = backward ? size.width - 1 - m : m;
-            const ptrdiff_t p = y * size.width + x;
-            uint16_t *sums = aggregated + p * size.depth;
-            for (int path = 0; path < 4; path++) {
-                /* Path 0 comes along the row, 1 to 3 from the three neighbours in the row before. */
-                const ptrdiff_t before_x = path == 0 ? x - step : x + (path - 2) * step;
-                const int inside = before_x >= 0 && before_x < size.width && (path == 0 || n > 0);
-                const ptrdiff_t q = (path == 0 ? y : y - step) * size.width + before_x;
-                const uint8_t *before = rows[path == 0 ? now : !now][path] + before_x * size.depth;
-                const int64_t difference = inside ? (int64_t)base[p] - base[q] : 0;
-                const int contrast = inside ? abs(image[p] - image[q]) : 0;
-                uint8_t *current = rows[now][path] + x * size.depth;
-                path_step(cost + p * size.depth, inside ? before : NULL, size.depth,
-                          llabs(difference) <= penalties.max_slant ? 0 : difference, penalties.p1,
-                          penalties.p2[contrast], current);
-                for (ptrdiff_t i = 0; i < size.depth; i++) {
-                    const int first = path == 0 && !backward;
-                    sums[i] = (uint16_t)((first ? 0 : sums[i]) + current[i]);
-                }
+    for (ptrdiff_t m = 0; m < width; m++) {
+        const ptrdiff_t x = s->backward ? width - 1 - m : m;
+        const ptrdiff_t p = y * width + x;
+        for (int path = 0; path < 4; path++) {
+            /* Path 0 comes along the row, 1 to 3 from the three neighbours in the row before. */
+            const ptrdiff_t before_x = path == 0 ? x - step : x + (path - 2) * step;
+            const int inside = before_x >= 0 && before_x < width && (path == 0 || s->done > 0);
+            const ptrdiff_t q = (path == 0 ? y : y - step) * width + before_x;
+            const uint8_t *before = inside ? rows[path > 0][path] + before_x * depth : NULL;
+            const int64_t difference = inside ? (int64_t)s->base[p] - s->base[q] : 0;
+            const int contrast = inside ? abs(s->image[p] - s->image[q]) : 0;
+            uint8_t *current = rows[0][path] + x * depth;
+            path_step(cost + x * depth, before, depth,
+                      llabs(difference) <= s->penalties.max_slant ? 0 : difference, s->penalties.p1,
+                      s->penalties.p2[contrast], current);
+            for (ptrdiff_t i = 0; i < depth; i++) {
+                const uint16_t sum = path > 0 ? sums_out[x * depth + i] : sums_in ? sums_in[x * depth + i] : 0;
+                sums_out[x * depth + i] = (uint16_t)(sum + current[i]);
             }
         }
     }
-}
-
-int aggregation_scalar(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                       path_penalties penalties, uint16_t *aggregated) {
-    uint8_t *scratch = malloc((size_t)(8 * size.width * size.depth));
-    if (!scratch) {
-        return -1;
-    }
-    sweep(cost, base, image, size, penalties, 0, scratch, aggregated);
-    sweep(cost, base, image, size, penalties, 1, scratch, aggregated);
-    free(scratch);
-    return 0;
+    s->done++;
 }

@@ -1,8 +1,7 @@
 #include <immintrin.h>
-#include <stdlib.h>
 #include <string.h>
 
-#include "rows_avx2.h"
+#include "rows.h"
 
 /* Hamming distances of one census word to 4 others, one per 64-bit lane. */
 static inline __m256i hamming_4(__m256i reference, const uint64_t *target) {
@@ -39,17 +38,8 @@ static inline __m256i hamming_32(__m256i reference, const uint64_t *target) {
     return _mm256_set_m128i(_mm_unpackhi_epi16(low, high), _mm_unpacklo_epi16(low, high));
 }
 
-uint64_t *cost_row_buffer(match_size size) {
-    const ptrdiff_t padded_width = size.target_width + 2 * size.depth;
-    uint64_t *buffer = malloc((size_t)padded_width * sizeof *buffer);
-    for (ptrdiff_t i = 0; buffer && i < padded_width; i++) {
-        buffer[i] = CENSUS_INVALID;
-    }
-    return buffer;
-}
-
-void cost_row(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-              uint64_t *buffer, uint8_t *cost) {
+void cost_row_avx2(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
+                   uint64_t *buffer, uint8_t *cost) {
     uint64_t *row = buffer + size.depth;
     memcpy(row, target, (size_t)size.target_width * sizeof *row);
     for (ptrdiff_t x = 0; x < size.width; x++) {
@@ -65,16 +55,4 @@ void cost_row(const uint64_t *reference, const uint64_t *target, const int32_t *
             _mm256_storeu_si256((__m256i *)(slots + i), hamming_32(word, row + first + i));
         }
     }
-}
-
-int cost_avx2(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-              uint8_t *cost) {
-    uint64_t *buffer = cost_row_buffer(size);
-    for (ptrdiff_t y = 0; buffer && y < size.height; y++) {
-        cost_row(reference + y * size.width, target + y * size.target_width, base + y * size.width, size, buffer,
-                 cost + y * size.width * size.depth);
-    }
-    const int status = buffer ? 0 : -1;
-    free(buffer);
-    return status;
 }

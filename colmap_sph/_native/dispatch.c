@@ -1,25 +1,46 @@
 #include <string.h>
 
-#include "kernels.h"
+#include "rows.h"
 
-static const kernel_table scalar_kernels = {"scalar",
-                                            census_scalar,
-                                            cost_scalar,
-                                            aggregation_scalar,
-                                            selection_scalar,
-                                            refine_offsets_scalar,
-                                            depth_candidates_scalar,
-                                            fit_planes_scalar};
+/* The kernels on whole images that are made of row kernels. */
+#define WHOLE_IMAGES(version) \
+    static const row_kernels rows_##version = {cost_row_##version, sweep_begin_##version, sweep_row_##version, \
+                                               selection_row_##version}; \
+    static int cost_##version(const uint64_t *reference, const uint64_t *target, const int32_t *base, \
+                              match_size size, uint8_t *cost) { \
+        return cost_of_rows(&rows_##version, reference, target, base, size, cost); \
+    } \
+    static int aggregation_##version(const uint8_t *cost, const int32_t *base, const uint8_t *image, \
+                                     match_size size, path_penalties penalties, uint16_t *aggregated) { \
+        return aggregate_rows(&rows_##version, cost, base, image, size, penalties, aggregated); \
+    } \
+    static int selection_##version(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference, \
+                                   const uint64_t *target, match_size size, int32_t max_difference, \
+                                   int32_t *offset) { \
+        return select_rows(&rows_##version, aggregated, base, reference, target, size, max_difference, offset); \
+    } \
+    static int match_##version(const match_input *input, ptrdiff_t band_rows, uint16_t *scratch, \
+                               int32_t *offset) { \
+        return match_rows(&rows_##version, input, band_rows, scratch, offset); \
+    }
+
+#define TABLE(version) \
+    {#version, \
+     census_##version, \
+     cost_##version, \
+     aggregation_##version, \
+     selection_##version, \
+     match_##version, \
+     refine_offsets_##version, \
+     depth_candidates_##version, \
+     fit_planes_##version}
+
+WHOLE_IMAGES(scalar)
+static const kernel_table scalar_kernels = TABLE(scalar);
 
 #ifdef COLMAP_SPH_HAVE_AVX2
-static const kernel_table avx2_kernels = {"avx2",
-                                          census_avx2,
-                                          cost_avx2,
-                                          aggregation_avx2,
-                                          selection_avx2,
-                                          refine_offsets_avx2,
-                                          depth_candidates_avx2,
-                                          fit_planes_avx2};
+WHOLE_IMAGES(avx2)
+static const kernel_table avx2_kernels = TABLE(avx2);
 
 static int has_avx2(void) {
     __builtin_cpu_init();

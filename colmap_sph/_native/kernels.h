@@ -57,6 +57,19 @@ typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const 
                          const uint64_t *target, match_size size, int32_t max_left_right_difference,
                          int32_t *offset);
 
+typedef struct {
+    const uint64_t *reference, *target;
+    const int32_t *base;
+    const uint8_t *image;
+    match_size size;
+    path_penalties penalties;
+    int32_t max_left_right_difference;
+} match_input;
+
+/* Cost, aggregation and selection in one. `scratch` has room for 3 bytes per slot of `band_rows` rows; the result
+ * does not depend on their number, but with fewer rows than the image has, half of the sweeps are done twice. */
+typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint16_t *scratch, int32_t *offset);
+
 /* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
 typedef int refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
                               match_size size, int32_t *refined);
@@ -91,15 +104,13 @@ typedef struct {
     cost_fn *cost;
     aggregation_fn *aggregation;
     selection_fn *selection;
+    match_fn *match;
     refine_offsets_fn *refine_offsets;
     depth_candidates_fn *depth_candidates;
     fit_planes_fn *fit_planes;
 } kernel_table;
 
 census_fn census_scalar, census_avx2;
-cost_fn cost_scalar, cost_avx2;
-aggregation_fn aggregation_scalar, aggregation_avx2;
-selection_fn selection_scalar, selection_avx2;
 refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
 depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
 fit_planes_fn fit_planes_scalar, fit_planes_avx2;

@@ -175,6 +175,48 @@ static PyObject *py_selection(PyObject *self, PyObject *args) {
     return finish(&arrays, status);
 }
 
+static PyObject *py_match(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[7];
+    int p1, max_slant, max_difference;
+    if (!PyArg_ParseTuple(args, "sOOOOiOiiOO", &backend, &o[0], &o[1], &o[2], &o[3], &p1, &o[4], &max_slant,
+                          &max_difference, &o[5], &o[6])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    int status = 0;
+    Py_ssize_t shape[2] = {-1, -1}, lut_shape[1] = {256}, scratch_shape[3] = {3, -1, -1};
+    const uint64_t *reference = table ? array_get(&arrays, o[0], "reference", U64, 2, READ, shape) : NULL;
+    Py_ssize_t target_shape[2] = {shape[0], -1};
+    const uint64_t *target = reference ? array_get(&arrays, o[1], "target", U64, 2, READ, target_shape) : NULL;
+    const int32_t *base = target ? array_get(&arrays, o[2], "base", I32, 2, READ, shape) : NULL;
+    const uint8_t *image = base ? array_get(&arrays, o[3], "image", U8, 2, READ, shape) : NULL;
+    const uint8_t *p2 = image ? array_get(&arrays, o[4], "p2", U8, 1, READ, lut_shape) : NULL;
+    uint8_t *scratch = p2 ? array_get(&arrays, o[5], "scratch", U8, 3, WRITE, scratch_shape) : NULL;
+    int32_t *offset = scratch ? array_get(&arrays, o[6], "offset", I32, 2, WRITE, shape) : NULL;
+    if (offset && check_depth(scratch_shape[2]) && check_width(shape[1]) && check_width(target_shape[1]) &&
+        check(scratch_shape[1] > 0 && (shape[1] == 0 || scratch_shape[1] % shape[1] == 0),
+              "scratch must have the size (3, pixels of one row or more, disparities)") &&
+        check_penalties(p1, p2) && check(max_slant >= 0, "the slant must not be negative") &&
+        check(max_difference >= 0, "the left-right difference must not be negative") && arrays_disjoint(&arrays) &&
+        check((uintptr_t)scratch % sizeof(uint16_t) == 0, "scratch must be aligned to 16 bits")) {
+        const match_input input = {reference,
+                                   target,
+                                   base,
+                                   image,
+                                   {shape[0], shape[1], target_shape[1], scratch_shape[2]},
+                                   {(uint8_t)p1, p2, max_slant},
+                                   max_difference};
+        const Py_ssize_t band_rows = shape[1] > 0 ? scratch_shape[1] / shape[1] : shape[0] + 1;
+        Py_BEGIN_ALLOW_THREADS;
+        status = table->match(&input, band_rows, (uint16_t *)(void *)scratch, offset);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, status);
+}
+
 static PyObject *py_refine_offsets(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
@@ -359,6 +401,8 @@ static PyMethodDef methods[] = {
      "aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)"},
     {"selection", py_selection, METH_VARARGS,
      "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
+    {"match", py_match, METH_VARARGS,
+     "match(backend, reference, target, base, image, p1, p2, max_slant, max_difference, scratch, offset)"},
     {"refine_offsets", py_refine_offsets, METH_VARARGS,
      "refine_offsets(backend, offset, reference, target, refined)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},

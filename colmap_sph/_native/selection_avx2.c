@@ -1,7 +1,7 @@
 #include <immintrin.h>
 #include <stdlib.h>
 
-#include "rows_avx2.h"
+#include "rows.h"
 
 /* One reference pixel's sums against the best so far of the target pixels they point at; of equals the leftmost
  * wins. Columns are kept in 16 bits (module.c limits the width). */
@@ -62,17 +62,9 @@ static inline int32_t select_pixel(const uint16_t *sums, ptrdiff_t x, int32_t ba
     return (int32_t)(base + best) * 256 + subpixel_offset(sums[best - 1], sums[best], sums[best + 1]);
 }
 
-int selection_begin(selection_buffers *buffers, match_size size) {
-    buffers->least = malloc((size_t)size.target_width * 2 * sizeof *buffers->least);
-    buffers->best_column = buffers->least + size.target_width;
-    return buffers->least ? 0 : -1;
-}
-
-void selection_end(selection_buffers *buffers) { free(buffers->least); }
-
-void selection_row(const uint16_t *sums, const int32_t *base, const uint64_t *reference, const uint64_t *target,
-                   match_size size, int32_t max_left_right_difference, selection_buffers *buffers,
-                   int32_t *offset) {
+void selection_row_avx2(const uint16_t *sums, const int32_t *base, const uint64_t *reference,
+                        const uint64_t *target, match_size size, int32_t max_left_right_difference,
+                        selection_buffers *buffers, int32_t *offset) {
     for (ptrdiff_t r = 0; r < size.target_width; r++) {
         buffers->least[r] = UINT16_MAX;
         buffers->best_column[r] = 0; /* so that a sum of 65535 never wins */
@@ -93,19 +85,4 @@ void selection_row(const uint16_t *sums, const int32_t *base, const uint64_t *re
                                                   : select_pixel(sums + x * size.depth, x, base[x], target, size,
                                                                  buffers, max_left_right_difference);
     }
-}
-
-int selection_avx2(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference,
-                   const uint64_t *target, match_size size, int32_t max_left_right_difference, int32_t *offset) {
-    selection_buffers buffers;
-    if (selection_begin(&buffers, size)) {
-        return -1;
-    }
-    for (ptrdiff_t y = 0; y < size.height; y++) {
-        const ptrdiff_t row = y * size.width;
-        selection_row(aggregated + row * size.depth, base + row, reference + row, target + y * size.target_width,
-                      size, max_left_right_difference, &buffers, offset + row);
-    }
-    selection_end(&buffers);
-    return 0;
 }

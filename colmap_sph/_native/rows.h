@@ -1,0 +1,75 @@
+/* The matching kernels row by row, scalar and AVX2, so that the matcher can pass rows from one to the next while
+ * in cache. All pointers to pixels are to the row in question unless said otherwise. */
+#ifndef COLMAP_SPH_ROWS_H
+#define COLMAP_SPH_ROWS_H
+
+#include "kernels.h"
+
+/* ---- matching cost ----------------------------------------------------------------------------------------- */
+
+/* Costs of one row, `size.width * size.depth` of them; `buffer` is one of cost_row_buffer. */
+typedef void cost_row_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
+                         uint64_t *buffer, uint8_t *cost);
+/* Room for one target row with `depth` unseen pixels on both sides; NULL without memory. */
+uint64_t *cost_row_buffer(match_size size);
+
+/* ---- path aggregation -------------------------------------------------------------------------------------- */
+
+/* One sweep over the image, four paths at once, forward (from the top left) or backward. `memory` holds all that a
+ * row leaves to the next. */
+typedef struct {
+    const int32_t *base;  /* of the whole image, */
+    const uint8_t *image; /* as this one */
+    match_size size;
+    path_penalties penalties;
+    int backward;
+    ptrdiff_t done; /* rows */
+    uint8_t *memory;
+    size_t memory_size;
+} sweep_state;
+
+/* 0, or -1 without memory; ended by free(state->memory). */
+typedef int sweep_begin_fn(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
+                           path_penalties penalties, int backward);
+/* The next row, y: sums_out = sums_in (NULL: 0) + the four paths. */
+typedef void sweep_row_fn(sweep_state *state, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
+                          uint16_t *sums_out);
+
+/* ---- selection --------------------------------------------------------------------------------------------- */
+
+/* Of every target pixel: the least sum that points at it, and from which column. */
+typedef struct {
+    uint16_t *least, *best_column;
+} selection_buffers;
+
+/* 0, or -1 without memory; ended by free(buffers->least). */
+int selection_begin(selection_buffers *buffers, match_size size);
+typedef void selection_row_fn(const uint16_t *sums, const int32_t *base, const uint64_t *reference,
+                              const uint64_t *target, match_size size, int32_t max_left_right_difference,
+                              selection_buffers *buffers, int32_t *offset);
+
+/* ---- whole images from rows -------------------------------------------------------------------------------- */
+
+typedef struct {
+    cost_row_fn *cost_row;
+    sweep_begin_fn *sweep_begin;
+    sweep_row_fn *sweep_row;
+    selection_row_fn *selection_row;
+} row_kernels;
+
+cost_row_fn cost_row_scalar, cost_row_avx2;
+sweep_begin_fn sweep_begin_scalar, sweep_begin_avx2;
+sweep_row_fn sweep_row_scalar, sweep_row_avx2;
+selection_row_fn selection_row_scalar, selection_row_avx2;
+
+int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
+                 const int32_t *base, match_size size, uint8_t *cost);
+int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_t *base, const uint8_t *image,
+                   match_size size, path_penalties penalties, uint16_t *aggregated);
+int select_rows(const row_kernels *kernels, const uint16_t *aggregated, const int32_t *base,
+                const uint64_t *reference, const uint64_t *target, match_size size,
+                int32_t max_left_right_difference, int32_t *offset);
+int match_rows(const row_kernels *kernels, const match_input *input, ptrdiff_t band_rows, uint16_t *scratch,
+               int32_t *offset);
+
+#endif
