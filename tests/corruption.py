@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 
@@ -69,8 +70,14 @@ def damage_text(data: bytes, rng: Random) -> bytes:
 
 
 def make_cases(project: Path) -> None:
-    """Complete a project of images and a binary model by the model as text and a dense workspace."""
+    """Complete the project of `test_undistortion` by pictures of its plane, its model as text, and a workspace."""
     model = pycolmap.Reconstruction(project / "sparse" / "0")
+    ground = np.random.default_rng(0).integers(0, 256, (64, 120, 3), np.uint8)
+    for image in model.images.values():
+        # The plane is 3 units away and the focal length 90 pixels: each 0.1 units of translation are 3 pixels.
+        shift = round(30 * image.cam_from_world().translation[0])
+        path = project / "images" / image.name
+        assert cv2.imwrite(str(path), ground[:, 12 - shift : 108 - shift])
     (project / "text").mkdir()
     model.write_text(project / "text")
     pycolmap.undistort_images(project / "dense", project / "sparse" / "0", project / "images")
