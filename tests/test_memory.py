@@ -2,6 +2,7 @@
 
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
@@ -41,8 +42,7 @@ def test_a_written_amount_is_enough(amount):
 
 
 def test_the_default_leaves_something_to_others():
-    with open("/proc/meminfo") as file:
-        total = int(file.readline().split()[1]) * 1024
+    total = int(Path("/proc/meminfo").read_text().split()[1]) * 1024
     assert resident() < budget(0) < total + resident()
     assert budget(7 * GIB) == 7 * GIB
 
