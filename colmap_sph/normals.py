@@ -15,6 +15,9 @@ from colmap_sph.errors import OptionError
 from colmap_sph.kernels import backend
 from colmap_sph.scene import View
 
+# Rows that are fitted at a time, which bounds the memory for it.
+_BAND_ROWS = 256
+
 
 @dataclass(frozen=True)
 class NormalOptions:
@@ -52,12 +55,27 @@ def fit_normals(
     depth : (H, W) float32 ndarray
         Depth of each plane at its pixel; 0 where no plane fits.
     """
+    normals = np.empty((*estimate.depth.shape, 3), dtype=np.float32)
+    fitted = np.empty_like(estimate.depth)
+    for first in range(0, view.height, _BAND_ROWS):
+        end = min(first + _BAND_ROWS, view.height)
+        low, high = max(first - options.radius, 0), min(end + options.radius, view.height)
+        kept = slice(first - low, end - low)
+        band_normals, band_fitted = _fit_rows(view, estimate, low, high, options)
+        normals[first:end], fitted[first:end] = band_normals[kept], band_fitted[kept]
+    return normals, fitted
+
+
+def _fit_rows(
+    view: View, estimate: DepthEstimate, first: int, end: int, options: NormalOptions
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    depth, sigma = estimate.depth[first:end], estimate.sigma[first:end]
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = np.where(estimate.depth > 0, 1 / estimate.depth, 0).astype(np.float32)
-    inverse_sigma = (estimate.sigma * inverse * inverse).astype(np.float32)
+        inverse = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
+    inverse_sigma = (sigma * inverse * inverse).astype(np.float32)
     normals = np.empty((*inverse.shape, 3), dtype=np.float32)
     fitted = np.empty_like(inverse)
-    _native.fit_planes(
-        backend(), inverse, inverse_sigma, view.K.copy(), options.radius, options.tolerance, normals, fitted
-    )
+    K = view.K.copy()
+    K[1, 2] -= first  # the rows of a band count from its first
+    _native.fit_planes(backend(), inverse, inverse_sigma, K, options.radius, options.tolerance, normals, fitted)
     return normals, fitted

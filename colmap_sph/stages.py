@@ -48,7 +48,7 @@ _CACHE_BYTES = 512 << 20
 _SCRATCH_BYTES = 256 << 20
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
 # of a view while its depth is voted, without its pairs' maps, or checked; per pixel of all images in fusion.
-_MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 70.0, 65.0, 90.0
+_MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 48.0, 45.0, 40.0
 FUSION_BYTES = 80.0
 
 
