@@ -1,11 +1,12 @@
 """The study's results as Markdown."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from benchmarking import table
 
 from rectification_study.pairs import SLOPE_EDGES
 
@@ -40,12 +41,6 @@ def markdown(content: Mapping[str, Any], figures: Sequence[Path]) -> str:
         "\n".join(f"![{figure.stem}]({figure.name})" for figure in figures),
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table: the first column to the left, the others to the right."""
-    rule = ["---", *["---:"] * (len(header) - 1)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in [header, rule, *rows])
 
 
 def change(frame: float, spherical: float) -> str:

@@ -1,0 +1,406 @@
+"""Speed of the compiled kernels, against OpenCV's semi-global matcher and against what the machine can do.
+
+    python scripts/bench_kernels.py [--width 1024] [--height 768] [--disparities 128] [--runs 5]
+
+On a synthetic pair: texture, seen with the disparities of slanted planes, with noise. First all versions of every
+kernel must give the same bits (exit code 1 if not), then each is timed, in one thread: median of the runs, in
+million disparity evaluations per second (MDE/s = width * height * disparities / seconds / 1e6), or in megapixels
+per second; seconds are of the processor. OpenCV is counted in the same way, though it leaves out the leftmost
+`disparities` columns.
+
+With --disparities all pixels search the same range, as at the matcher's coarsest level; with 32 and 64 disparities
+each searches around its surface, as at its other levels.
+"""
+
+import argparse
+import hashlib
+import statistics
+import sys
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from benchmarking import machine, table
+from machine_limits import copy_bandwidth, vector_throughput
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.matching import MatchingOptions
+from colmap_sph.normals import NormalOptions
+
+LEVELS = (32, 64)  # disparities at the matcher's levels below the coarsest
+OPTIONS = MatchingOptions()
+P2 = np.round(OPTIONS.p2_min + (OPTIONS.p2 - OPTIONS.p2_min) / (1 + np.arange(256) / OPTIONS.p2_contrast)).astype(
+    np.uint8
+)
+OFFSET_INVALID = np.iinfo(np.int32).min
+
+# Vector arithmetic and shuffles per 32 slots in the C sources, without loads, stores and what is done per pixel.
+# cost_avx2.c: hamming_4 has 10 (xor, 2 and, shift, 2 shuffles, add, sad, compare, blend), 8 times; shift and or,
+# 7 times; then shuffle, extract, 2 unpacks, insert.
+COST_OPS = 8 * 10 + 7 * 2 + 5
+# aggregation_avx2.c: `advance` has 7 (3 min, 2 add, subtract, running min) for each of 4 paths; 2 permutes and
+# 2 alignr bring the neighbouring slots of the path along the row; `add_paths` has 4 unpacks, 4 maddubs, 2 adds and
+# 2 permutes, and in the backward sweep 2 adds of the forward sums.
+SWEEP_OPS = 4 * 7 + 4 + 12
+AGGREGATION_OPS = 2 * SWEEP_OPS + 2
+# selection_avx2.c, 16 slots to a register: `match_target_pixels` has 9 (2 max, 3 compares, 2 andnot, min, blend);
+# `first_minimum` has a min, then compare and movemask until the minimum is found, halfway in the mean.
+SELECTION_OPS = 2 * 9 + 2 * 1 + 2
+# Bytes of the volumes read and written per slot; that stored lines are first read into the cache is not counted.
+# Costs have 1 byte, sums 2. `aggregation` reads costs twice and sums once, and writes sums twice; `match` writes
+# costs and forward sums, and reads both, while the sums of all paths stay in the cache.
+LIMITS = {
+    "matching_cost": (COST_OPS, 1),
+    "aggregation": (AGGREGATION_OPS, 2 * 1 + 3 * 2),
+    "selection": (SELECTION_OPS, 2),
+    "match": (COST_OPS + AGGREGATION_OPS + SELECTION_OPS, 2 * (1 + 2)),
+}
+"""Kernel → vector instructions per 32 slots, and bytes of memory traffic per slot."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A rectified pair with exact disparities, and where the pixels search.
+
+    Attributes
+    ----------
+    left, right : (H, W) uint8 ndarray
+    disparity : (H, W) float32 ndarray
+        Left column - right column, of every left pixel.
+    depth : int
+        Disparities searched per pixel.
+    base : (H, W) int32 ndarray
+        First offset (right column - left column) searched.
+    """
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    disparity: NDArray[np.float32]
+    depth: int
+    base: NDArray[np.int32]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.base.shape[0], self.base.shape[1]
+
+
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    """A kernel with its input: `call` writes the `outputs`, `work` evaluations (or pixels, without `depth`)."""
+
+    name: str
+    call: Callable[[str], None]
+    outputs: Sequence[NDArray[Any]]
+    work: int
+    depth: int | None = None
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Median seconds of a kernel, one per version, the fastest version first."""
+
+    name: str
+    depth: int | None
+    work: int
+    seconds: list[float]
+
+    @property
+    def speed(self) -> float:
+        """Million evaluations (or pixels) per second of the fastest version."""
+        return self.work / self.seconds[0] / 1e6
+
+
+# ---- the pair ----------------------------------------------------------------------------------------------
+
+
+def make_scene(width: int, height: int, depth: int, *, same_range: bool, seed: int = 0) -> Scene:
+    """Slanted planes whose disparities lie well within 0..depth."""
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.linspace(0, 1, width), np.linspace(0, 1, height))
+    share = 0.15 + 0.2 * x + 0.2 * y
+    for _ in range(5):
+        left, top = rng.uniform(0, 0.75, 2)
+        inside = (x >= left) & (x < left + 0.2) & (y >= top) & (y < top + 0.2)
+        slope_x, slope_y = rng.uniform(-0.5, 0.5, 2)
+        plane = rng.uniform(0.5, 0.75) + slope_x * (x - left) + slope_y * (y - top)
+        share = np.where(inside, plane, share)
+    disparity = (depth * np.clip(share, 0.1, 0.9)).astype(np.float32)
+    right = cv2.GaussianBlur(rng.normal(0, 1, (height, width)).astype(np.float32), None, 1.2)
+    columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
+    left = cv2.remap(right, columns - disparity, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    images = [np.clip(128 + 180 * image + rng.normal(0, 2, image.shape), 0, 255) for image in (left, right)]
+    middle = np.zeros_like(disparity) + depth / 2 if same_range else disparity
+    base = -np.round(middle).astype(np.int32) - depth // 2
+    return Scene(images[0].astype(np.uint8), images[1].astype(np.uint8), disparity, depth, base)
+
+
+def share_right(scene: Scene, disparity: NDArray[np.floating]) -> float:
+    """Share of the pixels that OpenCV treats, too, within one pixel of the true disparity (NaN = none)."""
+    return float((np.abs(disparity - scene.disparity)[:, scene.depth :] <= 1).mean())
+
+
+def disparity_of(offset: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Disparities from the kernels' offsets."""
+    return np.where(offset == OFFSET_INVALID, np.float32(np.nan), offset.astype(np.float32) / -256)
+
+
+# ---- the kernels -------------------------------------------------------------------------------------------
+
+
+def with_border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """The image with the census window's border."""
+    return np.asarray(cv2.copyMakeBorder(image, 3, 3, 4, 4, cv2.BORDER_REPLICATE), dtype=np.uint8)
+
+
+def census_pair(scene: Scene) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
+    """Census of both images, which are valid everywhere."""
+    left, right = np.empty(scene.shape, np.uint64), np.empty(scene.shape, np.uint64)
+    for image, census in ((scene.left, left), (scene.right, right)):
+        _native.census("scalar", with_border(image), np.full(scene.shape, 255, np.uint8), census)
+    return left, right
+
+
+def matching_kernels(scene: Scene) -> list[Kernel]:
+    """The kernels whose work grows with the number of disparities; the last is `match`."""
+    left, right = census_pair(scene)
+    volume = (*scene.shape, scene.depth)
+    cost, sums = np.empty(volume, np.uint8), np.empty(volume, np.uint16)
+    scratch = np.empty((3, scene.base.size, scene.depth), np.uint8)
+    selected, matched = np.empty(scene.shape, np.int32), np.empty(scene.shape, np.int32)
+    base, image = scene.base, scene.left
+    p1, slant, difference = OPTIONS.p1, OPTIONS.max_slant, OPTIONS.max_left_right_difference
+
+    def matching_cost(backend: str) -> None:
+        _native.matching_cost(backend, left, right, base, cost)
+
+    def aggregation(backend: str) -> None:
+        _native.aggregation(backend, cost, base, image, p1, P2, slant, sums)
+
+    def selection(backend: str) -> None:
+        _native.selection(backend, sums, base, left, right, difference, selected)
+
+    def match(backend: str) -> None:
+        _native.match(backend, left, right, base, image, p1, P2, slant, difference, scratch, matched)
+
+    steps = [(matching_cost, cost), (aggregation, sums), (selection, selected), (match, matched)]
+    return [Kernel(call.__name__, call, [output], cost.size, scene.depth) for call, output in steps]
+
+
+def image_kernels(scene: Scene) -> list[Kernel]:
+    """The kernels that work on images, on the results of those before them."""
+    left, right = census_pair(scene)
+    census, refined = np.empty_like(left), np.empty(scene.shape, np.int32)
+    offset = np.round(-256 * scene.disparity).astype(np.int32)
+    # A camera whose focal length is its width: the sphere's columns and rows are about its own.
+    height, width = scene.shape
+    K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float64)
+    origins = (-width * np.arctan(0.5), -width * np.arctan(0.5 * height / width))
+    inverse_K, disparity = np.linalg.inv(K), scene.disparity
+    depth, sigma, fitted = (np.empty(scene.shape, np.float32) for _ in range(3))
+    normals = np.empty((*scene.shape, 3), np.float32)
+    padded, valid = with_border(scene.left), np.full(scene.shape, 255, dtype=np.uint8)
+
+    def candidates(backend: str) -> None:
+        arguments = ((width, width), origins, 0.0, 1.0, 0.25, 1.0, True, True, 0, depth, sigma)
+        _native.depth_candidates(backend, disparity, inverse_K, *arguments)
+
+    candidates("scalar")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
+    inverse_sigma = (sigma * inverse * inverse).astype(np.float32)
+    window = NormalOptions()
+
+    def fit(backend: str) -> None:
+        arguments = (inverse, inverse_sigma, K, window.radius, window.tolerance, normals, fitted)
+        _native.fit_planes(backend, *arguments)
+
+    pixels = width * height
+    return [
+        Kernel("census", lambda backend: _native.census(backend, padded, valid, census), [census], pixels),
+        Kernel(
+            "refine_offsets",
+            lambda backend: _native.refine_offsets(backend, offset, left, right, refined),
+            [refined],
+            pixels,
+        ),
+        Kernel("depth_candidates", candidates, [depth, sigma], pixels),
+        Kernel("fit_planes", fit, [normals, fitted], pixels),
+    ]
+
+
+def check_equality(kernel: Kernel, backends: Sequence[str]) -> None:
+    """End the program where two versions of a kernel differ in a bit."""
+    digests = {}
+    for backend in backends:
+        for output in kernel.outputs:
+            output.view(np.uint8).fill(0xA5)  # what one version leaves unwritten must not pass for its result
+        kernel.call(backend)
+        digests[backend] = [hashlib.blake2b(output).digest() for output in kernel.outputs]
+    different = [backend for backend in backends if digests[backend] != digests[backends[-1]]]
+    if different:
+        at = f" with {kernel.depth} disparities" if kernel.depth else ""
+        sys.exit(f"error: {kernel.name}{at}: {', '.join(different)} and {backends[-1]} differ; run the tests.")
+
+
+def median_seconds(call: Callable[[], object], runs: int) -> float:
+    """Median processor time of a call that has been made before; other programs' time is not counted."""
+    seconds = []
+    for _ in range(runs):
+        start = time.process_time()
+        call()
+        seconds.append(time.process_time() - start)
+    return statistics.median(seconds)
+
+
+# ---- OpenCV ------------------------------------------------------------------------------------------------
+
+OPENCV_MODES = {
+    "SGBM": cv2.STEREO_SGBM_MODE_SGBM,
+    "HH": cv2.STEREO_SGBM_MODE_HH,
+    "HH4": cv2.STEREO_SGBM_MODE_HH4,
+    "SGBM_3WAY": cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+}
+
+
+def opencv_matcher(mode: str, depth: int) -> cv2.StereoSGBM:
+    """OpenCV's matcher with the penalties of its documentation for windows of 3 x 3 pixels."""
+    return cv2.StereoSGBM.create(
+        minDisparity=0,
+        numDisparities=depth,
+        blockSize=3,
+        P1=8 * 9,
+        P2=32 * 9,
+        disp12MaxDiff=OPTIONS.max_left_right_difference,
+        preFilterCap=63,
+        mode=OPENCV_MODES[mode],
+    )
+
+
+# ---- tables ------------------------------------------------------------------------------------------------
+
+
+def time_kernel(kernel: Kernel, backends: Sequence[str], runs: int) -> Timing:
+    """Time all versions of a kernel."""
+    seconds = [median_seconds(lambda b=backend: kernel.call(b), runs) for backend in backends]
+    return Timing(kernel.name, kernel.depth, kernel.work, seconds)
+
+
+def kernel_row(timing: Timing) -> list[str]:
+    """Row of the table of kernels."""
+    unit, digits = ("MDE/s", 0) if timing.depth else ("Mpixel/s", 1)
+    rates = [f"{timing.work / s / 1e6:.{digits}f}" for s in timing.seconds]
+    cells = [c for s, rate in zip(timing.seconds, rates, strict=True) for c in (f"{1000 * s:.1f}", rate)]
+    return [timing.name, str(timing.depth or "-"), unit, *cells]
+
+
+def time_matchers(scene: Scene, ours: Kernel, ours_seconds: float, runs: int) -> list[list[str]]:
+    """Rows of the comparison: `match` and OpenCV's modes on the same pair."""
+    results = {"colmap_sph match": (ours_seconds, share_right(scene, disparity_of(ours.outputs[0])))}
+    for mode in OPENCV_MODES:
+        matcher = opencv_matcher(mode, scene.depth)
+        found = matcher.compute(scene.left, scene.right).astype(np.float32) / 16
+        seconds = median_seconds(lambda m=matcher: m.compute(scene.left, scene.right), runs)
+        results[f"OpenCV MODE_{mode}"] = seconds, share_right(scene, np.where(found < 0, np.nan, found))
+    hh_seconds = results["OpenCV MODE_HH"][0]
+    return [
+        [
+            name,
+            str(scene.depth),
+            f"{100 * right:.1f}",
+            f"{1000 * seconds:.1f}",
+            f"{ours.work / seconds / 1e6:.0f}",
+            f"{hh_seconds / seconds:.2f}",
+        ]
+        for name, (seconds, right) in results.items()
+    ]
+
+
+def limit_mde(name: str, instructions: float, bandwidth: float) -> float:
+    """What a kernel could reach, MDE/s, with so many vector instructions and copied bytes per second."""
+    operations, traffic = LIMITS[name]
+    return min(instructions * 32 / operations, bandwidth / traffic) / 1e6
+
+
+def print_limits(timings: Sequence[Timing]) -> None:
+    """The machine's limits, and how near to them the matching kernels come."""
+    bandwidth, instructions = copy_bandwidth(), vector_throughput()
+    operations, traffic = LIMITS["match"]
+    print(
+        f"\nCopy bandwidth, read and written: {bandwidth / 1e9:.1f} GB/s; `match` moves {traffic} bytes per ",
+        end="",
+    )
+    print(f"slot: at most {bandwidth / traffic / 1e6:.0f} MDE/s.")
+    if isinstance(instructions, str):
+        print(f"No arithmetic bound: {instructions}.")
+        return
+    print(
+        f"Independent vector instructions: {instructions / 1e9:.1f} billion/s; `match` has {operations} per ",
+        end="",
+    )
+    print(f"32 slots (cost {COST_OPS}, sweeps {AGGREGATION_OPS}, selection {SELECTION_OPS}): at most ", end="")
+    print(f"{instructions * 32 / operations / 1e6:.0f} MDE/s.\n")
+    rows = []
+    for timing in timings:
+        limit = limit_mde(timing.name, instructions, bandwidth)
+        share = f"{100 * timing.speed / limit:.0f} %"
+        rows.append([timing.name, str(timing.depth), f"{timing.speed:.0f}", f"{limit:.0f}", share])
+    print(table(["kernel", "disparities", "MDE/s", "bound, MDE/s", "share"], rows))
+    print(
+        "\nThe rest: loads and stores, what is done per pixel (penalties, horizontal minima, shifted ranges, "
+        "sub-pixel fit), shuffles that fewer units can do, and each pixel's wait for the one before it on its row."
+    )
+
+
+def bench(width: int, height: int, disparities: int, runs: int) -> None:
+    """Check, time and print all tables."""
+    backends = _native.backends()
+    timings: list[Timing] = []
+    comparison: list[list[str]] = []
+    wall, processor = time.perf_counter(), time.process_time()
+    for depth in dict.fromkeys((disparities, *LEVELS)):
+        coarsest = depth == disparities
+        scene = make_scene(width, height, depth, same_range=coarsest)
+        kernels = [*(image_kernels(scene) if coarsest else []), *matching_kernels(scene)]
+        for kernel in kernels:
+            check_equality(kernel, backends)
+        timings += [time_kernel(kernel, backends, runs) for kernel in kernels]
+        comparison += time_matchers(scene, kernels[-1], timings[-1].seconds[0], runs)
+    share = (time.process_time() - processor) / (time.perf_counter() - wall)
+    print(f"Equal to the bit: {', '.join(backends)}.\n" if len(backends) > 1 else "One version only.\n")
+    header = ["kernel", "disparities", "unit", *(c for b in backends for c in (f"{b}, ms", f"{b}, per s"))]
+    print(table(header, map(kernel_row, timings)) + "\n")
+    header = ["matcher", "disparities", "within 1 pixel, %", "ms", "MDE/s", "times as fast as HH"]
+    print(table(header, comparison))
+    if share < 0.95:
+        print(f"\nOnly {100 * share:.0f} % of the time on a processor: other programs share its caches, too.")
+    if backends[0] == "avx2":
+        print_limits([timing for timing in timings if timing.depth])
+
+
+def main() -> None:
+    """Check, time, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--width", type=int, default=1024)
+    parser.add_argument("--height", type=int, default=768)
+    parser.add_argument("--disparities", type=int, default=128, help="of the coarsest level; a multiple of 32")
+    parser.add_argument("--runs", type=int, default=5, help="timed runs of each kernel")
+    arguments = parser.parse_args()
+    if arguments.disparities % 32 or not 32 <= arguments.disparities <= 1024:
+        parser.error(f"--disparities must be a multiple of 32 up to 1024, not {arguments.disparities}")
+    if not (arguments.disparities + 64 <= arguments.width <= 65535 and arguments.height >= 32):
+        parser.error("--width must lie between --disparities + 64 and 65535, and --height be at least 32")
+    if arguments.runs < 1:
+        parser.error(f"--runs must be at least 1, not {arguments.runs}")
+    cv2.setNumThreads(1)
+    print(f"{machine()}; OpenCV {cv2.__version__}; {arguments.width} x {arguments.height} pixels; ", end="")
+    print(f"one thread, median of {arguments.runs} runs\n", flush=True)
+    bench(arguments.width, arguments.height, arguments.disparities, arguments.runs)
+
+
+if __name__ == "__main__":
+    main()
