@@ -5,7 +5,8 @@
 On a synthetic pair: texture, seen with the disparities of slanted planes, with noise. First all versions of every
 kernel must give the same bits (exit code 1 if not), then each is timed, in one thread: median of the runs, in
 million disparity evaluations per second (MDE/s = width * height * disparities / seconds / 1e6), or in megapixels
-per second. OpenCV is counted in the same way, though it leaves out the leftmost `disparities` columns.
+per second; seconds are of the processor. OpenCV is counted in the same way, though it leaves out the leftmost
+`disparities` columns.
 
 With --disparities all pixels search the same range, as at the matcher's coarsest level; with 32 and 64 disparities
 each searches around its surface, as at its other levels.
@@ -247,12 +248,12 @@ def check_equality(kernel: Kernel, backends: Sequence[str]) -> None:
 
 
 def median_seconds(call: Callable[[], object], runs: int) -> float:
-    """Median time of a call that has been made before."""
+    """Median processor time of a call that has been made before; other programs' time is not counted."""
     seconds = []
     for _ in range(runs):
-        start = time.perf_counter()
+        start = time.process_time()
         call()
-        seconds.append(time.perf_counter() - start)
+        seconds.append(time.process_time() - start)
     return statistics.median(seconds)
 
 
@@ -376,7 +377,7 @@ def bench(width: int, height: int, disparities: int, runs: int) -> None:
     header = ["matcher", "disparities", "within 1 pixel, %", "ms", "MDE/s", "times as fast as HH"]
     print(table(header, comparison))
     if share < 0.95:
-        print(f"\nOnly {100 * share:.0f} % of the time on a processor: other programs made the times longer.")
+        print(f"\nOnly {100 * share:.0f} % of the time on a processor: other programs share its caches, too.")
     if backends[0] == "avx2":
         print_limits([timing for timing in timings if timing.depth])
 
