@@ -12,7 +12,7 @@ from test_undistortion import make_project
 from colmap_sph.errors import ColmapSphError, InputError
 from colmap_sph.workspace import check_map, read_depth_map, read_normal_map, write_depth_map, write_normal_map
 
-NUM_COMMANDS = 252
+NUM_COMMANDS = 216
 NUM_MAPS = 60
 
 
