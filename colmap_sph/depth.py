@@ -28,7 +28,7 @@ _BAND_BYTES = 8 << 20
 class DepthOptions:
     """How a view's pairs become its depth map."""
 
-    disparity_sigma: float = 0.25
+    disparity_sigma: float = 0.2
     """Standard deviation, pixels, of a disparity on a smooth surface; where disparities are rough it is larger.
     The scale of every tolerance below."""
     max_disparity_step: float = 2.0
@@ -39,12 +39,12 @@ class DepthOptions:
     """Pairs that must agree on a photometric depth."""
     max_reprojection_error: float = 2.0
     """Two views' depths agree when the point, seen by the other view, projects back within this many pixels."""
-    consistency_tolerance: float = 6.0
+    consistency_tolerance: float = 4.5
     """… and when they differ by less than this many standard deviations."""
     min_consistent: int = 2
     """Views, of those that share a pair with the image, that must confirm a geometric depth; one is enough for a
     point that no other has in view."""
-    max_contradiction: float = 1.0
+    max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
 
     def check(self) -> None:

@@ -75,7 +75,8 @@ def test_penta_depth_maps(penta: Result) -> None:
     assert mean.median_error < 0.2
     for name, one in scores.items():
         assert one.coverage > 0.45, name
-        assert one.within[0] > 0.85, name
+        # At the rim of the block two oblique views alone confirm walls: more of them, less exact.
+        assert one.within[0] > 0.8, name
 
 
 def test_penta_cloud(penta: Result) -> None:
@@ -85,7 +86,7 @@ def test_penta_cloud(penta: Result) -> None:
     np.testing.assert_allclose(np.linalg.norm(cloud["normal"], axis=1), 1, atol=1e-3)
     # A city seen from above: roofs and streets face the sky, and hardly anything the ground.
     assert np.mean(cloud["normal"][:, 2] > 0.7) > 0.85
-    assert np.mean(cloud["normal"][:, 2] < -0.3) < 0.001
+    assert np.mean(cloud["normal"][:, 2] < -0.3) < 0.003
 
 
 def test_fountain(fountain: Result) -> None:
