@@ -64,7 +64,7 @@ class Measured:
 def command() -> list[str]:
     """The installed command beside this Python, else the package's module."""
     script = Path(sys.executable).parent / "colmap_sph"
-    return [str(script)] if script.is_file() else [sys.executable, "-m", "colmap_sph.cli"]
+    return [str(script)] if script.is_file() else [sys.executable, "-P", "-m", "colmap_sph"]
 
 
 def run_process(arguments: Sequence[str], log: Path) -> tuple[int, float, float, int]:

@@ -115,7 +115,7 @@ def kill_and_resume(arguments: list[str], output: Path, num_kills: int, seed: in
 
 def run(arguments: list[str], workspace: Path, *, kill_after: float | None = None) -> bool:
     """Run the command; return whether it came to its end, which without a kill it must."""
-    command = [sys.executable, "-m", "colmap_sph", "run", *arguments, "--output", str(workspace)]
+    command = [sys.executable, "-P", "-m", "colmap_sph", "run", *arguments, "--output", str(workspace)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         try:
             said, _ = process.communicate(timeout=kill_after)

@@ -161,7 +161,7 @@ def test_the_log_of_a_second_run_follows_the_first(small: Path, capsys: pytest.C
 def test_as_a_program(small: Path) -> None:
     """A process of its own, without a terminal, with Python's warnings as errors."""
     done = subprocess.run(
-        [sys.executable, "-W", "error", "-m", "colmap_sph", "run", "--model", "sparse/0", *FAST],
+        [sys.executable, "-P", "-W", "error", "-m", "colmap_sph", "run", "--model", "sparse/0", *FAST],
         capture_output=True,
         text=True,
         timeout=120,
@@ -171,7 +171,7 @@ def test_as_a_program(small: Path) -> None:
     assert re.search(r"cloud +[\d,]+ points in \S", done.stderr)
     assert done.stdout == ""
     done = subprocess.run(
-        [sys.executable, "-m", "colmap_sph", "run", "--model", "nowhere"], capture_output=True, text=True
+        [sys.executable, "-P", "-m", "colmap_sph", "run", "--model", "nowhere"], capture_output=True, text=True
     )
     assert done.returncode == 2
     assert "nowhere does not exist" in error_sentence(done.returncode, done.stderr)

@@ -197,7 +197,7 @@ def test_an_empty_exact_depth_map_is_left_out(folder, capsys):
 
 
 def test_the_command_line_itself(folder):
-    command = [sys.executable, "-m", "colmap_sph", "evaluate", folder / "deep.ply"]
+    command = [sys.executable, "-P", "-m", "colmap_sph", "evaluate", folder / "deep.ply"]
     command += ["--reference", folder / "depth", "--model", folder / "sparse"]
     run = subprocess.run([*map(str, command), "--depth-scale", "0.0005"], capture_output=True, text=True)
     assert run.returncode == 0 and "deep.ply" in run.stdout and run.stderr == ""

@@ -11,7 +11,7 @@ def fuzz(*arguments: str, before: str = "") -> subprocess.CompletedProcess[str]:
     """Run the script, after some lines of code."""
     code = f"import runpy, sys\nsys.argv = {['fuzz', *arguments]!r}\n{before}\n"
     code += f"runpy.run_path({str(SCRIPT)!r}, None, '__main__')"
-    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=100)
+    return subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=100)
 
 
 def test_no_call_fails() -> None:

@@ -23,7 +23,7 @@ STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
 
 
 def start(*arguments: object) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "colmap_sph", "run", *map(str, arguments), "--threads", "2"]
+    command = [sys.executable, "-P", "-m", "colmap_sph", "run", *map(str, arguments), "--threads", "2"]
     return started(command)
 
 
@@ -280,7 +280,7 @@ def test_read_only_disk(uninterrupted: Path, small_disk: Path, capsys: pytest.Ca
 def test_files_that_may_not_grow(uninterrupted: Path, tmp_path: Path) -> None:
     """A limit on the size of a file, which the normal maps exceed, for those who cannot mount a full disk."""
     model, dense = uninterrupted.parent / "sparse/0", tmp_path / "dense"
-    command = [sys.executable, "-m", "colmap_sph", "run", "--model", str(model), "--output", str(dense)]
+    command = [sys.executable, "-P", "-m", "colmap_sph", "run", "--model", str(model), "--output", str(dense)]
 
     def limit() -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (800_000, 800_000))

@@ -76,7 +76,7 @@ def test_penta_depth_maps(penta: Result) -> None:
     for name, one in scores.items():
         assert one.coverage > 0.45, name
         # At the rim of the block two oblique views alone confirm walls: more of them, less exact.
-        assert one.within[0] > 0.8, name
+        assert one.within[0] > 0.7, name
 
 
 def test_penta_cloud(penta: Result) -> None:

@@ -142,7 +142,7 @@ CHANGES = {
         expected_files(pairs=0, votes=4, photometric=4, geometric=4, cloud=True),
     ),
     "consistency": (
-        {"depth": DepthOptions(max_contradiction=0.5)},
+        {"depth": DepthOptions(max_contradiction=0.7)},
         expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
     ),
     "normals": (
