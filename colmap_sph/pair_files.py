@@ -90,6 +90,17 @@ def stored_key(path: Path) -> str | None:
         return None
 
 
+def disparity_bytes(path: Path) -> int:
+    """About the memory that the disparity map of a pair's file takes; 0 where the file is missing.
+
+    A missing file is for `read_pair` to report: another worker may have found it damaged and removed it.
+    """
+    try:
+        return 2 * path.stat().st_size  # two bytes per pixel in the file, four in memory
+    except OSError:
+        return 0
+
+
 def _is_damaged(path: Path) -> bool:
     """Whether an archive is there, but cut off or altered; its checksums tell."""
     try:

@@ -24,7 +24,7 @@ from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, Scratch, match_pair
 from colmap_sph.memory import MemoryGate, format_memory, resident
 from colmap_sph.normals import fit_normals
-from colmap_sph.pair_files import read_arrays, read_pair, stored_key, write_arrays, write_pair
+from colmap_sph.pair_files import disparity_bytes, read_arrays, read_pair, stored_key, write_arrays, write_pair
 from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
 from colmap_sph.scene import View
 from colmap_sph.state import forget, vouch, vouched_facts
@@ -155,8 +155,7 @@ def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str,
     def work(view: View) -> Done:
         state = vote_state(context, pair_keys, view)
         if not state.is_done:
-            # A pair's file has two bytes per pixel, its map four.
-            maps = sum(2 * context.pair_path(*pair).stat().st_size for pair in _pairs_of(pair_keys, view.name))
+            maps = sum(disparity_bytes(context.pair_path(*pair)) for pair in _pairs_of(pair_keys, view.name))
             with gate.reserve(maps + _VOTE_BYTES * view.width * view.height, view.name):
                 estimate = _read_estimate(context, view.name) if state.is_voted else _vote(view, state.key)
                 _write_maps(context, view, estimate, "photometric", context.keys.photometric(state.key))

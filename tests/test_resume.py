@@ -325,11 +325,12 @@ def spoil_disparities(path: Path) -> None:
     path.write_bytes(data)
 
 
-def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Finished) -> None:
+@pytest.mark.parametrize("threads", [1, 2])
+def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Finished, threads: int) -> None:
     ids = finished.ids
     path = finished.dense / f"colmap_sph/pairs/{ids[NAMES[0]]:06d}-{ids[NAMES[1]]:06d}.npz"
     spoil_disparities(path)
-    changed = {"depth": DepthOptions(vote_tolerance=2.5)}
+    changed = {"depth": DepthOptions(vote_tolerance=2.5), "threads": threads}
     report = finished.rerun(**changed)
     # Whichever of the two read it first removed it; the other finds it missing.
     assert sorted(report.skipped_images) == NAMES[:2]
