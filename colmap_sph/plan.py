@@ -240,4 +240,5 @@ def _memory(context: Context, survey: _Survey) -> float:
         if options.use_cache:
             fusion = min(fusion, options.cache_size * 1e9)
         fusion += _FUSION_MASK_MEMORY * max(view.width * view.height**2 for view in views)
-    return min(_BASE_MEMORY + max(matching, fusion), most)
+    # The budget bounds the matching, not COLMAP's fusion.
+    return max(min(_BASE_MEMORY + matching, most), _BASE_MEMORY + fusion)
