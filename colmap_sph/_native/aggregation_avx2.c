@@ -61,6 +61,14 @@ static const uint8_t *shifted(const uint8_t *slots, int64_t difference, ptrdiff_
     return scratch + GAP;
 }
 
+/* The step from pixel q to p, whose slots and their minimum are given. */
+ALWAYS_INLINE step begin_step(const sweep_state *s, ptrdiff_t p, ptrdiff_t q, const uint8_t *slots,
+                              __m256i least) {
+    const int p2 = s->penalties.p2[abs(s->image[p] - s->image[q])];
+    /* Saturated: without common slots `least` itself has grown to 62 + P2. */
+    return (step){slots, least, _mm256_adds_epu8(least, _mm256_set1_epi8((char)p2)), _mm256_set1_epi8((char)255)};
+}
+
 ALWAYS_INLINE __m256i advance(step *s, __m256i below, __m256i same, __m256i above, __m256i cost, __m256i p1) {
     const __m256i one_step = _mm256_adds_epu8(_mm256_min_epu8(below, above), p1);
     const __m256i best = _mm256_min_epu8(_mm256_min_epu8(same, one_step), s->jump);
@@ -108,11 +116,9 @@ ALWAYS_INLINE step begin_vertical(const sweep_state *s, ptrdiff_t y, ptrdiff_t x
     }
     const ptrdiff_t p = y * width + x, q = (y - direction) * width + before_x;
     const int64_t difference = (int64_t)s->base[p] - s->base[q];
-    const int jump = s->penalties.p2[abs(s->image[p] - s->image[q])];
-    const __m256i least = _mm256_set1_epi8((char)place[depth + MINIMUM]);
-    /* Saturated: without common slots `least` itself has grown to 62 + P2. */
-    return (step){llabs(difference) <= s->penalties.max_slant ? place : shifted(place, difference, depth, scratch),
-                  least, _mm256_adds_epu8(least, _mm256_set1_epi8((char)jump)), _mm256_set1_epi8((char)255)};
+    const uint8_t *slots =
+        llabs(difference) <= s->penalties.max_slant ? place : shifted(place, difference, depth, scratch);
+    return begin_step(s, p, q, slots, _mm256_set1_epi8((char)place[depth + MINIMUM]));
 }
 
 /* The path along the row: slots of the pixel before in registers. */
@@ -125,7 +131,6 @@ ALWAYS_INLINE step begin_along(const sweep_state *s, ptrdiff_t p, __m256i least,
                                along_row *along) {
     const ptrdiff_t q = p - (s->backward ? -1 : 1);
     const int64_t difference = (int64_t)s->base[p] - s->base[q];
-    const int jump = s->penalties.p2[abs(s->image[p] - s->image[q])];
     along->first_below = along->last_above = _mm256_set1_epi8((char)255);
     if (llabs(difference) > s->penalties.max_slant) {
         uint8_t unshifted[MAX_DEPTH], scratch[MAX_DEPTH + 2 * GAP];
@@ -139,7 +144,7 @@ ALWAYS_INLINE step begin_along(const sweep_state *s, ptrdiff_t p, __m256i least,
         along->first_below = load(slots - 32);
         along->last_above = load(slots + depth);
     }
-    return (step){NULL, least, _mm256_adds_epu8(least, _mm256_set1_epi8((char)jump)), _mm256_set1_epi8((char)255)};
+    return begin_step(s, p, q, NULL, least);
 }
 
 ALWAYS_INLINE void sweep_row_of(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
