@@ -1,6 +1,7 @@
 """The memory budget of a run: what is left of it, and a gate that work passes only with its share."""
 
 import re
+import resource
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -47,7 +48,7 @@ def budget(wanted: int) -> int:
 def resident() -> int:
     """Bytes of memory this process has in use."""
     try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
     except (OSError, ValueError, IndexError):
         return 200 << 20
 
@@ -74,27 +75,33 @@ class MemoryGate:
     ----------
     total : int
         Bytes of the whole run, what the process has in use already among them.
-    kept : int
-        Bytes that caches and scratch memory may take on their own.
     """
 
-    def __init__(self, total: int, kept: int = 0) -> None:
-        self._total, self._outside = total, resident() + kept
-        self._free = total - self._outside
+    def __init__(self, total: int) -> None:
+        self._total, self._outside = total, resident()
         self._reserved = 0
         self._changed = threading.Condition()
+
+    @property
+    def free(self) -> int:
+        """Bytes of the budget that neither the process has in use nor caches keep."""
+        return max(self._total - self._outside, 0)
+
+    def keep(self, amount: int) -> None:
+        """Take `amount` bytes for caches and scratch memory, for good; before any work begins."""
+        self._outside += amount
 
     @contextmanager
     def reserve(self, amount: float, what: str) -> Iterator[None]:
         """Wait until `amount` bytes of arrays fit, and hold them; `OptionError` where they never can."""
         needed = int(_SLACK * amount)
-        if needed > self._free:
+        if needed > self.free:
             raise OptionError(
                 f"--memory {format_memory(self._total)} is too little for {what}; "
                 f"{format_memory((self._outside + needed) * 1.05)} would do."
             )
         with self._changed:
-            self._changed.wait_for(lambda: self._reserved + needed <= self._free)
+            self._changed.wait_for(lambda: self._reserved + needed <= self.free)
             self._reserved += needed
         try:
             yield

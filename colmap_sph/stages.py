@@ -79,10 +79,11 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
     """
     report = context.report
     make_dir(context.pairs_dir)
-    thread, threads, total = threading.local(), context.options.num_threads, context.options.memory_budget
-    spare = max(total - resident(), 0)
-    scratch_bytes, cache_bytes = min(_SCRATCH_BYTES, spare // (3 * threads)), min(_CACHE_BYTES, spare // 12)
-    gate = MemoryGate(total, kept=threads * scratch_bytes + 2 * cache_bytes)
+    thread, threads = threading.local(), context.options.num_threads
+    gate = MemoryGate(context.options.memory_budget)
+    scratch_bytes = min(_SCRATCH_BYTES, gate.free // (3 * threads))
+    cache_bytes = min(_CACHE_BYTES, gate.free // 12)
+    gate.keep(threads * scratch_bytes + 2 * cache_bytes)
     images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
     masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, cache_bytes)
 
@@ -199,9 +200,9 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
     `votes` are what `estimate_views` returned. Returns the keys of the maps by image name.
     """
     report, partners = context.report, partners_of(pairs)
-    total = context.options.memory_budget
-    cache_bytes = min(_CACHE_BYTES, max(total - resident(), 0) // 3)
-    gate = MemoryGate(total, kept=cache_bytes)
+    gate = MemoryGate(context.options.memory_budget)
+    cache_bytes = min(_CACHE_BYTES, gate.free // 3)
+    gate.keep(cache_bytes)
     estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, cache_bytes)
 
     def work(view: View) -> Done:
