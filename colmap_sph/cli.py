@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import cv2
 import rich.logging
@@ -90,6 +90,11 @@ class RunCommand:
         """The options of all stages."""
         return RunOptions(**{name: getattr(self, name) for name in RunOptions.__dataclass_fields__})
 
+    def sources(self) -> dict[str, Any]:
+        """What `run` and `make_plan` are to work on, by the names of their arguments."""
+        names = ("model", "images", "masks", "output", "workspace", "overwrite")
+        return {name: getattr(self, name) for name in names}
+
 
 @dataclass(frozen=True)
 class DemoCommand:
@@ -152,28 +157,10 @@ def run_command(command: RunCommand, console: Console) -> int:
     options = command.options()
     options.check()
     if command.dry_run:
-        plan = make_plan(
-            command.model,
-            images=command.images,
-            masks=command.masks,
-            output=command.output,
-            workspace=command.workspace,
-            options=options,
-            overwrite=command.overwrite,
-        )
-        print_plan(plan, Workspace(root), console)
+        print_plan(make_plan(options=options, **command.sources()), Workspace(root), console)
         return 0
     with workspace_log(Workspace(root), _header(command)), _Display(console) as display:
-        report = run(
-            command.model,
-            images=command.images,
-            masks=command.masks,
-            output=command.output,
-            workspace=command.workspace,
-            options=options,
-            progress=display,
-            overwrite=command.overwrite,
-        )
+        report = run(options=options, progress=display, **command.sources())
     print_summary(report, Workspace(root), console)
     return PARTIAL_EXIT_CODE if report.skipped_images else 0
 
