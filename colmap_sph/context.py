@@ -11,13 +11,15 @@ from typing import TypeVar
 from colmap_sph.keys import Keys
 from colmap_sph.options import RunOptions
 from colmap_sph.report import Progress, RunReport, Silent
-from colmap_sph.scene import Scene
+from colmap_sph.scene import Scene, View
 from colmap_sph.workers import for_all
 from colmap_sph.workspace import MapKind, Workspace
 
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
+# Names of two images.
+Pair = tuple[str, str]
 
 
 @dataclass(frozen=True)
@@ -32,11 +34,14 @@ class Done:
         Whether this run worked it out; else an earlier run had.
     coverage : float
         Share of pixels with a depth, where the stage gives one.
+    points : int
+        Points of the cloud, where the stage gives them.
     """
 
     key: str
     made: bool
     coverage: float = 0.0
+    points: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +111,12 @@ class Context:
             results = for_all(work, items, threads=self.options.num_threads, progress=self.progress, skip=skip)
         self.count(stage, results.values())
         return results
+
+    def skip_view(self, item: View | str, reason: str) -> None:
+        """Report that a view could not be done."""
+        name = item if isinstance(item, str) else item.name
+        self.report.skipped_images[name] = reason
+        logger.warning("%s skipped: %s", name, reason)
 
     def count(self, stage: str, results: Iterable[Done]) -> None:
         """Report how many results of a stage are new, and how many an earlier run had made."""

@@ -18,7 +18,7 @@ from colmap_sph import _native
 from colmap_sph.errors import OptionError
 from colmap_sph.kernels import backend
 from colmap_sph.rectification import RectifiedPair, Side, rectified_ray_from_pixel
-from colmap_sph.scene import View
+from colmap_sph.scene import View, pixel_transfer
 
 # Candidates of all pairs are voted on in bands of rows of about this size.
 _BAND_BYTES = 8 << 20
@@ -237,7 +237,8 @@ def check_depth(
             estimate.sigma,
             partner_estimate.depth,
             partner_estimate.sigma,
-            *_pixel_transfers(view, partner),
+            pixel_transfer(view, partner),
+            pixel_transfer(partner, view),
             options.max_reprojection_error,
             options.consistency_tolerance,
             observing,
@@ -254,18 +255,3 @@ def check_depth(
         depth = np.where(kept, estimate.depth + weighted / (weight + own), 0).astype(np.float32)
         sigma = np.where(kept, 1 / np.sqrt(weight + own), 0).astype(np.float32)
     return DepthEstimate(depth, sigma, np.where(kept, agreeing, 0).astype(np.uint8))
-
-
-def _pixel_transfers(reference: View, partner: View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """(3, 4) matrices [A | a]: partner pixel ~ A (col, row, 1) depth + a, and the way back."""
-
-    def transfer(source: View, target: View) -> NDArray[np.float64]:
-        rotation = target.R @ source.R.T
-        return np.hstack(
-            [
-                target.K @ rotation @ np.linalg.inv(source.K),
-                (target.K @ (target.t - rotation @ source.t))[:, None],
-            ]
-        )
-
-    return transfer(reference, partner), transfer(partner, reference)

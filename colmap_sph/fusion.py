@@ -1,45 +1,42 @@
-"""Dense workspace → fused cloud, by COLMAP's own fusion of the depth and normal maps.
+"""Depth and normal maps → cloud: one point for every piece of surface, from the pixel that sees it best.
 
-COLMAP's default gates suit its own patch match; ours keep one point per surface element instead of merging
-neighbours two pixels away, which thins a cloud several times. COLMAP computes with 32-bit floats, so a model in
-map coordinates is moved near its origin before, and the cloud back afterwards.
+Every pixel with a depth is looked up in the maps of the images that overlap its own. It becomes a point where
+enough of them see the same surface and none sees that piece of it with a finer pixel. So the cloud is as dense as
+its finest image everywhere, and an image is fused from the maps alone: images may be done in any order, by any
+number of threads, with the maps of few images in memory, and the cloud is the same to the byte.
 """
 
-import errno
-import os
-import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
+from typing import Literal
 
+import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
-from colmap_sph.colmap_log import quiet_colmap
-from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.map_coordinates import local_origin, move_cloud, move_model
-from colmap_sph.scene import cameras_of_images, load_model
-from colmap_sph.staging import scratch_folder
-from colmap_sph.workspace import MapKind, Workspace, check_map, make_dir
+from colmap_sph import _native
+from colmap_sph.cloud_files import POINT
+from colmap_sph.errors import InputError, OptionError
+from colmap_sph.masks import read_mask
+from colmap_sph.scene import View, pixel_transfer
+from colmap_sph.workspace import MapKind, Workspace, mask_path, read_depth_map, read_normal_planes
 
-# COLMAP derives the name of the visibility file from the cloud's.
-_CLOUD_FILES = ("fused.ply", "fused.ply.vis")
-# COLMAP's cloud: position and normal in 32-bit floats, and a colour.
-_PLY_END = b"end_header\n"
-_PLY_POINT_BYTES = 6 * 4 + 3
+# A bit for each of them.
+MAX_PARTNERS = 64
+# Points are made from so many pixels at a time.
+_BAND_PIXELS = 1 << 20
 
 
 @dataclass(frozen=True)
 class FusionOptions:
-    """COLMAP's fusion options, under COLMAP's names, with defaults for our maps."""
+    """How maps become a cloud: under COLMAP's names, with defaults for our maps."""
 
+    method: Literal["best-pixel", "colmap"] = "best-pixel"
+    """Our own, a point from the pixel that sees a piece of surface best; or COLMAP's stereo_fusion."""
     min_num_pixels: int = 2
     """Pixels, of different images, that must agree on a point (COLMAP: 5)."""
-    max_num_pixels: int = 10000
-    """Most pixels to merge into one point."""
-    max_traversal_depth: int = 100
-    """Longest chain of pixels, from image to image, that makes one point."""
     max_reproj_error: float = 0.5
     """Pixels within this distance of a point's projection are merged into it (COLMAP: 2)."""
     max_depth_error: float = 0.01
@@ -47,16 +44,22 @@ class FusionOptions:
     max_normal_error: float = 30.0
     """Largest angle, degrees, of normals that agree (COLMAP: 10)."""
     check_num_images: int = 50
-    """Overlapping images to look for agreement in."""
+    """Overlapping images to look for agreement in; our own looks in no more than 64."""
     mask_path: Path | None = None
     """Folder of NAME.png masks in undistorted geometry, black = excluded."""
+    max_num_pixels: int = 10000
+    """Most pixels to merge into one point (COLMAP's only)."""
+    max_traversal_depth: int = 100
+    """Longest chain of pixels, from image to image, that makes one point (COLMAP's only)."""
     use_cache: bool = False
-    """Keep only part of the maps in memory, `cache_size` of them."""
+    """Keep only part of the maps in memory, `cache_size` of them (COLMAP's only; ours always does)."""
     cache_size: float = 32.0
     """Gigabytes of maps to keep in memory with `use_cache`."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
+        if self.method not in ("best-pixel", "colmap"):
+            raise OptionError(f"fusion method must be 'best-pixel' or 'colmap', not {self.method!r}.")
         for name in ("min_num_pixels", "max_num_pixels", "max_traversal_depth", "check_num_images"):
             if getattr(self, name) < 1:
                 raise OptionError(f"fusion {name} must be at least 1, not {getattr(self, name)}.")
@@ -72,189 +75,126 @@ class FusionOptions:
             raise OptionError(f"the fusion mask folder {self.mask_path} does not exist.")
 
 
-def fuse(
-    workspace: Workspace,
-    options: FusionOptions,
-    *,
-    threads: int = -1,
-    kind: MapKind = "geometric",
-    partners: Mapping[str, Sequence[str]] | None = None,
-) -> int:
-    """Fuse the workspace's maps with COLMAP's `stereo_fusion` into ``fused.ply`` and ``fused.ply.vis``.
+@dataclass(frozen=True, eq=False)
+class ViewMaps:
+    """A view with what is fused of it.
 
-    The cloud of a model in map coordinates has 64-bit coordinates. What COLMAP's other programs, which compute
-    with 32-bit floats, need to go on is left in ``colmap_sph/local``: a workspace of links with the model and the
-    cloud near their origin, and that origin's map coordinates in ``origin.txt``.
+    Attributes
+    ----------
+    view : View
+    index : int
+        Its place among the images of the model: what ``fused.ply.vis`` calls it by.
+    depth : (H, W) float32 ndarray
+        z-depth along the ray K⁻¹ (col, row, 1), model units; 0 = none.
+    normals : (3, H, W) float32 ndarray
+        Unit vectors in the camera frame, towards the camera, plane by plane as in COLMAP's file.
+    image : (H, W, 3) uint8 ndarray
+        Blue, green, red, as OpenCV reads it.
+    """
+
+    view: View
+    index: int
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    image: NDArray[np.uint8]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return self.depth.nbytes + self.normals.nbytes + self.image.nbytes
+
+
+def read_view_maps(workspace: Workspace, view: View, index: int, kind: MapKind, masks: Path | None) -> ViewMaps:
+    """Read what is fused of a view; see `ViewMaps`.
 
     Parameters
     ----------
     workspace : Workspace
-        With images, model, maps and ``fusion.cfg``.
-    options : FusionOptions
-    threads : int
-        Threads of COLMAP's fusion; -1: all cores.
+    view : View
+    index : int
     kind : {"geometric", "photometric"}
-        Which maps to fuse.
-    partners : mapping of str to sequence of str, optional
-        For each image the images to look for agreement in; without it those that share tracks with it, as in
-        COLMAP, where a model without tracks fuses to nothing.
-
-    Returns
-    -------
-    int
-        Number of points.
+    masks : Path, optional
+        Folder of ``NAME.png`` masks of the undistorted images, black = excluded.
 
     Raises
     ------
     InputError
-        A map is missing, or ``fusion.cfg`` is missing or names images that the model does not have.
-    OutputError
-        The cloud cannot be written.
+        A map, the image or the mask is missing, damaged or not of the camera's size.
     """
-    options.check()
-    _check_places(workspace)
-    model, colmap_options = _check_maps(workspace, kind), _colmap_options(options, threads)
-    origin = local_origin(model)
-    scratch = workspace.state_dir / "fusion"
-    with scratch_folder(scratch):
-        try:
-            source = workspace.root
-            if partners is not None or origin.any():
-                source = _link_workspace(workspace, model, partners, origin, scratch)
-            with quiet_colmap():
-                cloud = pycolmap.stereo_fusion(
-                    scratch / "fused.ply", source, input_type=kind, options=colmap_options, output_type="PLY"
-                )
-            _check_written(scratch / "fused.ply", scratch / "fused.ply.vis", cloud.num_points3D())
-            _move_into_place(scratch, workspace, origin)
-        except (OSError, RuntimeError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
-            raise OutputError(
-                f"COLMAP's fusion cannot write {workspace.fused_path} ({reason}); check space and permissions."
-            ) from error
-    return int(cloud.num_points3D())
-
-
-def _check_places(workspace: Workspace) -> None:
-    """Raise `OutputError` where a folder is in the cloud's place."""
-    for name in _CLOUD_FILES:
-        if (workspace.root / name).is_dir():
-            raise OutputError(f"{workspace.root / name} is a folder; remove it, the cloud goes there.")
-
-
-def _colmap_options(options: FusionOptions, threads: int) -> pycolmap.StereoFusionOptions:
-    """Our options as COLMAP's."""
-    colmap_options = pycolmap.StereoFusionOptions()
-    for name in FusionOptions.__dataclass_fields__:
-        value = getattr(options, name)
-        if name != "mask_path" or value is not None:
-            setattr(colmap_options, name, value)
-    colmap_options.num_threads = threads
-    return colmap_options
-
-
-def _move_into_place(scratch: Path, workspace: Workspace, origin: NDArray[np.float64]) -> None:
-    """Move the cloud that was fused in `scratch` to its place, in the coordinates of the workspace's model."""
-    shutil.rmtree(workspace.local_dir, ignore_errors=True)
-    if origin.any():
-        _keep_local_workspace(workspace.local_dir, scratch, origin)
-    # A kill in between must not leave a cloud beside the visibility of another.
-    (workspace.root / _CLOUD_FILES[1]).unlink(missing_ok=True)
-    for name in _CLOUD_FILES:
-        (scratch / name).replace(workspace.root / name)
-
-
-def _check_written(cloud: Path, visibility: Path, num_points: int) -> None:
-    """Raise `OSError` for files that are cut off: COLMAP does not notice a full disk."""
-    with cloud.open("rb") as file:
-        header_bytes = file.read(1000).find(_PLY_END) + len(_PLY_END)
-    is_whole = cloud.stat().st_size == header_bytes + _PLY_POINT_BYTES * num_points
-    # Behind their number, each point has its number of images, and then these.
-    words, position = np.fromfile(visibility, dtype="<u4").data, 2
-    try:
-        for _ in range(num_points):
-            position += 1 + words[position]
-    except IndexError:
-        is_whole = False
-    if not is_whole or position != len(words):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
-    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, and these whole maps."""
-    try:
-        names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+    depth = read_depth_map(workspace.depth_map_path(view.name, kind))
+    normals = read_normal_planes(workspace.normal_map_path(view.name, kind))
+    path = workspace.image_path(view.name)
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
+    shape = (view.height, view.width)
+    if depth.shape != shape or normals.shape[1:] != shape or image.shape[:2] != shape:
         raise InputError(
-            f"{workspace.fusion_cfg_path} cannot be read ({error}); list the images in it."
-        ) from error
-    model = load_model(workspace.sparse_dir)
-    cameras = cameras_of_images(model)
-    for name in filter(None, map(str.strip, names)):
-        if name not in cameras:
-            raise InputError(f"{workspace.fusion_cfg_path} names {name!r}, which is not in the model; remove it.")
-        for path in (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)):
-            if not path.is_file():
-                raise InputError(f"The map {path} is missing; compute it, or remove {name!r} from fusion.cfg.")
-        shape = (cameras[name].height, cameras[name].width)
-        check_map(workspace.depth_map_path(name, kind), shape)
-        check_map(workspace.normal_map_path(name, kind), (*shape, 3))
-    return model
+            f"The maps or the image of {view.name} are not of its camera's {shape[1]} x {shape[0]} pixels; "
+            "delete the maps and compute them again."
+        )
+    mask = None if masks is None else read_mask(mask_path(masks, view.name), view.width, view.height)
+    if mask is not None:
+        depth[mask == 0] = 0
+    return ViewMaps(view, index, depth, normals, np.asarray(image, np.uint8))
 
 
-def _with_tracks(
-    source: pycolmap.Reconstruction, partners: Mapping[str, Sequence[str]]
-) -> pycolmap.Reconstruction:
-    """Copy a model, with one track for every pair of `partners` and no others.
+def fuse_view(
+    reference: ViewMaps, partners: Iterable[ViewMaps], options: FusionOptions
+) -> Iterator[tuple[NDArray[np.void], NDArray[np.uint32]]]:
+    """Make the points of a cloud which one view sees better than any other.
 
-    COLMAP's fusion asks the tracks alone which images overlap, and nothing else.
+    A partner agrees with a pixel where the depth and the normal at the pixel next to its projection do. It covers
+    it where that projection is within `max_reproj_error` of the partner's pixel, and that pixel stands for less
+    surface: depth² / (fx fy |n · r|), r the ray of depth 1. As this orders all pixels, one at least of those that
+    see a piece of surface is not covered.
+
+    Parameters
+    ----------
+    reference : ViewMaps
+    partners : iterable of ViewMaps
+        At most 64 are looked at, one after the other.
+    options : FusionOptions
+
+    Yields
+    ------
+    points : (n,) ndarray of `cloud_files.POINT`
+        World frame; the colour is the mean over the views that agree.
+    visibility : (m,) uint32 ndarray
+        For each point the number of these views and their indices: ``fused.ply.vis``.
     """
-    model = pycolmap.Reconstruction()
-    pairs = sorted({(min(a, b), max(a, b)) for a, others in partners.items() for b in others})
-    tracks = [pycolmap.Track() for _ in pairs]
-    for camera in source.cameras.values():
-        model.add_camera_with_trivial_rig(camera)
-    for image in (source.image(image_id) for image_id in sorted(source.reg_image_ids())):
-        mine = [track for pair, track in zip(pairs, tracks, strict=True) if image.name in pair]
-        for place, track in enumerate(mine):
-            track.add_element(image.image_id, place)
-        keypoints = np.zeros((len(mine), 2))
-        copy = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
-        model.add_image_with_trivial_frame(copy, image.cam_from_world())
-    for track in tracks:
-        first, second = (model.image(element.image_id) for element in track.elements)
-        # Between the two centres, where a triangulation angle is defined.
-        middle = (first.projection_center() + second.projection_center()) / 2
-        model.add_point3D(middle, track, np.zeros(3, dtype=np.uint8))
-    return model
-
-
-def _link_workspace(
-    workspace: Workspace,
-    model: pycolmap.Reconstruction,
-    partners: Mapping[str, Sequence[str]] | None,
-    origin: NDArray[np.float64],
-    folder: Path,
-) -> Path:
-    """Make `folder` a workspace of links, but for its model, which is moved to `origin`; return it."""
-    linked = Workspace(folder)
-    make_dir(linked.sparse_dir)
-    if partners is not None:
-        model = _with_tracks(model, partners)
-    if origin.any():
-        move_model(model, origin)
-    model.write_binary(linked.sparse_dir)
-    for link, target in ((linked.images_dir, workspace.images_dir), (linked.stereo_dir, workspace.stereo_dir)):
-        # Relative, so that the workspace can be moved as a whole.
-        link.symlink_to(os.path.relpath(target.resolve(), folder.resolve()))
-    return folder
-
-
-def _keep_local_workspace(local: Path, scratch: Path, origin: NDArray[np.float64]) -> None:
-    """Keep what was fused near the origin as `local`, and leave the cloud in map coordinates in `scratch`."""
-    local.mkdir()
-    for name in ("fused.ply", "images", "stereo", "sparse"):
-        (scratch / name).rename(local / name)
-    (local / "fused.ply.vis").symlink_to(Path("..", "..", "fused.ply.vis"))
-    (local / "origin.txt").write_text(" ".join(map(repr, origin.tolist())) + "\n")
-    move_cloud(local / "fused.ply", scratch / "fused.ply", origin)
+    shape = reference.depth.shape
+    covered, agreeing = np.zeros(shape, np.uint8), np.zeros(shape, np.uint64)
+    colour = reference.image.astype(np.uint16)
+    indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
+    indices[0] = reference.index
+    for bit, partner in enumerate(islice(partners, MAX_PARTNERS)):
+        indices[1 + bit] = partner.index
+        _native.fuse_partner(
+            reference.depth,
+            reference.normals,
+            np.linalg.inv(reference.view.K),
+            partner.depth,
+            partner.normals,
+            np.linalg.inv(partner.view.K),
+            partner.image,
+            pixel_transfer(reference.view, partner.view),
+            reference.view.R @ partner.view.R.T,
+            options.max_reproj_error,
+            options.max_depth_error,
+            np.cos(np.radians(options.max_normal_error)),
+            partner.index < reference.index,
+            bit,
+            covered,
+            agreeing,
+            colour,
+        )
+    view, step = reference.view, max(_BAND_PIXELS // shape[1], 1)
+    pixels = (reference.depth, reference.normals, covered, agreeing, colour, options.min_num_pixels)
+    frame = (np.ascontiguousarray(view.R.T @ np.linalg.inv(view.K)), np.ascontiguousarray(view.R.T), view.center)
+    for first in range(0, shape[0], step):
+        rows = (first, min(first + step, shape[0]))
+        num_points, num_words = _native.count_points(*pixels, *rows)
+        points, visibility = np.empty((num_points, POINT.itemsize), np.uint8), np.empty(num_words, np.uint32)
+        _native.write_points(*pixels, *rows, *frame, indices, points, visibility)
+        yield points.view(POINT)[:, 0], visibility

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.fusion import FusionOptions
 from colmap_sph.load_cache import LoadCache
+from colmap_sph.pairs import overlapping_views
 from colmap_sph.scene import Scene, View
 from colmap_sph.workspace import MapKind, Workspace, read_depth_map, read_normal_map
 
@@ -90,24 +91,17 @@ def explain_losses(
         return read_depth_map(depth_path), read_normal_map(normal_path)
 
     maps = LoadCache(load, lambda pair: pair[0].nbytes + pair[1].nbytes, _CACHE_BYTES)
+    overlapping = overlapping_views(scene, min(options.check_num_images, _EXPLAINED_PARTNERS))
     counts = np.zeros(5)
     for view in scene.views[:: -(-len(scene.views) // max_views)]:
         points, normals = _sample_points(view, *maps.get(view.name), samples)
         verdicts = np.zeros((len(points), 4), dtype=int)
-        for other in _overlapping(scene, view, min(options.check_num_images, _EXPLAINED_PARTNERS)):
-            verdicts += _verdicts(points, normals, other, *maps.get(other.name), options)
+        for name in overlapping[view.name]:
+            verdicts += _verdicts(points, normals, scene.view(name), *maps.get(name), options)
         enough = 1 + verdicts[:, 3] >= options.min_num_pixels
         failed = np.where(verdicts[:, :3].any(axis=1), verdicts[:, :3].argmax(axis=1) + 1, 0)
         counts += np.bincount(np.where(enough, 4, failed), minlength=5)
     return GateLosses(*(counts / max(counts.sum(), 1)))
-
-
-def _overlapping(scene: Scene, view: View, most: int) -> list[View]:
-    """Up to `most` other views, those which share most sparse points with `view` first."""
-    seen = np.zeros(len(scene.points), dtype=bool)
-    seen[view.point_indices] = True
-    others = [other for other in scene.views if other is not view]
-    return sorted(others, key=lambda other: -int(np.count_nonzero(seen[other.point_indices])))[:most]
 
 
 def _sample_points(

@@ -7,7 +7,7 @@ overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obey
 
 import logging
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -148,6 +148,27 @@ def select_pairs(
         selection = _explicit_selection(graph, options, explicit)
     _report(selection, options)
     return selection
+
+
+def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
+    """Names of up to `most` views that overlap each view, those which share most points with it first.
+
+    Where the model has no tracks, projected points or the frusta say what overlaps.
+    """
+    graph = _build_graph(scene, PairOptions(min_shared_points=1), None)
+    return {
+        view.name: [scene.views[j].name for j in graph.candidates(i)[0][:most]]
+        for i, view in enumerate(scene.views)
+    }
+
+
+def partners_of(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Partners of each image, sorted."""
+    partners: dict[str, list[str]] = {}
+    for left, right in pairs:
+        partners.setdefault(left, []).append(right)
+        partners.setdefault(right, []).append(left)
+    return {name: sorted(others) for name, others in partners.items()}
 
 
 class _Graph:

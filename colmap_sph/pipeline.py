@@ -13,6 +13,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from colmap_sph.claim import claimed
+from colmap_sph.cloud_stage import fuse_views
 from colmap_sph.context import Context, timed_stage
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.keys import Keys
@@ -20,7 +21,7 @@ from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairSelection, select_pairs
 from colmap_sph.report import Progress, RunReport, Silent
 from colmap_sph.scene import Scene, image_names, load_model, model_files, read_scene
-from colmap_sph.stages import check_views, estimate_views, fuse_views, match_pairs
+from colmap_sph.stages import check_views, estimate_views, match_pairs
 from colmap_sph.staging import discard_results
 from colmap_sph.undistortion import (
     UndistortionOptions,
@@ -173,7 +174,7 @@ def reconstruct(
         pairs = match_pairs(context, selection.unique_pairs())
         votes = estimate_views(context, pairs)
         maps = check_views(context, pairs, votes)
-    fuse_views(context, pairs, maps)
+        fuse_views(context, pairs, maps)
     _write_report(context)
     if not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")

@@ -11,22 +11,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_sph.context import Context
+from colmap_sph.cloud_stage import COLMAP_FUSION_BYTES, cloud_state
+from colmap_sph.context import Context, Pair
 from colmap_sph.errors import ColmapSphError
 from colmap_sph.keys import Keys
 from colmap_sph.options import RunOptions
-from colmap_sph.pairs import select_pairs
+from colmap_sph.pairs import partners_of, select_pairs
 from colmap_sph.pipeline import check_arguments, choose_pairs, find_database, wanted_scene
 from colmap_sph.rectification import rectify_pair
 from colmap_sph.scene import read_scene
 from colmap_sph.stages import (
-    FUSION_BYTES,
-    Pair,
     PairState,
     check_state,
-    cloud_state,
     pair_state,
-    partners_of,
     vote_state,
 )
 from colmap_sph.undistortion import foresee_workspace, leave_out_bad_images, open_workspace
@@ -233,12 +230,14 @@ def _survey_votes(context: Context, keys: Mapping[Pair, str], survey: _Survey) -
 
 def _memory(context: Context, survey: _Survey) -> float:
     matching = _MATCH_MEMORY * survey.largest_pair * min(context.options.num_threads, max(survey.pairs, 1))
-    views, fusion, options = context.scene.views, 0.0, context.options.fusion
-    most = context.options.memory_budget
-    if survey.fuse:
-        fusion = FUSION_BYTES * sum(view.width * view.height for view in views)
-        if options.use_cache:
-            fusion = min(fusion, options.cache_size * 1e9)
-        fusion += _FUSION_MASK_MEMORY * max(view.width * view.height**2 for view in views)
-    # The budget bounds the matching, not COLMAP's fusion.
-    return max(min(_BASE_MEMORY + matching, most), _BASE_MEMORY + fusion)
+    most, options = context.options.memory_budget, context.options.fusion
+    matching = min(_BASE_MEMORY + matching, most)
+    if not survey.fuse or options.method != "colmap":
+        return matching
+    views = context.scene.views
+    fusion = COLMAP_FUSION_BYTES * sum(view.width * view.height for view in views)
+    if options.use_cache:
+        fusion = min(fusion, options.cache_size * 1e9)
+    fusion += _FUSION_MASK_MEMORY * max(view.width * view.height**2 for view in views)
+    # The budget bounds all but COLMAP's fusion.
+    return max(matching, _BASE_MEMORY + fusion)

@@ -70,6 +70,21 @@ class View:
         return np.hstack([self.R, self.t[:, None]])
 
 
+def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:
+    """Return the (3, 4) matrix [A | a] from pixels of one view to those of another.
+
+    The pixel (col, row) with z-depth z in `source` lies at the homogeneous pixel A (col, row, 1) z + a in
+    `target`, whose third coordinate is its z-depth there. Both are integer pixels as the depth maps count them.
+    """
+    rotation = target.R @ source.R.T
+    return np.hstack(
+        [
+            target.K @ rotation @ np.linalg.inv(source.K),
+            (target.K @ (target.t - rotation @ source.t))[:, None],
+        ]
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Views, sorted by name, and the sparse points they observe.
@@ -83,11 +98,14 @@ class Scene:
     origin : (3,) float64 ndarray
         Where the scene's world origin lies in the model's coordinates: zero, but for a model in map
         coordinates, whose scene is moved near its origin.
+    image_ids : tuple of int
+        COLMAP's ids of all registered images of the model, in its order, the unusable ones among them.
     """
 
     views: tuple[View, ...]
     points: NDArray[np.float64]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    image_ids: tuple[int, ...] = ()
 
     @cached_property
     def index_of(self) -> dict[str, int]:
@@ -138,7 +156,8 @@ def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
             logger.warning("%s: the pose or calibration in %s is impossible; left out", view.name, sparse_dir)
     if not usable:
         raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
-    return Scene(tuple(sorted(usable, key=lambda view: view.name)), points - origin, origin)
+    views_by_name = tuple(sorted(usable, key=lambda view: view.name))
+    return Scene(views_by_name, points - origin, origin, tuple(model.reg_image_ids()))
 
 
 def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:

@@ -1,4 +1,4 @@
-"""The stages that compute: disparity maps of pairs, photometric and geometric maps of images, the cloud.
+"""The stages that compute maps: disparity maps of pairs, photometric and geometric maps of images.
 
 Every stage asks for each of its results first whether an earlier run has made the very same; `pair_state`,
 `vote_state` and `check_state` answer that without computing anything.
@@ -6,25 +6,23 @@ Every stage asks for each of its results first whether an earlier run has made t
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.context import Context, Done
+from colmap_sph.context import Context, Done, Pair
 from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate_depth
 from colmap_sph.errors import InputError, NoResultError
-from colmap_sph.fusion import fuse
-from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.load_cache import LoadCache
 from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, Scratch, match_pair
-from colmap_sph.memory import MemoryGate, format_memory, resident
+from colmap_sph.memory import MemoryGate
 from colmap_sph.normals import fit_normals
 from colmap_sph.pair_files import disparity_bytes, read_arrays, read_pair, stored_key, write_arrays, write_pair
+from colmap_sph.pairs import partners_of
 from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
 from colmap_sph.scene import View
 from colmap_sph.state import forget, vouch, vouched_facts
@@ -33,23 +31,17 @@ from colmap_sph.workspace import (
     Workspace,
     make_dir,
     write_depth_map,
-    write_fusion_cfg,
     write_normal_map,
 )
 
 logger = logging.getLogger(__name__)
 
-Pair = tuple[str, str]
-
-# Fewer points than this share of the pixels with a geometric depth calls for an explanation.
-_FEW_POINTS = 0.02
 _CACHE_BYTES = 512 << 20
 # Scratch memory of a matching thread: more is no faster.
 _SCRATCH_BYTES = 256 << 20
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
-# of a view while its depth is voted, without its pairs' maps, or checked; per pixel of all images in fusion.
+# of a view while its depth is voted, without its pairs' maps, or checked.
 _MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 48.0, 45.0, 40.0
-FUSION_BYTES = 80.0
 
 
 # ---- matching ----------------------------------------------------------------------------------------------
@@ -173,7 +165,7 @@ def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str,
         write_arrays(context.estimate_path(view.name), arrays, key)
         return estimate
 
-    results = context.for_all("estimate depth", work, context.scene.views, _skip_view(context))
+    results = context.for_all("estimate depth", work, context.scene.views, context.skip_view)
     return {view.name: done.key for view, done in results.items()}
 
 
@@ -217,7 +209,7 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
         return Done(state.key, made=True, coverage=coverage)
 
     views = [view for view in context.scene.views if view.name in votes]
-    results = context.for_all("check consistency", work, views, _skip_view(context))
+    results = context.for_all("check consistency", work, views, context.skip_view)
     coverage = {view.name: done.coverage for view, done in results.items()}
     report.coverage = {view.name: coverage.get(view.name, 0.0) for view in context.scene.views}
     report.images = sum(share > 0 for share in report.coverage.values())
@@ -234,116 +226,12 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
     return {view.name: done.key for view, done in results.items()}
 
 
-# ---- the cloud ---------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class CloudState:
-    """Key of the cloud, and what is known of it where it is there.
-
-    Attributes
-    ----------
-    names : tuple of str
-        Images to fuse: those with any depth.
-    partners : dict, optional
-        Where the model has no tracks, from which COLMAP's fusion knows what overlaps: partners of each image.
-    key : str
-    facts : dict, optional
-        Its number of points and the advice to give; None where it must be made.
-    """
-
-    names: tuple[str, ...]
-    partners: dict[str, list[str]] | None
-    key: str
-    facts: dict[str, Any] | None
-
-
-def cloud_state(
-    context: Context, pairs: Iterable[Pair], maps: Mapping[str, str], coverage: Mapping[str, float]
-) -> CloudState:
-    """See `CloudState`; `maps` and `coverage` are keys and coverage of the geometric maps by image name."""
-    names = tuple(view.name for view in context.scene.views if coverage.get(view.name, 0) > 0)
-    tracked = any(len(view.point_indices) for view in context.scene.views)
-    partners = None if tracked else partners_of(pairs)
-    key = context.keys.cloud({name: maps[name] for name in names}, partners or {}, context.scene.origin)
-    return CloudState(names, partners, key, vouched_facts(context.cloud_record, key, context.cloud_paths))
-
-
-def fuse_views(context: Context, pairs: Iterable[Pair], maps: Mapping[str, str]) -> None:
-    """Fuse the maps into the cloud; writes ``fused.ply`` and ``fused.ply.vis``.
-
-    `maps` are what `check_views` returned.
-    """
-    options, report = context.options, context.report
-    with context.stage("fuse", 1):
-        state = cloud_state(context, pairs, maps, report.coverage)
-        facts = state.facts
-        write_fusion_cfg(context.workspace.fusion_cfg_path, state.names)
-        if facts is None:
-            _warn_of_memory(context, state.names)
-            forget(context.cloud_record)
-            points = fuse(
-                context.workspace,
-                options.fusion,
-                threads=options.num_threads,
-                kind=options.fusion_input,
-                partners=state.partners,
-            )
-            facts = {"points": points, "advice": _advice(context, points)}
-            vouch(context.cloud_record, state.key, context.cloud_paths, **facts)
-        context.progress.advance()
-    context.count("fuse", [Done(state.key, made=state.facts is None)])
-    report.points, report.advice = facts["points"], facts["advice"]
-    if report.advice:
-        logger.warning("Only %d points survived fusion. %s", report.points, report.advice)
-
-
-def partners_of(pairs: Iterable[Pair]) -> dict[str, list[str]]:
-    """Partners of each image, sorted."""
-    partners: dict[str, list[str]] = {}
-    for left, right in pairs:
-        partners.setdefault(left, []).append(right)
-        partners.setdefault(right, []).append(left)
-    return {name: sorted(others) for name, others in partners.items()}
-
-
 # ---- helpers -----------------------------------------------------------------------------------------------
-
-
-def _warn_of_memory(context: Context, names: Iterable[str]) -> None:
-    """COLMAP's fusion holds all maps at once; its cache bounds that, but makes it many times slower."""
-    total = context.options.memory_budget
-    needed = resident() + FUSION_BYTES * sum(v.width * v.height for v in map(context.scene.view, names))
-    if needed > total and not context.options.fusion.use_cache:
-        logger.warning(
-            "COLMAP's fusion will take about %s of memory, more than the %s allowed; "
-            "--fusion.use-cache True bounds it, but takes hours.",
-            format_memory(needed),
-            format_memory(total),
-        )
-
-
-def _advice(context: Context, points: int) -> str:
-    """Which gate of the fusion to loosen, where few points survived."""
-    coverage, scene = context.report.coverage, context.scene
-    pixels = sum(coverage[view.name] * view.width * view.height for view in scene.views)
-    if points >= _FEW_POINTS * pixels:
-        return ""
-    options = context.options
-    return explain_losses(context.workspace, scene, options.fusion, kind=options.fusion_input).sentence()
 
 
 def _pairs_of(pairs: Iterable[Pair], name: str) -> list[Pair]:
     """Pairs of an image, by the name of its partner."""
     return sorted((pair for pair in pairs if name in pair), key=lambda pair: [n for n in pair if n != name])
-
-
-def _skip_view(context: Context) -> Callable[[View, str], None]:
-    def skip(view: View, reason: str) -> None:
-        context.report.skipped_images[view.name] = reason
-        logger.warning("%s skipped: %s", view.name, reason)
-
-    return skip
 
 
 def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:

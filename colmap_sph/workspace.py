@@ -213,7 +213,12 @@ def write_normal_map(path: Path, normals: NDArray[np.float32]) -> None:
 
 def read_normal_map(path: Path) -> NDArray[np.float32]:
     """Read a COLMAP normal map as an (H, W, 3) float32 array; `InputError` where it is missing or damaged."""
-    return np.ascontiguousarray(_read_planes(path, channels=3).transpose(1, 2, 0))
+    return np.ascontiguousarray(read_normal_planes(path).transpose(1, 2, 0))
+
+
+def read_normal_planes(path: Path) -> NDArray[np.float32]:
+    """Read a COLMAP normal map as it lies in the file: a (3, H, W) float32 array; raises as `read_normal_map`."""
+    return _read_planes(path, channels=3)
 
 
 def _write_planes(path: Path, planes: NDArray[np.floating]) -> None:
@@ -261,14 +266,18 @@ def _parse_header(path: Path, start: bytes, size: int, channels: int) -> tuple[t
 def _read_planes(path: Path, *, channels: int) -> NDArray[np.float32]:
     """Read a map file as a (channels, H, W) array."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            start, size = file.read(_MAX_HEADER), path.stat().st_size
+            (height, width), header = _parse_header(path, start, size, channels)
+            file.seek(header)
+            values = np.fromfile(file, "<f4", channels * height * width)
     except OSError as error:
         raise InputError(
             f"The map {path} cannot be read ({error.strerror or error}); compute it again."
         ) from error
-    (height, width), start = _parse_header(path, data[:_MAX_HEADER], len(data), channels)
-    planes = np.frombuffer(data, dtype="<f4", offset=start).astype(np.float32)
-    return planes.reshape(channels, height, width)
+    if len(values) < channels * height * width:
+        raise InputError(f"{path} is truncated or damaged; delete it and compute it again.")
+    return values.astype(np.float32, copy=False).reshape(channels, height, width)
 
 
 def write_fusion_cfg(path: Path, names: Iterable[str]) -> None:

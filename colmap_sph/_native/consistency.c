@@ -1,15 +1,7 @@
 #include <math.h>
 
+#include "geometry.h"
 #include "kernels.h"
-
-typedef struct {
-    double x, y, z;
-} vector;
-
-static inline vector transform(const double *m, const double *t, double x, double y, double z) {
-    return (vector){(m[0] * x + m[1] * y + m[2]) * z + t[0], (m[3] * x + m[4] * y + m[5]) * z + t[1],
-                    (m[6] * x + m[7] * y + m[8]) * z + t[2]};
-}
 
 static inline void count(uint8_t *counter) { *counter += *counter < UINT8_MAX; }
 

@@ -2,12 +2,15 @@
  * released around the work. */
 #include "arrays.h"
 
+#include <string.h>
+
 #include "kernels.h"
 
 #define F32 'f', (Py_ssize_t)sizeof(float)
 #define F64 'f', (Py_ssize_t)sizeof(double)
 #define U8 'u', (Py_ssize_t)1
 #define U16 'u', (Py_ssize_t)2
+#define U32 'u', (Py_ssize_t)4
 #define U64 'u', (Py_ssize_t)8
 #define I32 'i', (Py_ssize_t)4
 
@@ -316,6 +319,14 @@ static PyObject *py_vote_depth(PyObject *self, PyObject *args) {
     return finish(&arrays, 0);
 }
 
+/* [A | a], row by row, as A and a. */
+static void split_transfer(const double *matrix, double *left, double *last) {
+    for (int r = 0; r < 3; r++) {
+        memcpy(left + 3 * r, matrix + 4 * r, 3 * sizeof *left);
+        last[r] = matrix[4 * r + 3];
+    }
+}
+
 static int copy_transfer(array_set *arrays, PyObject *forward, PyObject *back, view_transfer *transfer) {
     Py_ssize_t shape[2] = {3, 4};
     const double *f = array_get(arrays, forward, "partner_from_reference", F64, 2, READ, shape);
@@ -323,14 +334,25 @@ static int copy_transfer(array_set *arrays, PyObject *forward, PyObject *back, v
     if (!b) {
         return 0;
     }
-    for (int r = 0; r < 3; r++) {
-        for (int c = 0; c < 3; c++) {
-            transfer->pixel_from_reference[3 * r + c] = f[4 * r + c];
-            transfer->reference_from_pixel[3 * r + c] = b[4 * r + c];
-        }
-        transfer->translation[r] = f[4 * r + 3];
-        transfer->back_translation[r] = b[4 * r + 3];
+    split_transfer(f, transfer->pixel_from_reference, transfer->translation);
+    split_transfer(b, transfer->reference_from_pixel, transfer->back_translation);
+    return 1;
+}
+
+/* Depth, normals and K^-1 of a view, from three objects. */
+static int get_maps(array_set *arrays, PyObject *const *objects, view_maps *maps) {
+    Py_ssize_t shape[2] = {-1, -1}, matrix_shape[2] = {3, 3};
+    maps->depth = array_get(arrays, objects[0], "depth", F32, 2, READ, shape);
+    Py_ssize_t normals_shape[3] = {3, shape[0], shape[1]};
+    maps->normals = maps->depth ? array_get(arrays, objects[1], "normals", F32, 3, READ, normals_shape) : NULL;
+    const double *inverse =
+        maps->normals ? array_get(arrays, objects[2], "ray_from_pixel", F64, 2, READ, matrix_shape) : NULL;
+    if (!inverse) {
+        return 0;
     }
+    maps->height = shape[0];
+    maps->width = shape[1];
+    memcpy(maps->ray_from_pixel, inverse, sizeof maps->ray_from_pixel);
     return 1;
 }
 
@@ -361,6 +383,122 @@ static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
         check_consistency(depth, sigma, shape[0], shape[1], partner, partner_sigma, partner_shape[0],
                           partner_shape[1], &transfer, max_error, tolerance, observing, agreeing, contradicting,
                           weighted, weight);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static PyObject *py_fuse_partner(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[12];
+    fusion_transfer transfer;
+    fusion_gates gates;
+    int bit;
+    if (!PyArg_ParseTuple(args, "OOOOOOOOOfffpiOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &o[6], &o[7], &o[8],
+                          &gates.max_reprojection_error, &gates.max_depth_error, &gates.min_normal_cosine,
+                          &transfer.partner_wins, &bit, &o[9], &o[10], &o[11])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    view_maps reference, partner;
+    Py_ssize_t image_shape[3] = {-1, -1, 3}, forward_shape[2] = {3, 4}, matrix_shape[2] = {3, 3};
+    const int ready = get_maps(&arrays, o, &reference) && get_maps(&arrays, o + 3, &partner);
+    image_shape[0] = ready ? partner.height : -1;
+    image_shape[1] = ready ? partner.width : -1;
+    Py_ssize_t shape[3] = {ready ? reference.height : -1, ready ? reference.width : -1, 3};
+    const uint8_t *image = ready ? array_get(&arrays, o[6], "partner_image", U8, 3, READ, image_shape) : NULL;
+    const double *forward =
+        image ? array_get(&arrays, o[7], "partner_from_reference", F64, 2, READ, forward_shape) : NULL;
+    const double *back =
+        forward ? array_get(&arrays, o[8], "normal_from_partner", F64, 2, READ, matrix_shape) : NULL;
+    fusion_verdict verdict = {0};
+    verdict.covered = back ? array_get(&arrays, o[9], "covered", U8, 2, WRITE, shape) : NULL;
+    verdict.agreeing = verdict.covered ? array_get(&arrays, o[10], "agreeing", U64, 2, WRITE, shape) : NULL;
+    verdict.colour = verdict.agreeing ? array_get(&arrays, o[11], "colour", U16, 3, WRITE, shape) : NULL;
+    if (verdict.colour && check(bit >= 0 && bit < 64, "the partner's bit must lie in 0..63") &&
+        arrays_disjoint(&arrays)) {
+        split_transfer(forward, transfer.pixel_from_reference, transfer.translation);
+        memcpy(transfer.reference_from_partner, back, sizeof transfer.reference_from_partner);
+        Py_BEGIN_ALLOW_THREADS;
+        fuse_partner(&reference, &partner, image, &transfer, gates, bit, &verdict);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+/* Maps and verdict of a view from five objects, and rows of them; 0 with an error set. */
+static int get_fused_rows(array_set *arrays, PyObject *const *objects, view_maps *maps, fusion_verdict *verdict,
+                          fused_rows *rows) {
+    Py_ssize_t shape[3] = {-1, -1, 3};
+    maps->depth = array_get(arrays, objects[0], "depth", F32, 2, READ, shape);
+    Py_ssize_t normals_shape[3] = {3, shape[0], shape[1]};
+    maps->normals = maps->depth ? array_get(arrays, objects[1], "normals", F32, 3, READ, normals_shape) : NULL;
+    verdict->covered = maps->normals ? array_get(arrays, objects[2], "covered", U8, 2, READ, shape) : NULL;
+    verdict->agreeing = verdict->covered ? array_get(arrays, objects[3], "agreeing", U64, 2, READ, shape) : NULL;
+    verdict->colour = verdict->agreeing ? array_get(arrays, objects[4], "colour", U16, 3, READ, shape) : NULL;
+    maps->height = shape[0];
+    maps->width = shape[1];
+    rows->maps = maps;
+    rows->verdict = verdict;
+    return verdict->colour &&
+           check(0 <= rows->first_row && rows->first_row <= rows->end_row && rows->end_row <= maps->height,
+                 "the rows must lie in the map");
+}
+
+static PyObject *py_count_points(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[5];
+    fused_rows rows;
+    if (!PyArg_ParseTuple(args, "OOOOOinn", &o[0], &o[1], &o[2], &o[3], &o[4], &rows.min_views, &rows.first_row,
+                          &rows.end_row)) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    view_maps maps;
+    fusion_verdict verdict;
+    ptrdiff_t points = 0, words = 0;
+    if (get_fused_rows(&arrays, o, &maps, &verdict, &rows)) {
+        Py_BEGIN_ALLOW_THREADS;
+        count_points(&rows, &points, &words);
+        Py_END_ALLOW_THREADS;
+    }
+    arrays_release(&arrays);
+    return PyErr_Occurred() ? NULL : Py_BuildValue("nn", (Py_ssize_t)points, (Py_ssize_t)words);
+}
+
+static PyObject *py_write_points(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[11];
+    fused_rows rows;
+    if (!PyArg_ParseTuple(args, "OOOOOinnOOOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &rows.min_views,
+                          &rows.first_row, &rows.end_row, &o[5], &o[6], &o[7], &o[8], &o[9], &o[10])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    view_maps maps;
+    fusion_verdict verdict;
+    point_frame frame;
+    ptrdiff_t num_points = 0, num_words = 0;
+    Py_ssize_t matrix_shape[2] = {3, 3}, vector_shape[1] = {3}, indices_shape[1] = {1 + 64};
+    const int ready = get_fused_rows(&arrays, o, &maps, &verdict, &rows);
+    const double *pixel = ready ? array_get(&arrays, o[5], "world_from_pixel", F64, 2, READ, matrix_shape) : NULL;
+    const double *camera =
+        pixel ? array_get(&arrays, o[6], "world_from_camera", F64, 2, READ, matrix_shape) : NULL;
+    const double *centre = camera ? array_get(&arrays, o[7], "centre", F64, 1, READ, vector_shape) : NULL;
+    frame.indices = centre ? array_get(&arrays, o[8], "indices", U32, 1, READ, indices_shape) : NULL;
+    if (frame.indices) {
+        /* The arrays must hold what will be written, and nothing may change it meanwhile: counted here again. */
+        count_points(&rows, &num_points, &num_words);
+    }
+    Py_ssize_t points_shape[2] = {num_points, POINT_BYTES}, words_shape[1] = {num_words};
+    uint8_t *points = frame.indices ? array_get(&arrays, o[9], "points", U8, 2, WRITE, points_shape) : NULL;
+    uint32_t *visibility = points ? array_get(&arrays, o[10], "visibility", U32, 1, WRITE, words_shape) : NULL;
+    if (visibility && arrays_disjoint(&arrays)) {
+        memcpy(frame.world_from_pixel, pixel, sizeof frame.world_from_pixel);
+        memcpy(frame.world_from_camera, camera, sizeof frame.world_from_camera);
+        memcpy(frame.centre, centre, sizeof frame.centre);
+        Py_BEGIN_ALLOW_THREADS;
+        write_points(&rows, &frame, points, visibility);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -415,6 +553,15 @@ static PyMethodDef methods[] = {
      "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
      "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
      "weighted_depth, weight)"},
+    {"fuse_partner", py_fuse_partner, METH_VARARGS,
+     "fuse_partner(depth, normals, ray_from_pixel, partner_depth, partner_normals, partner_ray_from_pixel, "
+     "partner_image, partner_from_reference, normal_from_partner, max_reprojection_error, max_depth_error, "
+     "min_normal_cosine, partner_wins, bit, covered, agreeing, colour)"},
+    {"count_points", py_count_points, METH_VARARGS,
+     "count_points(depth, normals, covered, agreeing, colour, min_views, first_row, end_row) -> (points, words)"},
+    {"write_points", py_write_points, METH_VARARGS,
+     "write_points(depth, normals, covered, agreeing, colour, min_views, first_row, end_row, world_from_pixel, "
+     "world_from_camera, centre, indices, points, visibility)"},
     {"fit_planes", py_fit_planes, METH_VARARGS,
      "fit_planes(backend, inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
     {NULL, NULL, 0, NULL}};

@@ -1,0 +1,132 @@
+#include <math.h>
+#include <string.h>
+
+#include "geometry.h"
+#include "kernels.h"
+
+typedef struct {
+    float x, y, z;
+} direction;
+
+static inline direction normal_at(const view_maps *maps, ptrdiff_t pixel) {
+    const ptrdiff_t plane = maps->height * maps->width;
+    const float *n = maps->normals + pixel;
+    return (direction){n[0], n[plane], n[2 * plane]};
+}
+
+static inline float cosine_after(const double *m, direction from, direction to) {
+    const double x = m[0] * from.x + m[1] * from.y + m[2] * from.z;
+    const double y = m[3] * from.x + m[4] * from.y + m[5] * from.z;
+    const double z = m[6] * from.x + m[7] * from.y + m[8] * from.z;
+    return (float)(x * to.x + y * to.y + z * to.z);
+}
+
+/* Area of the surface that a pixel covers: its solid angle cuts depth^2 / (fx fy) out of a plane parallel to the
+ * image, and more out of a slanted one. */
+static inline float surface_area(const double *m, double column, double row, float depth, direction normal) {
+    const double x = m[0] * column + m[1] * row + m[2], y = m[3] * column + m[4] * row + m[5];
+    const double facing = fabs(normal.x * x + normal.y * y + normal.z);
+    return (float)(m[0] * m[4] * depth * depth / fmax(facing, 1e-3));
+}
+
+void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
+                  const fusion_transfer *transfer, fusion_gates gates, int bit, const fusion_verdict *verdict) {
+    const double max_error_squared = (double)gates.max_reprojection_error * gates.max_reprojection_error;
+    const double last_column = (double)(partner->width - 1), last_row = (double)(partner->height - 1);
+    for (ptrdiff_t row = 0; row < reference->height; row++) {
+        for (ptrdiff_t column = 0; column < reference->width; column++) {
+            const ptrdiff_t p = row * reference->width + column;
+            const float z = reference->depth[p];
+            if (!(z > 0) || verdict->covered[p]) {
+                continue;
+            }
+            const vector seen =
+                transform(transfer->pixel_from_reference, transfer->translation, (double)column, (double)row, z);
+            if (!(seen.z > 0 && seen.x >= 0 && seen.y >= 0 && seen.x <= last_column * seen.z &&
+                  seen.y <= last_row * seen.z)) {
+                continue;
+            }
+            const double u = seen.x / seen.z, v = seen.y / seen.z;
+            if (!(u <= last_column && v <= last_row)) {
+                continue; /* by rounding, or not a number */
+            }
+            const ptrdiff_t x = (ptrdiff_t)(u + 0.5), y = (ptrdiff_t)(v + 0.5);
+            const ptrdiff_t q = y * partner->width + x;
+            const float depth = partner->depth[q];
+            if (!(fabsf(depth - (float)seen.z) <= gates.max_depth_error * depth)) {
+                continue;
+            }
+            const direction own = normal_at(reference, p), other = normal_at(partner, q);
+            if (!(cosine_after(transfer->reference_from_partner, other, own) >= gates.min_normal_cosine)) {
+                continue;
+            }
+            const double du = u - (double)x, dv = v - (double)y;
+            if (du * du + dv * dv <= max_error_squared) {
+                const float area = surface_area(reference->ray_from_pixel, (double)column, (double)row, z, own);
+                const float other_area = surface_area(partner->ray_from_pixel, (double)x, (double)y, depth, other);
+                if (other_area < area || (other_area == area && transfer->partner_wins)) {
+                    verdict->covered[p] = 1;
+                    continue;
+                }
+            }
+            verdict->agreeing[p] |= UINT64_C(1) << bit;
+            for (int k = 0; k < 3; k++) {
+                verdict->colour[3 * p + k] = (uint16_t)(verdict->colour[3 * p + k] + image[3 * q + k]);
+            }
+        }
+    }
+}
+
+/* Number of views that see this pixel's point; 0: it does not become one. */
+static inline int views_of_point(const fused_rows *rows, ptrdiff_t pixel) {
+    const int views = 1 + __builtin_popcountll(rows->verdict->agreeing[pixel]);
+    const int is_point = rows->maps->depth[pixel] > 0 && !rows->verdict->covered[pixel];
+    return is_point && views >= rows->min_views ? views : 0;
+}
+
+void count_points(const fused_rows *rows, ptrdiff_t *points, ptrdiff_t *words) {
+    const ptrdiff_t width = rows->maps->width;
+    *points = *words = 0;
+    for (ptrdiff_t p = rows->first_row * width; p < rows->end_row * width; p++) {
+        const int views = views_of_point(rows, p);
+        *points += views > 0;
+        *words += views > 0 ? views + 1 : 0;
+    }
+}
+
+static inline void write_vector(const double *m, double x, double y, double z, const double *offset,
+                                uint8_t *place) {
+    float result[3];
+    for (int k = 0; k < 3; k++) {
+        result[k] = (float)(m[3 * k] * x + m[3 * k + 1] * y + m[3 * k + 2] * z + offset[k]);
+    }
+    memcpy(place, result, sizeof result);
+}
+
+void write_points(const fused_rows *rows, const point_frame *frame, uint8_t *points, uint32_t *visibility) {
+    static const double none[3] = {0, 0, 0};
+    const view_maps *maps = rows->maps;
+    for (ptrdiff_t row = rows->first_row; row < rows->end_row; row++) {
+        for (ptrdiff_t column = 0; column < maps->width; column++) {
+            const ptrdiff_t p = row * maps->width + column;
+            const int views = views_of_point(rows, p);
+            if (!views) {
+                continue;
+            }
+            const double z = maps->depth[p];
+            const direction n = normal_at(maps, p);
+            write_vector(frame->world_from_pixel, (double)column * z, (double)row * z, z, frame->centre, points);
+            write_vector(frame->world_from_camera, n.x, n.y, n.z, none, points + 12);
+            const uint16_t *colour = rows->verdict->colour + 3 * p;
+            for (int k = 0; k < 3; k++) {
+                points[24 + k] = (uint8_t)((colour[2 - k] + views / 2) / views);
+            }
+            points += POINT_BYTES;
+            *visibility++ = (uint32_t)views;
+            *visibility++ = frame->indices[0];
+            for (uint64_t bits = rows->verdict->agreeing[p]; bits; bits &= bits - 1) {
+                *visibility++ = frame->indices[1 + __builtin_ctzll(bits)];
+            }
+        }
+    }
+}
