@@ -20,6 +20,9 @@ from colmap_sph.kernels import backend
 from colmap_sph.rectification import RectifiedPair, Side, rectified_ray_from_pixel
 from colmap_sph.scene import View, pixel_transfer
 
+# Window around a pixel in which its surface is looked for, and the steepest slope of a surface against the image,
+# as depth over width.
+_SURFACE_RADIUS, _STEEPEST = 3, 4.0
 # Candidates of all pairs are voted on in bands of rows of about this size.
 _BAND_BYTES = 8 << 20
 
@@ -46,6 +49,9 @@ class DepthOptions:
     point that no other has in view."""
     max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
+    min_surface: float = 0.8
+    """Where one view alone confirms a depth, at least this share of the 7 x 7 pixels around it must be of the same
+    surface: what a single pair found in passing is rarely right."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
@@ -64,11 +70,19 @@ class DepthOptions:
             raise OptionError(f"min_consistent must lie in 0..255, not {self.min_consistent}.")
         if not self.max_contradiction >= 0:
             raise OptionError(f"max_contradiction must not be negative, not {self.max_contradiction}.")
+        if not 0 <= self.min_surface <= 1:
+            raise OptionError(f"min_surface must lie in 0..1, not {self.min_surface}.")
 
 
 # Which options `estimate_depth` reads, and which `check_depth`.
 VOTE_OPTIONS = ("disparity_sigma", "max_disparity_step", "vote_tolerance", "min_support")
-CHECK_OPTIONS = ("max_reprojection_error", "consistency_tolerance", "min_consistent", "max_contradiction")
+CHECK_OPTIONS = (
+    "max_reprojection_error",
+    "consistency_tolerance",
+    "min_consistent",
+    "max_contradiction",
+    "min_surface",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,8 +264,26 @@ def check_depth(
     found = estimate.depth > 0
     kept = found & (agreeing >= np.minimum(np.maximum(observing, 1), options.min_consistent))
     kept &= contradicting <= options.max_contradiction * agreeing
+    kept[kept & (agreeing < 2)] = (
+        _surface_share(view, np.where(kept, estimate.depth, 0), kept & (agreeing < 2)) >= options.min_surface
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
         own = 1 / np.square(estimate.sigma)
         depth = np.where(kept, estimate.depth + weighted / (weight + own), 0).astype(np.float32)
         sigma = np.where(kept, 1 / np.sqrt(weight + own), 0).astype(np.float32)
     return DepthEstimate(depth, sigma, np.where(kept, agreeing, 0).astype(np.uint8))
+
+
+def _surface_share(view: View, depth: NDArray[np.float32], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """For each chosen pixel the share of the pixels around it, itself among them, with depths of its surface."""
+    radius = _SURFACE_RADIUS
+    padded = np.pad(depth, radius, mode="edge")
+    rows, columns = np.nonzero(chosen)
+    first = rows * padded.shape[1] + columns
+    own = depth[chosen]
+    step = own * np.float32(_STEEPEST * radius / view.K[0, 0])
+    count = np.zeros(len(own), np.uint8)
+    for y in range(2 * radius + 1):
+        for x in range(2 * radius + 1):
+            count += np.abs(padded.ravel()[first + y * padded.shape[1] + x] - own) <= step
+    return count / (2 * radius + 1) ** 2

@@ -17,6 +17,10 @@ from colmap_sph.scene import View
 
 # Rows that are fitted at a time, which bounds the memory for it.
 _BAND_ROWS = 256
+# Depths that differ from their plane's by less are noise.
+_SHIFT_SIGMAS = 2
+# What so many support may be seen under any angle.
+_WELL_SUPPORTED = 3
 
 
 @dataclass(frozen=True)
@@ -27,6 +31,12 @@ class NormalOptions:
     """Radius of the window, pixels."""
     tolerance: float = 3.0
     """Neighbours further from the plane than this many standard deviations hardly count."""
+    max_shift: float = 1.0
+    """A depth that differs from its plane's by more than this many times the size of its pixel, and by more than
+    two standard deviations, is dropped."""
+    max_incidence: float = 75.0
+    """Largest angle, degrees, between the ray and the normal of a pixel whose depth fewer than three others
+    support: what few see at a glance is rarely right."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
@@ -34,6 +44,10 @@ class NormalOptions:
             raise OptionError(f"the normals' radius must lie in 1..16, not {self.radius}.")
         if not self.tolerance > 0:
             raise OptionError(f"the normals' tolerance must be positive, not {self.tolerance}.")
+        if not self.max_shift > 0:
+            raise OptionError(f"the normals' max_shift must be positive, not {self.max_shift}.")
+        if not 0 < self.max_incidence <= 90:
+            raise OptionError(f"the normals' max_incidence must lie in 0..90 degrees, not {self.max_incidence}.")
 
 
 def fit_normals(
@@ -78,4 +92,18 @@ def _fit_rows(
     K = view.K.copy()
     K[1, 2] -= first  # the rows of a band count from its first
     _native.fit_planes(backend(), inverse, inverse_sigma, K, options.radius, options.tolerance, normals, fitted)
+    shift = np.abs(fitted - depth)
+    doubtful = (shift * np.float32(K[0, 0]) > options.max_shift * fitted) & (shift > _SHIFT_SIGMAS * sigma)
+    weak = estimate.support[first:end] < _WELL_SUPPORTED
+    doubtful |= weak & (_cosines(normals, K) < np.cos(np.radians(options.max_incidence)))
+    normals[doubtful], fitted[doubtful] = 0, 0
     return normals, fitted
+
+
+def _cosines(normals: NDArray[np.float32], K: NDArray[np.float64]) -> NDArray[np.float32]:
+    """(H, W) cosines between normals and the rays of their pixels, 1 where the surface faces the camera."""
+    height, width = normals.shape[:2]
+    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height), [1.0], indexing="xy"), axis=-1)[:, :, 0]
+    rays = (pixels @ np.linalg.inv(K).T).astype(np.float32)
+    along = np.einsum("ijk,ijk->ij", normals, rays)
+    return np.asarray(-along / np.sqrt(np.einsum("ijk,ijk->ij", rays, rays)))

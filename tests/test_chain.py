@@ -39,7 +39,8 @@ def reconstruct(surfaces, light, cameras):
     for view in scene.views:
         partners = [(other, own[other.name]) for other in scene.views if other is not view]
         checked = check_depth(view, own[view.name], partners, DepthOptions())
-        normals, _ = fit_normals(view, checked, NormalOptions())
+        normals, fitted = fit_normals(view, checked, NormalOptions())
+        checked.depth[fitted == 0] = 0
         results.append((checked, normals))
     return results
 

@@ -46,6 +46,7 @@ OPTIONS = DepthOptions(
     consistency_tolerance=4.0,
     min_consistent=2,
     max_contradiction=1.0,
+    min_surface=0.0,
 )
 SIZE = (160, 120)
 RENDERED = {
@@ -445,6 +446,26 @@ def test_what_too_few_views_confirm_is_dropped():
     assert (check(views, maps, replace(OPTIONS, min_consistent=0)).depth > 0).all()
 
 
+def test_what_one_view_confirms_in_passing_is_dropped():
+    """Of what one view alone confirms, only what is part of a surface stays."""
+    views, maps = wall_views(2)
+    shape = maps[0].shape
+    second = in_view(views[0], views[1], 10.0)
+    speckles = np.zeros(shape, bool)
+    speckles[::9, ::9] = speckles[1::9, ::9] = True
+    block = np.zeros(shape, bool)
+    block[15:45, 20:50] = True
+    maps[0] = np.where(speckles | block, maps[0], 0)
+    checked = check(views, maps, replace(OPTIONS, min_surface=0.8)).depth > 0
+    inner = np.zeros(shape, bool)
+    inner[18:42, 23:47] = True
+    assert (inner & second).sum() > 100
+    assert checked[inner & second].all()
+    # Nothing outside the block, whose corners have a quarter of a window around them.
+    assert not checked[~block].any() and not checked[15, 20]
+    assert (check(views, maps).depth > 0)[speckles & second].all()
+
+
 GHOST = (slice(18, 30), slice(26, 38))
 
 
@@ -538,6 +559,8 @@ def test_a_view_without_pairs_has_no_depth():
         *[("min_support", value) for value in (0, 256)],
         *[("min_consistent", value) for value in (-1, 256)],
         ("max_contradiction", -0.1),
+        ("min_surface", 1.5),
+        ("min_surface", np.nan),
     ],
 )
 def test_options_out_of_bounds_are_refused(name, value):

@@ -1,5 +1,7 @@
 """Normals of planes in closed form, with and without noise, and next to edges."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rendered import pixel_rays
@@ -10,7 +12,7 @@ from colmap_sph.errors import OptionError
 from colmap_sph.normals import NormalOptions, fit_normals
 from colmap_sph.scene import View
 
-OPTIONS = NormalOptions(radius=4, tolerance=6.0)
+OPTIONS = NormalOptions(radius=4, tolerance=6.0, max_shift=1.0, max_incidence=90.0)
 # Two thousand pixels a radian of parallax: depth 10 with a baseline of 2 and a focal length of 400.
 PIXELS_PER_INVERSE_DEPTH = 800.0
 VIEW = View(
@@ -184,9 +186,47 @@ def test_a_larger_window_takes_more_noise():
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("radius", 0), ("radius", 17), ("tolerance", 0.0), ("tolerance", -1.0), ("tolerance", np.nan)],
+    [
+        ("radius", 0),
+        ("radius", 17),
+        *((name, value) for name in ("tolerance", "max_shift", "max_incidence") for value in (0.0, -1.0, np.nan)),
+        ("max_incidence", 90.5),
+    ],
 )
 def test_options_out_of_bounds_are_refused(name, value):
     NormalOptions().check()
     with pytest.raises(OptionError, match=name):
         NormalOptions(**{name: value}).check()
+
+
+def test_depths_off_their_plane_are_dropped():
+    """A pixel that sticks out of a plane by several pixel sizes and standard deviations, and one within either."""
+    plane = estimate(inverse_depth(plane_normal(20, 40)), noise=0.3)
+    depth, size = plane.depth.copy(), plane.depth / VIEW.K[0, 0]
+    depth[30, 30] += 5 * plane.sigma[30, 30] + 3 * size[30, 30]
+    depth[60, 60] += 0.5 * size[60, 60]
+    noisy = DepthEstimate(depth, plane.sigma, plane.support)
+    normals, fitted = fit_normals(VIEW, noisy, OPTIONS)
+    assert fitted[30, 30] == 0 and not normals[30, 30].any()
+    assert (fitted > 0).sum() == fitted.size - 1
+    assert (fit_normals(VIEW, noisy, replace(OPTIONS, max_shift=100.0))[1] > 0).all()
+    # Where depths are uncertain, the same step is noise.
+    uncertain = DepthEstimate(depth, 5 * plane.sigma, plane.support)
+    assert (fit_normals(VIEW, uncertain, OPTIONS)[1] > 0).all()
+
+
+def test_glancing_surfaces_need_support():
+    """A plane under angles of 66 to 84 degrees: the part beyond 75 needs three others that see it."""
+    normal = plane_normal(75, 0)
+    exact = estimate(inverse_depth(normal), noise=0.3)
+    column, row = np.meshgrid(np.arange(VIEW.width), np.arange(VIEW.height))
+    rays = pixel_rays(VIEW, column, row).reshape(*column.shape, 3)
+    incidence = np.degrees(np.arccos(-(rays @ normal) / np.linalg.norm(rays, axis=-1)))
+    clear = (np.abs(incidence - 75) > 0.1) & (exact.depth > 0)
+    assert 0.2 < (incidence < 75)[clear].mean() < 0.8
+    options = replace(OPTIONS, max_incidence=75.0)
+    for support, kept in ((2, (incidence < 75)[clear]), (3, np.ones(clear.sum(), bool))):
+        supported = DepthEstimate(exact.depth, exact.sigma, np.full(exact.depth.shape, support, np.uint8))
+        normals, depth = fit_normals(VIEW, supported, options)
+        np.testing.assert_array_equal(depth[clear] > 0, kept)
+        np.testing.assert_array_equal(normals.any(axis=-1)[clear], kept)
