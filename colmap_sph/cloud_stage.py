@@ -110,7 +110,10 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
     overlapping = state.partners or {}
     check_places(workspace)
     gate = MemoryGate(options.memory_budget)
-    cache_bytes = int(min(_MAPS_BYTES * sum(v.width * v.height for v in scene.views), gate.free // 2))
+    sizes = [view.width * view.height for view in scene.views]
+    # What one image needs comes before what makes it faster.
+    spare = gate.free - 1.2 * _FUSE_BYTES * max(sizes)
+    cache_bytes = int(min(_MAPS_BYTES * sum(sizes), max(spare, 0.0)))
     gate.keep(cache_bytes)
     index_of = {image_id: index for index, image_id in enumerate(scene.image_ids)}
 

@@ -20,9 +20,8 @@ from colmap_sph.kernels import backend
 from colmap_sph.rectification import RectifiedPair, Side, rectified_ray_from_pixel
 from colmap_sph.scene import View, pixel_transfer
 
-# Window around a pixel in which its surface is looked for, and the steepest slope of a surface against the image,
-# as depth over width.
-_SURFACE_RADIUS, _STEEPEST = 3, 4.0
+# Slope of the steepest surface that is looked for around a pixel, as depth over width.
+_STEEPEST = 4.0
 # Candidates of all pairs are voted on in bands of rows of about this size.
 _BAND_BYTES = 8 << 20
 
@@ -261,29 +260,17 @@ def check_depth(
             weighted,
             weight,
         )
-    found = estimate.depth > 0
-    kept = found & (agreeing >= np.minimum(np.maximum(observing, 1), options.min_consistent))
-    kept &= contradicting <= options.max_contradiction * agreeing
-    kept[kept & (agreeing < 2)] = (
-        _surface_share(view, np.where(kept, estimate.depth, 0), kept & (agreeing < 2)) >= options.min_surface
+    _native.confirm_depth(
+        estimate.depth,
+        estimate.sigma,
+        options.min_consistent,
+        options.max_contradiction,
+        options.min_surface,
+        _STEEPEST / view.K[0, 0],
+        observing,
+        agreeing,
+        contradicting,
+        weighted,
+        weight,
     )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        own = 1 / np.square(estimate.sigma)
-        depth = np.where(kept, estimate.depth + weighted / (weight + own), 0).astype(np.float32)
-        sigma = np.where(kept, 1 / np.sqrt(weight + own), 0).astype(np.float32)
-    return DepthEstimate(depth, sigma, np.where(kept, agreeing, 0).astype(np.uint8))
-
-
-def _surface_share(view: View, depth: NDArray[np.float32], chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """For each chosen pixel the share of the pixels around it, itself among them, with depths of its surface."""
-    radius = _SURFACE_RADIUS
-    padded = np.pad(depth, radius, mode="edge")
-    rows, columns = np.nonzero(chosen)
-    first = rows * padded.shape[1] + columns
-    own = depth[chosen]
-    step = own * np.float32(_STEEPEST * radius / view.K[0, 0])
-    count = np.zeros(len(own), np.uint8)
-    for y in range(2 * radius + 1):
-        for x in range(2 * radius + 1):
-            count += np.abs(padded.ravel()[first + y * padded.shape[1] + x] - own) <= step
-    return count / (2 * radius + 1) ** 2
+    return DepthEstimate(weighted, weight, agreeing)

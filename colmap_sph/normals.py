@@ -91,19 +91,19 @@ def _fit_rows(
     fitted = np.empty_like(inverse)
     K = view.K.copy()
     K[1, 2] -= first  # the rows of a band count from its first
-    _native.fit_planes(backend(), inverse, inverse_sigma, K, options.radius, options.tolerance, normals, fitted)
-    shift = np.abs(fitted - depth)
-    doubtful = (shift * np.float32(K[0, 0]) > options.max_shift * fitted) & (shift > _SHIFT_SIGMAS * sigma)
-    weak = estimate.support[first:end] < _WELL_SUPPORTED
-    doubtful |= weak & (_cosines(normals, K) < np.cos(np.radians(options.max_incidence)))
-    normals[doubtful], fitted[doubtful] = 0, 0
+    _native.fit_planes(
+        backend(),
+        inverse,
+        inverse_sigma,
+        estimate.support[first:end],
+        K,
+        options.radius,
+        options.tolerance,
+        options.max_shift,
+        _SHIFT_SIGMAS,
+        np.cos(np.radians(options.max_incidence)),
+        _WELL_SUPPORTED,
+        normals,
+        fitted,
+    )
     return normals, fitted
-
-
-def _cosines(normals: NDArray[np.float32], K: NDArray[np.float64]) -> NDArray[np.float32]:
-    """(H, W) cosines between normals and the rays of their pixels, 1 where the surface faces the camera."""
-    height, width = normals.shape[:2]
-    pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height), [1.0], indexing="xy"), axis=-1)[:, :, 0]
-    rays = (pixels @ np.linalg.inv(K).T).astype(np.float32)
-    along = np.einsum("ijk,ijk->ij", normals, rays)
-    return np.asarray(-along / np.sqrt(np.einsum("ijk,ijk->ij", rays, rays)))

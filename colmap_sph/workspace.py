@@ -182,7 +182,7 @@ def write_depth_map(path: Path, depth: NDArray[np.float32]) -> None:
     if depth.ndim != 2:
         raise ValueError(f"a depth map has shape (H, W), not {depth.shape}")
     # Fusion's test is `depth <= 0`, which NaN passes.
-    _write_planes(path, np.where(np.isfinite(depth), depth, 0.0)[None])
+    _write_planes(path, [np.where(np.isfinite(depth), depth, 0.0)], (*depth.shape, 1))
 
 
 def read_depth_map(path: Path) -> NDArray[np.float32]:
@@ -207,8 +207,8 @@ def write_normal_map(path: Path, normals: NDArray[np.float32]) -> None:
     """
     if normals.ndim != 3 or normals.shape[2] != 3:
         raise ValueError(f"a normal map has shape (H, W, 3), not {normals.shape}")
-    finite = np.isfinite(normals).all(axis=2, keepdims=True)
-    _write_planes(path, np.where(finite, normals, 0.0).transpose(2, 0, 1))
+    finite = np.isfinite(normals).all(axis=2)
+    _write_planes(path, (np.where(finite, normals[..., k], 0.0) for k in range(3)), (*finite.shape, 3))
 
 
 def read_normal_map(path: Path) -> NDArray[np.float32]:
@@ -221,11 +221,13 @@ def read_normal_planes(path: Path) -> NDArray[np.float32]:
     return _read_planes(path, channels=3)
 
 
-def _write_planes(path: Path, planes: NDArray[np.floating]) -> None:
-    channels, height, width = planes.shape
+def _write_planes(path: Path, planes: Iterable[NDArray[np.floating]], shape: tuple[int, int, int]) -> None:
+    """Write planes one after the other, so that only one has to be in memory; `shape` is (H, W, planes)."""
+    height, width, channels = shape
     with atomic_file(path) as file:
         file.write(f"{width}&{height}&{channels}&".encode())
-        file.write(np.ascontiguousarray(planes, dtype="<f4").data)
+        for plane in planes:
+            file.write(np.ascontiguousarray(plane, dtype="<f4").data)
 
 
 def check_map(path: Path, shape: tuple[int, ...]) -> None:

@@ -213,11 +213,11 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
     inverse_sigma = (sigma * inverse * inverse).astype(np.float32)
-    window = NormalOptions()
+    window, support = NormalOptions(), np.ones(scene.shape, np.uint8)
 
     def fit(backend: str) -> None:
-        arguments = (inverse, inverse_sigma, K, window.radius, window.tolerance, normals, fitted)
-        _native.fit_planes(backend, *arguments)
+        gates = (window.radius, window.tolerance, window.max_shift, 2.0, 0.0, 0)
+        _native.fit_planes(backend, inverse, inverse_sigma, support, K, *gates, normals, fitted)
 
     pixels = width * height
     return [

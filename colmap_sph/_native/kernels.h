@@ -92,10 +92,19 @@ typedef void depth_candidates_fn(const float *disparity, ptrdiff_t map_height, p
                                  const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows,
                                  ptrdiff_t columns, float *depth, float *sigma);
 
+typedef struct {
+    int radius;
+    float tolerance;   /* standard deviations from the plane within which a neighbour counts */
+    float max_shift;   /* most that a depth may differ from its plane's: pixel sizes, and ... */
+    float shift_sigma; /* ... standard deviations; both must be exceeded to drop it */
+    float min_cosine;  /* of the angle between ray and normal, where ... */
+    int supported;     /* ... less than this support the depth */
+} plane_fit;
+
 /* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse
  * depth, and the depth of each plane at its centre; zeros where no plane fits. */
-typedef int fit_planes_fn(const float *inverse_depth, const float *inverse_sigma, ptrdiff_t height,
-                          ptrdiff_t width, const double *K, int radius, float tolerance, float *normals,
+typedef int fit_planes_fn(const float *inverse_depth, const float *inverse_sigma, const uint8_t *support,
+                          ptrdiff_t height, ptrdiff_t width, const double *K, const plane_fit *fit, float *normals,
                           float *fitted_depth);
 
 typedef struct {
@@ -148,6 +157,22 @@ void check_consistency(const float *depth, const float *sigma, ptrdiff_t height,
                        ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
                        float tolerance, uint8_t *observing, uint8_t *agreeing, uint8_t *contradicting,
                        float *weighted_depth, float *weight);
+
+enum { SURFACE_RADIUS = 3 };
+
+typedef struct {
+    int min_consistent;      /* views that must agree, or all that have the point in view; one at least */
+    float max_contradiction; /* most that look through it, per agreeing view */
+    float min_surface;       /* least share of the window that must be on the surface where one view agrees */
+    float steepest;          /* largest relative change of depth per pixel there */
+} confirmation;
+
+/* Turns the verdicts of all partners into the geometric map, in place: `weighted_depth` becomes depth, `weight`
+ * its standard deviation, `agreeing` its support; zeros where the depth is not confirmed. `contradicting` is
+ * spoilt. */
+void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
+                   const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
+                   uint8_t *contradicting, float *weighted_depth, float *weight);
 
 /* A view's depth map, its normals (three planes) and K^-1. */
 typedef struct {

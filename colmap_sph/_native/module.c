@@ -504,13 +504,39 @@ static PyObject *py_write_points(PyObject *self, PyObject *args) {
     return finish(&arrays, 0);
 }
 
+static PyObject *py_confirm_depth(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[7];
+    confirmation options;
+    if (!PyArg_ParseTuple(args, "OOifffOOOOO", &o[0], &o[1], &options.min_consistent, &options.max_contradiction,
+                          &options.min_surface, &options.steepest, &o[2], &o[3], &o[4], &o[5], &o[6])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[2] = {-1, -1};
+    const float *depth = array_get(&arrays, o[0], "depth", F32, 2, READ, shape);
+    const float *sigma = depth ? array_get(&arrays, o[1], "sigma", F32, 2, READ, shape) : NULL;
+    const uint8_t *observing = sigma ? array_get(&arrays, o[2], "observing", U8, 2, READ, shape) : NULL;
+    uint8_t *agreeing = observing ? array_get(&arrays, o[3], "agreeing", U8, 2, WRITE, shape) : NULL;
+    uint8_t *contradicting = agreeing ? array_get(&arrays, o[4], "contradicting", U8, 2, WRITE, shape) : NULL;
+    float *weighted = contradicting ? array_get(&arrays, o[5], "weighted_depth", F32, 2, WRITE, shape) : NULL;
+    float *weight = weighted ? array_get(&arrays, o[6], "weight", F32, 2, WRITE, shape) : NULL;
+    if (weight && arrays_disjoint(&arrays)) {
+        Py_BEGIN_ALLOW_THREADS;
+        confirm_depth(depth, sigma, shape[0], shape[1], &options, observing, agreeing, contradicting, weighted,
+                      weight);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
 static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
-    PyObject *o[5];
-    int radius;
-    float tolerance;
-    if (!PyArg_ParseTuple(args, "sOOOifOO", &backend, &o[0], &o[1], &o[2], &radius, &tolerance, &o[3], &o[4])) {
+    PyObject *o[6];
+    plane_fit fit;
+    if (!PyArg_ParseTuple(args, "sOOOOiffffiOO", &backend, &o[0], &o[1], &o[2], &o[3], &fit.radius, &fit.tolerance,
+                          &fit.max_shift, &fit.shift_sigma, &fit.min_cosine, &fit.supported, &o[4], &o[5])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
@@ -519,13 +545,14 @@ static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     Py_ssize_t shape[3] = {-1, -1, 3}, matrix_shape[2] = {3, 3};
     const float *inverse = table ? array_get(&arrays, o[0], "inverse_depth", F32, 2, READ, shape) : NULL;
     const float *sigma = inverse ? array_get(&arrays, o[1], "inverse_sigma", F32, 2, READ, shape) : NULL;
-    const double *K = sigma ? array_get(&arrays, o[2], "K", F64, 2, READ, matrix_shape) : NULL;
-    float *normals = K ? array_get(&arrays, o[3], "normals", F32, 3, WRITE, shape) : NULL;
-    float *fitted = normals ? array_get(&arrays, o[4], "fitted_depth", F32, 2, WRITE, shape) : NULL;
-    if (fitted && check(radius >= 1 && radius <= MAX_FIT_RADIUS, "the window radius must lie in 1..16") &&
+    const uint8_t *support = sigma ? array_get(&arrays, o[2], "support", U8, 2, READ, shape) : NULL;
+    const double *K = support ? array_get(&arrays, o[3], "K", F64, 2, READ, matrix_shape) : NULL;
+    float *normals = K ? array_get(&arrays, o[4], "normals", F32, 3, WRITE, shape) : NULL;
+    float *fitted = normals ? array_get(&arrays, o[5], "fitted_depth", F32, 2, WRITE, shape) : NULL;
+    if (fitted && check(fit.radius >= 1 && fit.radius <= MAX_FIT_RADIUS, "the window radius must lie in 1..16") &&
         arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
-        status = table->fit_planes(inverse, sigma, shape[0], shape[1], K, radius, tolerance, normals, fitted);
+        status = table->fit_planes(inverse, sigma, support, shape[0], shape[1], K, &fit, normals, fitted);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
@@ -553,6 +580,10 @@ static PyMethodDef methods[] = {
      "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
      "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
      "weighted_depth, weight)"},
+    {"confirm_depth", py_confirm_depth, METH_VARARGS,
+     "confirm_depth(depth, sigma, min_consistent, max_contradiction, min_surface, steepest, observing, "
+     "agreeing, "
+     "contradicting, weighted_depth, weight)"},
     {"fuse_partner", py_fuse_partner, METH_VARARGS,
      "fuse_partner(depth, normals, ray_from_pixel, partner_depth, partner_normals, partner_ray_from_pixel, "
      "partner_image, partner_from_reference, normal_from_partner, max_reprojection_error, max_depth_error, "
@@ -563,7 +594,8 @@ static PyMethodDef methods[] = {
      "write_points(depth, normals, covered, agreeing, colour, min_views, first_row, end_row, world_from_pixel, "
      "world_from_camera, centre, indices, points, visibility)"},
     {"fit_planes", py_fit_planes, METH_VARARGS,
-     "fit_planes(backend, inverse_depth, inverse_sigma, K, radius, tolerance, normals, fitted_depth)"},
+     "fit_planes(backend, inverse_depth, inverse_sigma, support, K, radius, tolerance, max_shift, shift_sigma, "
+     "min_cosine, supported, normals, fitted_depth)"},
     {NULL, NULL, 0, NULL}};
 
 static PyModuleDef_Slot slots[] = {{0, NULL}};
