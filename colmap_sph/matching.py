@@ -32,13 +32,13 @@ _BYTES_PER_SLOT = 3  # of a level's cost and aggregated volumes
 class MatchingOptions:
     """How rectified images are matched."""
 
-    p1: int = 16
+    p1: int = 18
     """Penalty for a disparity change of one pixel between neighbours, in census bits."""
-    p2: int = 120
+    p2: int = 80
     """Penalty for larger changes in smooth image regions, in census bits."""
     p2_min: int = 30
     """Penalty for larger changes across strong intensity edges."""
-    p2_contrast: int = 24
+    p2_contrast: int = 16
     """Intensity difference (grey values) at which the penalty has fallen halfway to `p2_min`."""
     disparities: int = 32
     """Disparities searched per pixel at full resolution; a multiple of 32."""
@@ -48,7 +48,7 @@ class MatchingOptions:
     """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
     range_radius: int = 3
     """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches."""
-    max_slant: int = 3
+    max_slant: int = 2
     """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
