@@ -5,10 +5,10 @@
 FOLDER holds a folder for each pair: ``left.png``, ``right.png``, and ``disparity.npz`` with the array
 ``disparity``, x_right = x_left - disparity, NaN where it is unknown. Without --pairs the shared test pairs are
 taken (COLMAP_SPH_DATA, or ../shared/data beside the repository). Both matchers get the same range, that of the
-truth, and run on one thread. Pixels count whose true match lies inside the right image. *Wrong* is further than one
-pixel from the truth, among what was matched; *locked* says how uneven the fractions of the matched disparities are:
-the largest difference of a tenth of a pixel's share, relative to a tenth, from what the truth's have there (of use
-only where the truth is not itself in steps of a fraction of a pixel).
+truth, and run on one thread. Pixels count whose true match lies inside the right image. *Wrong* is further than
+one pixel from the truth, among what was matched. *Locked* says how uneven the fractions of the matched disparities
+are: the largest difference of a tenth of a pixel's share, relative to a tenth, from what the truth's have (of
+use only where the truth is not itself in steps of a fraction of a pixel).
 """
 
 import argparse

@@ -1,0 +1,133 @@
+"""What each idea is worth: whole runs with one thing changed at a time, as a Markdown table.
+
+    python scripts/ablation.py --model SPARSE --output FOLDER [--reference DEPTHS --depth-scale S --gsd G]
+
+Every variant starts from a copy of the default run and redoes only what depends on its option, so that hours
+become minutes; the seconds are those of its stages made anew in place of the default's. With exact depth maps
+(--reference) coverage, shares of right depths, and accuracy, completeness and F-score of the cloud are given;
+without them the distance of the cloud from the sparse points that five images or more track within 0.7 pixels.
+"""
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from benchmarking import machine, table
+from scipy.spatial import cKDTree
+
+from colmap_sph.cloud_files import POINT
+
+_VARIANTS: dict[str, list[str]] = {
+    "default": [],
+    "fusion by COLMAP": ["--fusion.method", "colmap"],
+    "three images must agree on a point": ["--fusion.min-num-pixels", "3"],
+    "what one view confirms needs no surface around it": ["--depth.min-surface", "0"],
+    "one confirming view is enough": ["--depth.min-consistent", "1"],
+    "three confirming views": ["--depth.min-consistent", "3"],
+    "depths off their plane or glanced at stay": ["--normals.max-shift", "1e9", "--normals.max-incidence", "90"],
+    "penalties 16, 120, softer edges": [
+        *("--matching.p1", "16", "--matching.p2", "120"),
+        *("--matching.p2-contrast", "24", "--matching.max-slant", "3"),
+    ],
+    "ranges do not follow slopes": ["--matching.max-slant", "0"],
+    "64 disparities": ["--matching.disparities", "64"],
+    "five pairs": ["--pairs.num-pairs", "5"],
+    "planar rectification": ["--rectification", "frame"],
+}
+_MIN_TRACK, _MAX_ERROR = 5, 0.7
+
+
+@dataclass
+class Outcome:
+    """Of one variant."""
+
+    seconds: dict[str, float]
+    points: int
+    columns: list[str] = field(default_factory=list)
+
+
+def run(command: list[str]) -> None:
+    """Run the program; end with its message where it fails."""
+    done = subprocess.run([sys.executable, "-m", "colmap_sph", *command], capture_output=True, text=True)
+    if done.returncode not in (0, 5):  # 5: some images have no depth map
+        sys.exit(f"colmap_sph {' '.join(command)} failed:\n{done.stdout}{done.stderr}")
+
+
+def reconstruct(arguments: argparse.Namespace, name: str, options: list[str], base: Outcome | None) -> Outcome:
+    """Run a variant, from the default's results where there are any."""
+    folder = arguments.output / name.replace(" ", "-").replace(",", "")
+    if base is not None and not folder.exists():
+        # The program replaces files and never writes into them.
+        shutil.copytree(arguments.output / "default", folder, copy_function=lambda a, b: Path(b).hardlink_to(a))
+    size = ["--max-image-size", str(arguments.max_image_size)]
+    run(["run", "--model", str(arguments.model), "--output", str(folder), *size, *options])
+    report = json.loads((folder / "colmap_sph" / "report.json").read_text())
+    seconds = {
+        stage: report["seconds"][stage] if base is None or report["made"].get(stage) else base.seconds[stage]
+        for stage in report["seconds"]
+    }
+    outcome = Outcome(seconds, report["points"])
+    score = exact_scores if arguments.reference else sparse_scores
+    outcome.columns = score(arguments, folder, report)
+    return outcome
+
+
+def exact_scores(arguments: argparse.Namespace, folder: Path, _report: dict[str, Any]) -> list[str]:
+    """Against exact depth maps."""
+    file = folder / "scores.json"
+    cloud = ["evaluate", str(folder / "fused.ply"), "--workspace", str(folder), "--json", str(file)]
+    truth = ["--reference", str(arguments.reference), "--depth-scale", str(arguments.depth_scale)]
+    run([*cloud, *truth, "--gsd", str(arguments.gsd)])
+    scores = json.loads(file.read_text())
+    maps, cloud_scores = scores["depth_maps"], scores["clouds"][0]
+    means = [np.mean([row["coverage"] for row in maps]), *np.mean([row["within"] for row in maps], axis=0)[:2]]
+    rows = [
+        [f"{100 * share[k]:.1f}" for k in range(3)]
+        for share in (cloud_scores["accuracy"], cloud_scores["f_score"])
+    ]
+    return [*(f"{100 * mean:.1f}" for mean in means), *(" / ".join(row) for row in rows)]
+
+
+def sparse_scores(arguments: argparse.Namespace, folder: Path, report: dict[str, Any]) -> list[str]:
+    """Against well-tracked sparse points."""
+    model = pycolmap.Reconstruction(arguments.model)
+    known = [p.xyz for p in model.points3D.values() if p.track.length() >= _MIN_TRACK and p.error < _MAX_ERROR]
+    body = (folder / "fused.ply").read_bytes().partition(b"end_header\n")[2]
+    distance, _ = cKDTree(np.frombuffer(body, POINT)["xyz"].astype(float)).query(np.array(known))
+    coverage = np.mean(list(report["coverage"].values()))
+    near = [f"{100 * np.mean(distance < limit):.1f}" for limit in (0.005, 0.01)]
+    return [f"{100 * coverage:.1f}", f"{1000 * np.median(distance):.2f}", " / ".join(near)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", type=Path, required=True, help="COLMAP sparse model, images beside or above it")
+    parser.add_argument("--output", type=Path, required=True, help="folder for the workspaces; grows large")
+    parser.add_argument("--max-image-size", type=int, default=-1)
+    parser.add_argument("--reference", type=Path, help="folder of exact depth maps, as for colmap_sph evaluate")
+    parser.add_argument("--depth-scale", type=float, default=1.0)
+    parser.add_argument("--gsd", type=float, default=1.0)
+    parser.add_argument("--only", nargs="*", choices=list(_VARIANTS), help="these variants, beside the default")
+    arguments = parser.parse_args()
+    truth = ["coverage %", "< 1 GSD %", "< 2 GSD %", "accuracy 1 / 2 / 4 GSD", "F 1 / 2 / 4 GSD"]
+    if not arguments.reference:
+        truth = ["coverage %", "median to sparse points, mm", "within 5 / 10 mm, %"]
+    rows, base = [], None
+    for name, options in _VARIANTS.items():
+        if base is None or not arguments.only or name in arguments.only:
+            outcome = reconstruct(arguments, name, options, base)
+            base = base or outcome
+            rows.append([name, f"{sum(outcome.seconds.values()):.0f}", f"{outcome.points:,}", *outcome.columns])
+            print(rows[-1], file=sys.stderr)
+    print(f"{machine()}\n\n{table(['variant', 'seconds', 'points', *truth], rows)}")
+
+
+if __name__ == "__main__":
+    main()
