@@ -15,6 +15,7 @@ from conftest import FinishedRun, keep_images
 import colmap_sph
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
+from colmap_sph.cloud_stage import fuse_views
 from colmap_sph.context import Context
 from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
@@ -26,7 +27,7 @@ from colmap_sph.pairs import PairOptions, select_pairs
 from colmap_sph.pipeline import find_database, workspace_root
 from colmap_sph.rectification import RectificationOptions
 from colmap_sph.scene import read_scene
-from colmap_sph.stages import check_views, estimate_views, fuse_views, match_pairs
+from colmap_sph.stages import check_views, estimate_views, match_pairs
 from colmap_sph.synthetic import DemoBlock
 from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.workspace import (

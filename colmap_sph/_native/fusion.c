@@ -53,7 +53,7 @@ void fuse_partner(const view_maps *reference, const view_maps *partner, const ui
             const ptrdiff_t x = (ptrdiff_t)(u + 0.5), y = (ptrdiff_t)(v + 0.5);
             const ptrdiff_t q = y * partner->width + x;
             const float depth = partner->depth[q];
-            if (!(fabsf(depth - (float)seen.z) <= gates.max_depth_error * depth)) {
+            if (!(depth > 0 && fabsf(depth - (float)seen.z) <= gates.max_depth_error * depth)) {
                 continue;
             }
             const direction own = normal_at(reference, p), other = normal_at(partner, q);

@@ -15,8 +15,9 @@ import pytest
 from clouds import read_fused, read_visibility
 
 from colmap_sph import synthetic as syn
+from colmap_sph.colmap_fusion import fuse_by_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.fusion import FusionOptions, fuse
+from colmap_sph.fusion import FusionOptions
 from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.scene import read_scene
 from colmap_sph.workspace import (
@@ -32,7 +33,9 @@ WIDTH, HEIGHT, FOCAL = 120, 90, 150.0
 FLYING_HEIGHT = 10.0
 GSD = FLYING_HEIGHT / FOCAL
 NORMAL = np.array([-0.35, 0.25, 0.9]) / np.linalg.norm([-0.35, 0.25, 0.9])
-COLMAP_DEFAULTS = FusionOptions(min_num_pixels=5, max_reproj_error=2.0, max_normal_error=10.0)
+COLMAP_DEFAULTS = FusionOptions(method="colmap", min_num_pixels=5, max_reproj_error=2.0, max_normal_error=10.0)
+# Our defaults of the options that COLMAP has, too.
+OURS = FusionOptions(method="colmap")
 
 
 def make_workspace(root: Path, *, origin: float = 0.0, tracks: bool = True) -> Workspace:
@@ -75,9 +78,9 @@ def workspace(tmp_path):
 # ---- what is fused -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("options", [FusionOptions(), COLMAP_DEFAULTS], ids=["ours", "COLMAP's"])
+@pytest.mark.parametrize("options", [OURS, COLMAP_DEFAULTS], ids=["ours", "COLMAP's"])
 def test_exact_maps_fuse_to_the_true_plane(workspace, options):
-    count = fuse(workspace, options, threads=1)
+    count = fuse_by_colmap(workspace, options, threads=1)
     cloud = read_fused(workspace.fused_path)
     assert count == len(cloud) > WIDTH * HEIGHT / 5
     distance = cloud["xyz"].astype(float) @ NORMAL
@@ -93,13 +96,13 @@ def test_exact_maps_fuse_to_the_true_plane(workspace, options):
 def test_half_a_pixel_would_show(tmp_path):
     """The measure above can tell depths of pixel centres from depths at COLMAP's pixel origin."""
     workspace = make_workspace(tmp_path / "dense", origin=0.5)
-    fuse(workspace, FusionOptions(), threads=1)
+    fuse_by_colmap(workspace, OURS, threads=1)
     distance = read_fused(workspace.fused_path)["xyz"] @ NORMAL
     assert abs(distance.mean()) > 0.2 * GSD
 
 
 def test_visibility_lists_the_images_of_each_point(workspace):
-    count = fuse(workspace, COLMAP_DEFAULTS, threads=1)
+    count = fuse_by_colmap(workspace, COLMAP_DEFAULTS, threads=1)
     cloud = read_fused(workspace.fused_path)
     visible = read_visibility(workspace.fused_path.with_name("fused.ply.vis"))
     views = read_scene(workspace.sparse_dir).views
@@ -115,15 +118,15 @@ def test_visibility_lists_the_images_of_each_point(workspace):
 
 
 def test_options_reach_colmap(workspace, tmp_path):
-    every = fuse(workspace, FusionOptions(), threads=1)
-    assert fuse(workspace, FusionOptions(min_num_pixels=4), threads=1) < 0.8 * every
+    every = fuse_by_colmap(workspace, OURS, threads=1)
+    assert fuse_by_colmap(workspace, replace(OURS, min_num_pixels=4), threads=1) < 0.8 * every
     masks = tmp_path / "masks"
     masks.mkdir()
     for name in "abcdef":
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
         mask[:, : WIDTH // 2] = 0
         cv2.imwrite(str(masks / f"{name}.png.png"), mask)
-    masked = fuse(workspace, FusionOptions(mask_path=masks), threads=1)
+    masked = fuse_by_colmap(workspace, replace(OURS, mask_path=masks), threads=1)
     assert 0.3 * every < masked < 0.7 * every
 
 
@@ -131,19 +134,20 @@ def test_photometric_maps(workspace):
     for folder in ("depth_maps", "normal_maps"):
         for path in (workspace.stereo_dir / folder).iterdir():
             path.rename(path.with_name(path.name.replace("geometric", "photometric")))
-    assert fuse(workspace, FusionOptions(), threads=1, kind="photometric") > WIDTH * HEIGHT
+    assert fuse_by_colmap(workspace, OURS, threads=1, kind="photometric") > WIDTH * HEIGHT
 
 
 def test_a_model_without_tracks_fuses_by_partners(tmp_path):
     """COLMAP finds no overlapping image without tracks; ours gives the same cloud as with them."""
-    expected = fuse(make_workspace(tmp_path / "tracks"), FusionOptions(), threads=1)
+    expected = fuse_by_colmap(make_workspace(tmp_path / "tracks"), OURS, threads=1)
     workspace = make_workspace(tmp_path / "none", tracks=False)
     names = workspace.fusion_cfg_path.read_text().split()
     model = {path.name: path.read_bytes() for path in workspace.sparse_dir.iterdir()}
-    assert fuse(workspace, FusionOptions(), threads=1) == 0
+    assert fuse_by_colmap(workspace, OURS, threads=1) == 0
     partners = {name: [other for other in names if other != name] for name in names}
     # Not to the point: COLMAP visits the images in the order of what they share.
-    assert fuse(workspace, FusionOptions(), threads=1, partners=partners) == pytest.approx(expected, rel=0.02)
+    count = fuse_by_colmap(workspace, OURS, threads=1, partners=partners)
+    assert count == pytest.approx(expected, rel=0.02)
     assert {path.name: path.read_bytes() for path in workspace.sparse_dir.iterdir()} == model
     assert workspace.images_dir.is_dir()
     assert workspace.depth_map_path("a.png", "geometric").is_file()
@@ -166,7 +170,7 @@ def test_debian_colmap_agrees(finished, tmp_path):
     assert done.returncode == 0, done.stderr
     dense = tmp_path / "dense"
     shutil.copytree(finished.dense, dense, ignore=shutil.ignore_patterns("colmap_sph"))
-    ours = fuse(Workspace(dense), COLMAP_DEFAULTS)
+    ours = fuse_by_colmap(Workspace(dense), COLMAP_DEFAULTS)
     theirs = len(read_fused(output))
     assert ours > 10_000
     assert theirs == pytest.approx(ours, rel=0.05)
@@ -203,12 +207,12 @@ def remove_depths(workspace, names):
 @pytest.mark.parametrize(
     ("spoil", "options", "gate"),
     [
-        (spoil_normals, FusionOptions(min_num_pixels=4), "normal"),
+        (spoil_normals, replace(OURS, min_num_pixels=4), "normal"),
         (interleave_normals, COLMAP_DEFAULTS, "normal"),
-        (scale_depths, FusionOptions(), "depth"),
-        (remove_depths, FusionOptions(), "unseen"),
-        (None, FusionOptions(max_reproj_error=0.02), "reprojection"),
-        (None, FusionOptions(), "kept"),
+        (scale_depths, OURS, "depth"),
+        (remove_depths, OURS, "unseen"),
+        (None, replace(OURS, max_reproj_error=0.02), "reprojection"),
+        (None, OURS, "kept"),
     ],
     ids=["normals", "interleaved normals", "depths", "no depths", "narrow gate", "nothing"],
 )
@@ -223,7 +227,7 @@ def test_the_gate_that_takes_the_points_is_named(workspace, spoil, options, gate
     option = {"normal": "max_normal_error", "depth": "max_depth_error", "reprojection": "max_reproj_error"}
     assert gate not in option or f"loosen {option[gate]}" in losses.sentence()
     # COLMAP's own fusion loses (or keeps) the points indeed.
-    count = fuse(workspace, options, threads=1)
+    count = fuse_by_colmap(workspace, options, threads=1)
     assert (count > WIDTH * HEIGHT / 5) == (gate == "kept")
 
 
@@ -243,7 +247,7 @@ def test_only_overlapping_views_are_compared(workspace):
     for view in far:
         write_maps(workspace, view.name, np.zeros((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH, 3)))
     block = replace(scene, views=tuple(sorted((*scene.views, *far), key=lambda view: view.name)))
-    assert explain_losses(workspace, block, FusionOptions(), max_views=5).kept > 0.9
+    assert explain_losses(workspace, block, OURS, max_views=5).kept > 0.9
 
 
 # ---- bad input ---------------------------------------------------------------------------------------------
@@ -268,7 +272,7 @@ def test_options_out_of_bounds(workspace, options, words):
     with pytest.raises(OptionError, match=words):
         FusionOptions(**options).check()
     with pytest.raises(OptionError, match=words):
-        fuse(workspace, FusionOptions(**options))
+        fuse_by_colmap(workspace, FusionOptions(**options))
 
 
 @pytest.mark.parametrize("blocked", ["fused.ply", "fused.ply.vis", "colmap_sph"])
@@ -281,7 +285,7 @@ def test_unwritable_output(workspace, blocked):
         path.mkdir()
     before = sorted(workspace.root.rglob("*"))
     with pytest.raises(OutputError, match=blocked):
-        fuse(workspace, FusionOptions(), threads=1)
+        fuse_by_colmap(workspace, OURS, threads=1)
     assert sorted(workspace.root.rglob("*")) == before
 
 
@@ -289,16 +293,16 @@ def test_a_missing_map_is_named(workspace):
     path = workspace.normal_map_path("c.png", "geometric")
     path.unlink()
     with pytest.raises(InputError, match=str(path)):
-        fuse(workspace, FusionOptions())
+        fuse_by_colmap(workspace, OURS)
 
 
 def test_fusion_cfg_that_does_not_fit(workspace):
     workspace.fusion_cfg_path.write_text("a.png\nz.png\n")
     with pytest.raises(InputError, match=r"z\.png"):
-        fuse(workspace, FusionOptions())
+        fuse_by_colmap(workspace, OURS)
     workspace.fusion_cfg_path.unlink()
     with pytest.raises(InputError, match=r"fusion\.cfg"):
-        fuse(workspace, FusionOptions())
+        fuse_by_colmap(workspace, OURS)
 
 
 @pytest.mark.parametrize("kind", ["cut off", "other size", "no header"])
@@ -310,5 +314,5 @@ def test_a_damaged_map_is_named(workspace, kind):
     else:
         path.write_bytes(path.read_bytes()[:-100] if kind == "cut off" else b"\0" * 100)
     with pytest.raises(InputError, match=str(path)):
-        fuse(workspace, FusionOptions())
+        fuse_by_colmap(workspace, OURS)
     assert not workspace.fused_path.exists()
