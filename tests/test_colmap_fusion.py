@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import pytest
 from clouds import read_fused, read_visibility
+from exact_maps import GSD, HEIGHT, NORMAL, WIDTH, make_workspace, write_maps
 
-from colmap_sph import synthetic as syn
 from colmap_sph.colmap_fusion import fuse_by_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.fusion import FusionOptions
@@ -25,49 +25,11 @@ from colmap_sph.workspace import (
     read_depth_map,
     read_normal_map,
     write_depth_map,
-    write_fusion_cfg,
-    write_normal_map,
 )
 
-WIDTH, HEIGHT, FOCAL = 120, 90, 150.0
-FLYING_HEIGHT = 10.0
-GSD = FLYING_HEIGHT / FOCAL
-NORMAL = np.array([-0.35, 0.25, 0.9]) / np.linalg.norm([-0.35, 0.25, 0.9])
 COLMAP_DEFAULTS = FusionOptions(method="colmap", min_num_pixels=5, max_reproj_error=2.0, max_normal_error=10.0)
 # Our defaults of the options that COLMAP has, too.
 OURS = FusionOptions(method="colmap")
-
-
-def make_workspace(root: Path, *, origin: float = 0.0, tracks: bool = True) -> Workspace:
-    """Six views of a plane through the origin, as a dense workspace with exact geometric maps."""
-    plane = syn.Plane((0, 0, 0), NORMAL, syn.Mottled(syn.Noise(GSD, seed=1)))
-    cameras = []
-    for x, y in [(-1.2, -0.7), (0.1, -0.8), (1.3, -0.6), (-1.1, 0.7), (-0.1, 0.9), (1.2, 0.6)]:
-        R, t = syn.look_at((x, y, FLYING_HEIGHT), (0.4 * x, 0.4 * y, 0), up=(0, 1, 0))
-        cameras.append(syn.Camera(syn.pinhole(FOCAL, WIDTH, HEIGHT), R, t, WIDTH, HEIGHT))
-    names = [f"{name}.png" for name in "abcdef"]
-    rng = np.random.default_rng(0)
-    sparse = syn.sample_sparse_points([plane], cameras, 100, rng)
-    if not tracks:
-        none = tuple(np.empty(0, np.int64) for _ in cameras)
-        sparse = syn.SparsePoints(np.empty((0, 3)), tuple(np.empty((0, 2)) for _ in cameras), none)
-    workspace = Workspace(root)
-    workspace.create_stereo_dirs(names)
-    workspace.images_dir.mkdir()
-    syn.write_reconstruction(syn.build_reconstruction(names, cameras, sparse), workspace.sparse_dir)
-    for name, camera in zip(names, cameras, strict=True):
-        cv2.imwrite(str(workspace.image_path(name)), rng.integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
-        depth, normals, _ = syn.exact_geometry([plane], camera, origin=origin)
-        write_maps(workspace, name, depth, normals)
-    write_fusion_cfg(workspace.fusion_cfg_path, names)
-    return workspace
-
-
-def write_maps(workspace, name, depth=None, normals=None):
-    if depth is not None:
-        write_depth_map(workspace.depth_map_path(name, "geometric"), depth.astype(np.float32))
-    if normals is not None:
-        write_normal_map(workspace.normal_map_path(name, "geometric"), normals.astype(np.float32))
 
 
 @pytest.fixture
