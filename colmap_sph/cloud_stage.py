@@ -29,7 +29,7 @@ _FEW_POINTS = 0.02
 _MOSTLY = 0.5
 # Bytes per pixel: of the maps of a view with its image; largest in use while a view is fused; of all images
 # together in COLMAP's fusion.
-_MAPS_BYTES, _FUSE_BYTES = 19.0, 60.0
+MAPS_BYTES, FUSE_BYTES = 19.0, 60.0
 COLMAP_FUSION_BYTES = 80.0
 
 
@@ -120,8 +120,8 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
     gate = MemoryGate(options.memory_budget)
     pixels = [view.width * view.height for view in map(scene.view, state.names)]
     # The cache takes nothing that the largest view needs.
-    spare = max(gate.free - 2 * _FUSE_BYTES * max(pixels), 0) / 2
-    cache_bytes = int(min(_MAPS_BYTES * sum(pixels), spare))
+    spare = max(gate.free - 2 * FUSE_BYTES * max(pixels), 0) / 2
+    cache_bytes = int(min(MAPS_BYTES * sum(pixels), spare))
     gate.keep(cache_bytes)
     index_of = {image_id: index for index, image_id in enumerate(scene.image_ids)}
 
@@ -142,7 +142,7 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
 
         def work(name: str) -> Done:
             view = scene.view(name)
-            with gate.reserve(_FUSE_BYTES * view.width * view.height, name):
+            with gate.reserve(FUSE_BYTES * view.width * view.height, name):
                 bands = fuse_view(maps.get(name), partners(name), options.fusion)
                 return Done(state.key, made=True, points=write_part(stems[name], bands))
 
