@@ -42,7 +42,7 @@ _UNDISTORTED_BYTES = 1.0
 _PAIR_BYTES = 2.0  # of the left rectified image
 _ESTIMATE_BYTES = 9.0
 _MAP_BYTES = 16.0  # depth and normals of one kind
-_CLOUD_BYTES = 9.0
+_CLOUD_BYTES = 12.0
 # Bytes in memory: of the libraries, per left rectified pixel and worker, and in COLMAP's fusion, for a moment,
 # per width times squared height of one image.
 _BASE_MEMORY = 200e6

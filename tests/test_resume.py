@@ -23,7 +23,7 @@ from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairOptions, select_pairs
-from colmap_sph.plan import make_plan
+from colmap_sph.plan import Plan, make_plan
 from colmap_sph.rectification import RectificationOptions
 from colmap_sph.report import RunReport
 from colmap_sph.scene import read_scene
@@ -528,6 +528,20 @@ def test_plan_of_reduced_images(project: Path) -> None:
     )
     assert half.disk == pytest.approx(whole.disk / 4, rel=0.15)
     assert half.pairs == whole.pairs
+
+
+def test_plan_of_the_fusion(finished: Finished) -> None:
+    """The budget bounds ours, not COLMAP's, and more partners take more time."""
+
+    def plan(**changes: object) -> Plan:
+        options = {"min_num_pixels": 3, **changes}
+        tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(**options))
+        return make_plan(workspace=finished.dense, options=tight)
+
+    ours, theirs = plan(), plan(method="colmap")
+    assert ours.fuse and theirs.fuse
+    assert ours.memory <= 203e6 < theirs.memory
+    assert ours.seconds > plan(check_num_images=1).seconds > 0
 
 
 def test_plan_of_a_finished_workspace(finished: Finished) -> None:
