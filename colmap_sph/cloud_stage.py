@@ -88,7 +88,8 @@ def fuse_views(context: Context, pairs: Iterable[Pair], maps: Mapping[str, str])
         forget(context.cloud_record)
         by_colmap = context.options.fusion.method == "colmap"
         points, whole = _fuse_by_colmap(context, state) if by_colmap else _fuse_by_pixel(context, state)
-        facts = {"points": points, "advice": _advice(context, state.names, points)}
+        fused = [name for name in state.names if name not in report.skipped_images]
+        facts = {"points": points, "advice": _advice(context, fused, points)}
         if whole:
             vouch(context.cloud_record, state.key, context.cloud_paths, **facts)
     context.count("fuse", [Done(state.key, made=state.facts is None)])

@@ -147,7 +147,8 @@ def fuse_view(
     A partner agrees with a pixel where the depth and the normal at the pixel next to its projection do. It covers
     it where that projection is within `max_reproj_error` of the partner's pixel, and that pixel stands for less
     surface: depth² / (fx fy |n · r|), r the ray of depth 1. As this orders all pixels, one at least of those that
-    see a piece of surface is not covered.
+    see a piece of surface is not covered. It has its own partners: where these are too few, for noise at a gate,
+    no other pixel takes its place.
 
     Parameters
     ----------

@@ -375,11 +375,12 @@ def test_thin_clouds_of_many_images_are_no_reason_for_advice(workspace, monkeypa
     assert "loosen max_normal_error" in report.advice
 
 
-def test_a_skipped_image_has_no_say_in_the_advice(workspace):
+@pytest.mark.parametrize("coverage", [0.0, 1.0], ids=["before", "in fusion"])
+def test_a_skipped_image_has_no_say_in_the_advice(workspace, coverage):
     """It has no maps to look at."""
     workspace.depth_map_path("b.png", "geometric").unlink()
     context = context_of(workspace, fusion=FusionOptions(min_num_pixels=6))
-    context.report.coverage["b.png"] = 0.0
+    context.report.coverage["b.png"] = coverage
     fuse_views(context, (), dict.fromkeys(NAMES, "key"))
     assert context.report.points == 0
     assert context.report.advice
