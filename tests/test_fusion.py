@@ -307,6 +307,8 @@ def noisy_maps(seed):
         camera((1.1, -0.4, 10), 110, size=(50, 41)),
         camera((-3.5, 0.4, 8), 60, target=(0, 0, 0), size=(33, 40)),
     ]
+    # Pixels that are not square, and a principal point aside.
+    cameras[1] = replace(cameras[1], K=np.array([[70.0, 0, 17], [0, 45, 16], [0, 0, 1]]))
     maps = []
     for one in maps_of(YARD, cameras):
         depth = one.depth * (1 + rng.normal(0, 0.006, one.depth.shape)).astype(np.float32)
