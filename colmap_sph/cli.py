@@ -40,7 +40,7 @@ from colmap_sph.workspace import MapKind, Workspace
 logger = logging.getLogger(__name__)
 
 PARTIAL_EXIT_CODE = 5
-"""The run finished, but some images of the model have no depth map."""
+"""The run finished, but some images of the model have no depth map, or are not in the cloud."""
 
 _MAX_LISTED_IMAGES = 60
 

@@ -46,8 +46,8 @@ def write_part(stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.ui
     count = 0
     with atomic_file(stem.with_suffix(".points")) as cloud, stem.with_suffix(".vis").open("wb") as visible:
         for points, visibility in bands:
-            cloud.write(points.tobytes())
-            visible.write(visibility.astype("<u4").tobytes())
+            cloud.write(points.data)
+            visible.write(visibility.astype("<u4", copy=False).data)
             count += len(points)
     return count
 

@@ -3,13 +3,14 @@
 import logging
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from colmap_sph.cloud_files import check_places, join_parts, link_workspace, move_into_place, write_part
 from colmap_sph.colmap_fusion import fuse_by_colmap
 from colmap_sph.context import Context, Done, Pair
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, NoResultError, OutputError
 from colmap_sph.fusion import MAX_PARTNERS, ViewMaps, fuse_view, read_view_maps
 from colmap_sph.fusion_losses import explain_losses
 from colmap_sph.load_cache import LoadCache
@@ -24,9 +25,11 @@ logger = logging.getLogger(__name__)
 
 # Fewer points than this share of the pixels with a geometric depth calls for an explanation.
 _FEW_POINTS = 0.02
+# Most of them can be confirmed, and the cloud is thin all the same, where many images see each piece of surface.
+_MOSTLY = 0.5
 # Bytes per pixel: of the maps of a view with its image; largest in use while a view is fused; of all images
 # together in COLMAP's fusion.
-_MAPS_BYTES, _FUSE_BYTES = 19.0, 60.0
+MAPS_BYTES, FUSE_BYTES = 19.0, 60.0
 COLMAP_FUSION_BYTES = 80.0
 
 
@@ -59,8 +62,13 @@ def cloud_state(
     names = tuple(view.name for view in scene.views if coverage.get(view.name, 0) > 0)
     partners: dict[str, list[str]] | None = None
     if options.method != "colmap":
-        overlapping = overlapping_views(scene, min(options.check_num_images, MAX_PARTNERS))
-        partners = {name: [other for other in overlapping[name] if other in names] for name in names}
+        most = min(options.check_num_images, MAX_PARTNERS)
+        # A pair that the user asked for may share no point.
+        overlapping, matched, fused = overlapping_views(scene, most), partners_of(pairs), set(names)
+        partners = {
+            name: [o for o in dict.fromkeys([*overlapping[name], *matched.get(name, [])]) if o in fused][:most]
+            for name in names
+        }
     elif not any(len(view.point_indices) for view in scene.views):
         partners = partners_of(pairs)
     key = context.keys.cloud({name: maps[name] for name in names}, partners or {}, scene.origin)
@@ -80,7 +88,8 @@ def fuse_views(context: Context, pairs: Iterable[Pair], maps: Mapping[str, str])
         forget(context.cloud_record)
         by_colmap = context.options.fusion.method == "colmap"
         points, whole = _fuse_by_colmap(context, state) if by_colmap else _fuse_by_pixel(context, state)
-        facts = {"points": points, "advice": _advice(context, points)}
+        fused = [name for name in state.names if name not in report.skipped_images]
+        facts = {"points": points, "advice": _advice(context, fused, points)}
         if whole:
             vouch(context.cloud_record, state.key, context.cloud_paths, **facts)
     context.count("fuse", [Done(state.key, made=state.facts is None)])
@@ -110,10 +119,10 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
     overlapping = state.partners or {}
     check_places(workspace)
     gate = MemoryGate(options.memory_budget)
-    sizes = [view.width * view.height for view in scene.views]
-    # What one image needs comes before what makes it faster.
-    spare = gate.free - 1.2 * _FUSE_BYTES * max(sizes)
-    cache_bytes = int(min(_MAPS_BYTES * sum(sizes), max(spare, 0.0)))
+    pixels = [view.width * view.height for view in map(scene.view, state.names)]
+    # The cache takes nothing that the largest view needs.
+    spare = max(gate.free - 2 * FUSE_BYTES * max(pixels), 0) / 2
+    cache_bytes = int(min(MAPS_BYTES * sum(pixels), spare))
     gate.keep(cache_bytes)
     index_of = {image_id: index for index, image_id in enumerate(scene.image_ids)}
 
@@ -134,17 +143,31 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
 
         def work(name: str) -> Done:
             view = scene.view(name)
-            with gate.reserve(_FUSE_BYTES * view.width * view.height, name):
+            with gate.reserve(FUSE_BYTES * view.width * view.height, name):
                 bands = fuse_view(maps.get(name), partners(name), options.fusion)
                 return Done(state.key, made=True, points=write_part(stems[name], bands))
 
         done = context.for_all("fuse", work, state.names, context.skip_view)
+        if not done:
+            raise NoResultError(f"No image could be fused ({context.report.skipped_images[state.names[0]]})")
         points = sum(part.points for part in done.values())
-        join_parts([stems[name] for name in done], scratch, points)
-        if scene.origin.any():
-            link_workspace(workspace, load_model(workspace.sparse_dir), scene.origin, scratch)
-        move_into_place(scratch, workspace, scene.origin)
+        _put_together(context, scratch, [stems[name] for name in done], points)
     return points, len(done) == len(state.names)
+
+
+def _put_together(context: Context, scratch: Path, stems: list[Path], points: int) -> None:
+    """Make the cloud in the folder `scratch` of its parts, and move it to its place."""
+    workspace, origin = context.workspace, context.scene.origin
+    try:
+        join_parts(stems, scratch, points)
+        if origin.any():
+            link_workspace(workspace, load_model(workspace.sparse_dir), origin, scratch)
+        move_into_place(scratch, workspace, origin)
+    except (OSError, RuntimeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OutputError(
+            f"{workspace.fused_path} cannot be written ({reason}); check space and permissions."
+        ) from error
 
 
 def _warn_of_memory(context: Context, names: Iterable[str]) -> None:
@@ -160,11 +183,12 @@ def _warn_of_memory(context: Context, names: Iterable[str]) -> None:
         )
 
 
-def _advice(context: Context, points: int) -> str:
-    """Which gate of the fusion to loosen, where few points survived."""
-    coverage, scene = context.report.coverage, context.scene
+def _advice(context: Context, names: Iterable[str], points: int) -> str:
+    """Which gate of the fusion to loosen, where few points of the fused images survived."""
+    coverage, options = context.report.coverage, context.options
+    scene = replace(context.scene, views=tuple(map(context.scene.view, names)))
     pixels = sum(coverage[view.name] * view.width * view.height for view in scene.views)
     if points >= _FEW_POINTS * pixels:
         return ""
-    options = context.options
-    return explain_losses(context.workspace, scene, options.fusion, kind=options.fusion_input).sentence()
+    losses = explain_losses(context.workspace, scene, options.fusion, kind=options.fusion_input)
+    return "" if points and losses.kept > _MOSTLY else losses.sentence()

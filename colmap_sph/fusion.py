@@ -25,8 +25,8 @@ from colmap_sph.workspace import MapKind, Workspace, mask_path, read_depth_map, 
 
 # A bit for each of them.
 MAX_PARTNERS = 64
-# Points are made from so many pixels at a time.
-_BAND_PIXELS = 1 << 20
+# Points are made from so many pixels at a time: one that 50 images see takes 231 bytes.
+_BAND_PIXELS = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,8 @@ def fuse_view(
     A partner agrees with a pixel where the depth and the normal at the pixel next to its projection do. It covers
     it where that projection is within `max_reproj_error` of the partner's pixel, and that pixel stands for less
     surface: depth² / (fx fy |n · r|), r the ray of depth 1. As this orders all pixels, one at least of those that
-    see a piece of surface is not covered.
+    see a piece of surface is not covered. It has its own partners: where these are too few, for noise at a gate,
+    no other pixel takes its place.
 
     Parameters
     ----------

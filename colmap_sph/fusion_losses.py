@@ -136,6 +136,8 @@ def _verdicts(
     seen = inside & (z > 0)
     far = seen & (np.abs(in_camera[:, 2] - z) > options.max_depth_error * z)
     off = seen & ~far & (np.hypot(*(uv - np.stack([columns, rows], axis=1)).T) > options.max_reproj_error)
+    if options.method != "colmap":  # what is farther away agrees all the same, and becomes a point of its own
+        off[:] = False
     cosine = (normals * (view_normals[rows, columns] @ view.R)).sum(axis=1)
     turned = seen & ~far & ~off & (cosine < np.cos(np.radians(options.max_normal_error)))
     return np.stack([far, off, turned, seen & ~far & ~off & ~turned], axis=1)

@@ -11,21 +11,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_sph.cloud_stage import COLMAP_FUSION_BYTES, cloud_state
+from colmap_sph.cloud_stage import COLMAP_FUSION_BYTES, FUSE_BYTES, MAPS_BYTES, cloud_state
 from colmap_sph.context import Context, Pair
 from colmap_sph.errors import ColmapSphError
+from colmap_sph.fusion import MAX_PARTNERS
 from colmap_sph.keys import Keys
 from colmap_sph.options import RunOptions
-from colmap_sph.pairs import partners_of, select_pairs
+from colmap_sph.pairs import overlapping_views, partners_of, select_pairs
 from colmap_sph.pipeline import check_arguments, choose_pairs, find_database, wanted_scene
 from colmap_sph.rectification import rectify_pair
 from colmap_sph.scene import read_scene
-from colmap_sph.stages import (
-    PairState,
-    check_state,
-    pair_state,
-    vote_state,
-)
+from colmap_sph.stages import PairState, check_state, pair_state, vote_state
 from colmap_sph.undistortion import foresee_workspace, leave_out_bad_images, open_workspace
 from colmap_sph.workspace import Workspace
 
@@ -38,15 +34,17 @@ _MATCH_SECONDS = 0.14  # of both rectified images
 _VOTE_SECONDS = 0.07  # of the image, per pair
 _CHECK_SECONDS = 0.05  # of the image, per partner
 _NORMALS_SECONDS = 0.25  # of the image, for each of its two kinds of maps
-_FUSE_SECONDS = 0.9
+_COLMAP_FUSE_SECONDS = 0.9
+# With 33 images of 1.1 megapixels, each of which 32 others overlap.
+_FUSE_SECONDS, _FUSE_PARTNER_SECONDS = 0.05, 0.011  # of the image, and per overlapping image
 # Bytes per pixel on disk, measured at the same time.
 _UNDISTORTED_BYTES = 1.0
 _PAIR_BYTES = 2.0  # of the left rectified image
 _ESTIMATE_BYTES = 9.0
 _MAP_BYTES = 16.0  # depth and normals of one kind
-_CLOUD_BYTES = 9.0
-# Bytes in memory: of the libraries, per left rectified pixel and worker, per pixel of all images in fusion, and
-# there, for a moment, per squared pixel of one image.
+_CLOUD_BYTES = 12.0
+# Bytes in memory: of the libraries, per left rectified pixel and worker, and in COLMAP's fusion, for a moment,
+# per width times squared height of one image.
 _BASE_MEMORY = 200e6
 _MATCH_MEMORY = 170.0
 _FUSION_MASK_MEMORY = 0.1
@@ -134,7 +132,7 @@ def make_plan(
         survey.seconds += _UNDISTORT_SECONDS * foreseen.original_pixels / 1e6
         survey.disk += _UNDISTORTED_BYTES * pixels
     if survey.fuse:
-        survey.seconds += _FUSE_SECONDS * pixels / 1e6
+        survey.seconds += _fuse_seconds(context)
         survey.disk += _CLOUD_BYTES * pixels
     return Plan(
         undistort=foreseen is not None,
@@ -228,16 +226,30 @@ def _survey_votes(context: Context, keys: Mapping[Pair, str], survey: _Survey) -
     return votes
 
 
+def _fuse_seconds(context: Context) -> float:
+    scene, options = context.scene, context.options.fusion
+    if options.method == "colmap":
+        return _COLMAP_FUSE_SECONDS * sum(view.width * view.height for view in scene.views) / 1e6
+    overlapping = overlapping_views(scene, min(options.check_num_images, MAX_PARTNERS))
+    return sum(
+        (_FUSE_SECONDS + _FUSE_PARTNER_SECONDS * len(overlapping[view.name])) * view.width * view.height / 1e6
+        for view in scene.views
+    )
+
+
 def _memory(context: Context, survey: _Survey) -> float:
-    matching = _MATCH_MEMORY * survey.largest_pair * min(context.options.num_threads, max(survey.pairs, 1))
+    threads, views = context.options.num_threads, context.scene.views
     most, options = context.options.memory_budget, context.options.fusion
-    matching = min(_BASE_MEMORY + matching, most)
-    if not survey.fuse or options.method != "colmap":
-        return matching
-    views = context.scene.views
-    fusion = COLMAP_FUSION_BYTES * sum(view.width * view.height for view in views)
-    if options.use_cache:
-        fusion = min(fusion, options.cache_size * 1e9)
-    fusion += _FUSION_MASK_MEMORY * max(view.width * view.height**2 for view in views)
-    # The budget bounds all but COLMAP's fusion.
-    return max(matching, _BASE_MEMORY + fusion)
+    pixels = [view.width * view.height for view in views]
+    matching = _MATCH_MEMORY * survey.largest_pair * min(threads, max(survey.pairs, 1))
+    fusion = FUSE_BYTES * max(pixels) * min(threads, len(pixels)) + MAPS_BYTES * sum(pixels)
+    if not survey.fuse:
+        fusion = 0
+    elif options.method == "colmap":
+        fusion = COLMAP_FUSION_BYTES * sum(pixels)
+        if options.use_cache:
+            fusion = min(fusion, options.cache_size * 1e9)
+        fusion += _FUSION_MASK_MEMORY * max(view.width * view.height**2 for view in views)
+        # The budget bounds all but COLMAP's fusion.
+        most = max(most, int(_BASE_MEMORY + fusion))
+    return min(_BASE_MEMORY + max(matching, fusion), most)

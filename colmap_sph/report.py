@@ -33,7 +33,7 @@ class RunReport:
     images : int
         Images with depth maps.
     skipped_images : dict
-        Image name → why it has no depth map.
+        Image name → why it has no depth map, or is not in the cloud.
     pair_source : str
         Where the pairs come from.
     pairs : int

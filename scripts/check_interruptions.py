@@ -3,11 +3,12 @@
     python scripts/check_interruptions.py --output /tmp/interruptions
     python scripts/check_interruptions.py --model sparse/0 --max-image-size 400 --output /tmp/interruptions
 
-Without --model it renders the demo's block. Every kill is a SIGKILL. The maps must come out the same to the bit,
-and what was finished at a kill must not be done again. A workspace that gets finished in spite of the kills is
-compared, and a new one is begun. Exit code 1: something was not as it must be.
+Without --model it renders the demo's block. Every kill is a SIGKILL. Maps and cloud must come out the same to the
+bit, and what was finished at a kill must not be done again. A workspace that gets finished in spite of the kills
+is compared, and a new one is begun. Exit code 1: something was not as it must be.
 """
 
+import filecmp
 import random
 import shutil
 import signal
@@ -20,6 +21,8 @@ from pathlib import Path
 
 import tyro
 
+from colmap_sph.cli import PARTIAL_EXIT_CODE
+from colmap_sph.cloud_files import CLOUD_FILES
 from colmap_sph.synthetic import make_demo_block
 
 
@@ -54,7 +57,8 @@ class Kill:
     remade : int
         Files of it that the next run wrote again: must be 0.
     different : int or None
-        Where the workspace was then finished: maps that differ from those of a run left alone. Must be 0.
+        Where the workspace was then finished: maps and files of the cloud that differ from those of a run left
+        alone. Must be 0.
     """
 
     moment: float
@@ -77,12 +81,12 @@ def main(check: Check) -> int:
         "--max-image-size",
         str(check.max_image_size),
     ]
-    print("kill  after s  pairs  votes  maps  cloud  made again  maps that differ", flush=True)
+    print("kill  after s  pairs  votes  maps  cloud  made again  files that differ", flush=True)
     kills = []
     for number, kill in enumerate(kill_and_resume(arguments, check.output, check.kills, check.seed), start=1):
         counts = "".join(f"{kill.finished[kind]:7d}" for kind in ("pairs", "votes", "maps", "cloud"))
         different = "-" if kill.different is None else str(kill.different)
-        print(f"{number:4d}{kill.moment:9.2f}{counts}{kill.remade:12d}{different:>18}", flush=True)
+        print(f"{number:4d}{kill.moment:9.2f}{counts}{kill.remade:12d}{different:>19}", flush=True)
         kills.append(kill)
     wrong = sum(kill.remade + (kill.different or 0) for kill in kills)
     print(f"{len(kills)} kills, {wrong} files made again or different")
@@ -123,7 +127,8 @@ def run(arguments: list[str], workspace: Path, *, kill_after: float | None = Non
             process.send_signal(signal.SIGKILL)
             process.communicate()
             return False
-    if process.returncode:
+    # Images of the model that have no depth map are no fault of the kills.
+    if process.returncode not in (0, PARTIAL_EXIT_CODE):
         raise RuntimeError(f"exit code {process.returncode}:\n{said}")
     return True
 
@@ -147,7 +152,7 @@ def finished_files(workspace: Path) -> dict[Path, int]:
         name = record.relative_to(state / "state").with_suffix(".bin")
         files += [stereo / "depth_maps" / name, stereo / "normal_maps" / name]
     if (state / "cloud.json").exists():
-        files += [workspace / "fused.ply", workspace / "fused.ply.vis"]
+        files += [workspace / name for name in CLOUD_FILES]
     return {path: path.stat().st_mtime_ns for path in files}
 
 
@@ -159,13 +164,20 @@ def kind_of(path: Path, workspace: Path) -> str:
 
 
 def num_different(workspace: Path, whole: Path) -> int:
-    """Maps that differ, or that only one of two workspaces has; and leftovers of killed runs."""
-    maps = [
-        {path.relative_to(root) for path in root.glob("stereo/*_maps/**/*.bin")} for root in (workspace, whole)
+    """Maps and clouds that differ, or that only one of two workspaces has; and leftovers of killed runs."""
+    files = [
+        {
+            path.relative_to(root)
+            for pattern in ("stereo/*_maps/**/*.bin", "fused.ply*", "colmap_sph/local/fused.ply")
+            for path in root.glob(pattern)
+        }
+        for root in (workspace, whole)
     ]
-    assert maps[1], f"{whole} has no maps"
-    differ = [name for name in maps[0] & maps[1] if (workspace / name).read_bytes() != (whole / name).read_bytes()]
-    return len(maps[0] ^ maps[1]) + len(differ) + len(list(workspace.rglob(".*.tmp")))
+    missing = {Path(name) for name in CLOUD_FILES} - files[1]
+    assert not missing, f"{whole} has no {missing}"
+    same = [filecmp.cmp(workspace / name, whole / name, shallow=False) for name in files[0] & files[1]]
+    leftovers = [*workspace.rglob(".*.tmp"), *workspace.glob("colmap_sph/fusion")]
+    return len(files[0] ^ files[1]) + same.count(False) + len(leftovers)
 
 
 if __name__ == "__main__":

@@ -70,7 +70,10 @@ def damage_text(data: bytes, rng: Random) -> bytes:
 
 
 def make_cases(project: Path) -> None:
-    """Complete the project of `test_undistortion` by pictures of its plane, its model as text, and a workspace."""
+    """Complete the project of `test_undistortion` by all that is to be damaged.
+
+    Pictures of its plane, its model as text, masks, a workspace of COLMAP's, and one with a finished run in it.
+    """
     model = pycolmap.Reconstruction(project / "sparse" / "0")
     ground = np.random.default_rng(0).integers(0, 256, (64, 120, 3), np.uint8)
     for image in model.images.values():
@@ -78,9 +81,16 @@ def make_cases(project: Path) -> None:
         shift = round(30 * image.cam_from_world().translation[0])
         path = project / "images" / image.name
         assert cv2.imwrite(str(path), ground[:, 12 - shift : 108 - shift])
+        mask = np.full((64, 96), 255, np.uint8)
+        mask[:8] = 0
+        (project / "masks" / image.name).parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(project / "masks" / f"{image.name}.png"), mask)
     (project / "text").mkdir()
     model.write_text(project / "text")
     pycolmap.undistort_images(project / "dense", project / "sparse" / "0", project / "images")
+    shutil.copytree(project / "dense", project / "finished")
+    code = run_command(["--workspace", str(project / "finished")])
+    assert code == "0 ", code
 
 
 def _damage_one(folder: Path, pattern: str, rng: Random, damage: Callable[[bytes, Random], bytes]) -> str:
@@ -94,20 +104,30 @@ def prepare(project: Path, seed: int, case: Path) -> tuple[str, list[str]]:
     """Make the damaged copy of a project in the folder `case`; return what was damaged, and the command for it."""
     rng = np.random.default_rng(seed)
     model, images = case / "model", project / "images"
-    kind = ("binary", "text", "binary", "text", "image", "workspace")[seed % 6]
+    kind = ("binary", "text", "binary", "text", "image", "workspace", "mask", "finished")[seed % 8]
+    if kind == "finished":
+        shutil.copytree(project / "finished", case / "finished")
+        pattern = str(rng.choice(["*.bin", "*.npz", "*.json", "fused.ply*"]))
+        folder = case / "finished" / ("stereo" if pattern == "*.bin" else "")
+        return _damage_one(folder, pattern, rng, damage_bytes), ["--workspace", str(case / "finished")]
     if kind == "workspace":
         shutil.copytree(project / "dense", case / "dense")
         pattern = str(rng.choice(["patch-match.cfg", "*.bin", "*.png"]))
         damage = damage_text if pattern == "patch-match.cfg" else damage_bytes
         return _damage_one(case / "dense", pattern, rng, damage), ["--workspace", str(case / "dense")]
     shutil.copytree(project / ("text" if kind == "text" else "sparse/0"), model)
-    if kind == "image":
+    arguments = ["--model", str(model), "--output", str(case / "out")]
+    if kind == "mask":
+        shutil.copytree(project / "masks", case / "masks")
+        name = _damage_one(case / "masks", "*.*", rng, damage_bytes)
+        arguments += ["--masks", str(case / "masks")]
+    elif kind == "image":
         shutil.copytree(images, case / "images")
         images = case / "images"
         name = _damage_one(images, "*.*", rng, damage_bytes)
     else:
         name = _damage_one(model, "*.*", rng, damage_text if kind == "text" else damage_bytes)
-    return name, ["--model", str(model), "--images", str(images), "--output", str(case / "out")]
+    return name, [*arguments, "--images", str(images)]
 
 
 def run_command(arguments: list[str]) -> str:
@@ -128,6 +148,19 @@ def run_command(arguments: list[str]) -> str:
     return f"{code} {said[0] if said else ''}"
 
 
+def is_mended(workspace: Path, finished: Path, damaged: str) -> bool:
+    """Whether the maps and the cloud are what they were before the file called `damaged` was.
+
+    Of larger files the records know the size and some blocks: what lies between may stay as it is.
+    """
+    for path in (*finished.rglob("*.bin"), *finished.glob("fused.ply*")):
+        expected, found = path.read_bytes(), (workspace / path.relative_to(finished)).read_bytes()
+        unseen = path.name == damaged and len(found) == len(expected) > 64 << 10
+        if found != expected and not unseen:
+            return False
+    return True
+
+
 def main(project: Path, first: int, last: int) -> None:
     """Run cases `first` to `last` - 1."""
     warnings.simplefilter("error")
@@ -143,6 +176,8 @@ def main(project: Path, first: int, last: int) -> None:
         signal.alarm(_SECONDS)
         result = run_command(arguments)
         signal.alarm(0)
+        if (case / "finished").exists() and not is_mended(case / "finished", project / "finished", name):
+            result = f"BROKEN {name} is not as before, with {result}"
         print("END", seed, result, flush=True)
 
 

@@ -284,3 +284,70 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
             abs(v % 1 - 0.5),
         )
     return verdict, observing, carried, spread, clearance
+
+
+def pixel_area(view, pixel, depth, normal):
+    """Area of a tangent plane that a pixel (col, row) covers, by differences of where its rays meet the plane."""
+    inverse, step = np.linalg.inv(view.K), 1e-3
+    point = depth * (inverse @ [*pixel, 1.0])
+
+    def meet(column, row):
+        ray = inverse @ [column, row, 1.0]
+        return ray * (normal @ point) / (normal @ ray)
+
+    across = meet(pixel[0] + step, pixel[1]) - meet(pixel[0] - step, pixel[1])
+    down = meet(pixel[0], pixel[1] + step) - meet(pixel[0], pixel[1] - step)
+    return np.linalg.norm(np.cross(across, down)) / (2 * step) ** 2
+
+
+def _agreement(world, normal, partner, options):
+    """What a partner says of a world point: pixel (col, row), distance from it, whether it agrees; clearance."""
+    view = partner.view
+    seen = view.R @ world + view.t
+    if not seen[2] > 0:
+        return None, 0.0, False, np.inf
+    u, v = (view.K @ seen)[:2] / seen[2]
+    x, y = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
+    clearance = min(abs(u % 1 - 0.5), abs(v % 1 - 0.5))
+    if not (0 <= x < partner.depth.shape[1] and 0 <= y < partner.depth.shape[0]):
+        return None, 0.0, False, clearance
+    depth = float(partner.depth[y, x])
+    if not depth > 0:
+        return None, 0.0, False, clearance
+    difference = abs(depth - seen[2]) / depth / options.max_depth_error
+    cosine = normal @ view.R.T @ partner.normals[:, y, x].astype(float)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / options.max_normal_error
+    clearance = min(clearance, abs(difference - 1), abs(angle - 1))
+    return (x, y), np.hypot(u - x, v - y), difference <= 1 and angle <= 1, clearance
+
+
+def fuse_view(reference, partners, options):
+    """Points of a view by pixel (col, row): position, normal, colour, views; and the clearance of each pixel.
+
+    `reference` and `partners` are `fusion.ViewMaps`. The clearance is the least relative distance from any gate,
+    from a pixel's border and between two areas.
+    """
+    view, points = reference.view, {}
+    clearance = np.full(reference.depth.shape, np.inf)
+    for row, col in zip(*np.nonzero(reference.depth > 0), strict=True):
+        z = float(reference.depth[row, col])
+        own = reference.normals[:, row, col].astype(float)
+        world = view.R.T @ (np.linalg.solve(view.K, [col, row, 1.0]) * z - view.t)
+        area = pixel_area(view, (col, row), z, own)
+        views, colours, covered = [reference.index], [reference.image[row, col].astype(int)], False
+        for partner in partners:
+            pixel, distance, agrees, margin = _agreement(world, view.R.T @ own, partner, options)
+            clearance[row, col] = min(clearance[row, col], margin)
+            if not agrees:
+                continue
+            x, y = pixel
+            other = pixel_area(partner.view, pixel, float(partner.depth[y, x]), partner.normals[:, y, x])
+            margin = min(abs(distance / options.max_reproj_error - 1), abs(other / area - 1))
+            clearance[row, col] = min(clearance[row, col], margin)
+            covered |= distance <= options.max_reproj_error and other < area
+            views.append(partner.index)
+            colours.append(partner.image[y, x].astype(int))
+        if not covered and len(views) >= options.min_num_pixels:
+            rgb = np.floor(np.mean(colours, axis=0) + 0.5)[::-1]
+            points[col, row] = (world, view.R.T @ own, rgb, tuple(views))
+    return points, clearance

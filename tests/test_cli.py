@@ -1,5 +1,6 @@
 """The command: help, exit codes, summary, log and report; and every bad input, said in one sentence."""
 
+import itertools
 import json
 import logging
 import os
@@ -15,6 +16,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from clouds import read_visibility
 from conftest import keep_images
 
 import colmap_sph
@@ -401,6 +403,24 @@ def test_dry_run_writes_nothing(small: Path, capsys: pytest.CaptureFixture[str])
     for line in ("undistort done", "pairs 0 to do, 3 done", "images 0 to do, 3 done", "cloud 1 to do, 0 done"):
         assert line in words
     assert {path: path.stat().st_mtime_ns for path in small.rglob("*")} == before
+
+
+def test_an_image_that_cannot_be_fused_is_left_out(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its mask does not fit: the cloud is made without it, and made again once the mask is mended."""
+    assert command(capsys, *RUN, *FAST)[0] == 0
+    (small / "masks").mkdir()
+    mask, wanted = small / "masks" / f"{IMAGES[1]}.png", ["--fusion.mask-path", "masks"]
+    cv2.imwrite(str(mask), np.full((24, 32), 255, np.uint8))
+    for _ in range(2):
+        code, output = command(capsys, *RUN, *FAST, *wanted)
+        assert code == cli.PARTIAL_EXIT_CODE
+        assert "Traceback" not in output
+        words = " ".join(output.split())
+        assert f"image skipped: {IMAGES[1]}: The mask masks/{IMAGES[1]}.png has 32 x 24 pixels" in words
+        assert set(itertools.chain(*read_visibility(small / "dense/fused.ply.vis"))) == {0, 2}
+    cv2.imwrite(str(mask), np.full((240, 320), 255, np.uint8))
+    assert command(capsys, *RUN, *FAST, *wanted)[0] == 0
+    assert set(itertools.chain(*read_visibility(small / "dense/fused.ply.vis"))) == {0, 1, 2}
 
 
 @pytest.mark.parametrize("case", ["neither", "no model", "wrong images", "not a workspace", "pairs", "threads"])

@@ -12,8 +12,8 @@ from test_undistortion import make_project
 from colmap_sph.errors import ColmapSphError, InputError
 from colmap_sph.workspace import check_map, read_depth_map, read_normal_map, write_depth_map, write_normal_map
 
-NUM_COMMANDS = 216
-NUM_MAPS = 60
+NUM_COMMANDS = 248
+NUM_MAPS = 90
 
 
 def run_cases(project: Path, first: int, last: int) -> tuple[dict[int, str], list[str]]:
@@ -41,7 +41,7 @@ def run_cases(project: Path, first: int, last: int) -> tuple[dict[int, str], lis
     return results, deaths
 
 
-def test_damaged_models_images_and_workspaces(tmp_path: Path) -> None:
+def test_damaged_models_images_masks_and_workspaces(tmp_path: Path) -> None:
     """Through the command, in a process that may use 8 GiB and 30 seconds for each."""
     make_project(tmp_path, "OPENCV", (0.05, 0.01, 1e-3, -1e-3))
     make_cases(tmp_path)

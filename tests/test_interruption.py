@@ -47,6 +47,10 @@ def maps(dense: Path) -> dict[str, bytes]:
     return {str(path.relative_to(dense)): path.read_bytes() for path in dense.glob("stereo/*_maps/*.bin")}
 
 
+def results(dense: Path) -> dict[str, bytes]:
+    return maps(dense) | {path.name: path.read_bytes() for path in dense.glob("fused*")}
+
+
 def wait_for(process: "subprocess.Popen[str]", pattern: str, folder: Path, number: int = 1) -> None:
     """Wait until that many files are there; the process must not end before."""
     limit = time.monotonic() + 60
@@ -72,7 +76,7 @@ def test_kills_cost_only_the_work_in_flight(
 
 
 def test_the_check_of_kills_finds_faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work that was done again, a map that differs, a map that is missing, a leftover."""
+    """Work that was done again, a map and a cloud that differ, a map that is missing, leftovers."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
     script = importlib.import_module("check_interruptions")
     for root in ("killed", "whole"):
@@ -80,26 +84,31 @@ def test_the_check_of_kills_finds_faults(tmp_path: Path, monkeypatch: pytest.Mon
             path = tmp_path / root / "stereo" / folder / "cam" / "a.jpg.geometric.bin"
             path.parent.mkdir(parents=True)
             path.write_bytes(b"1")
+        for name in ("fused.ply", "fused.ply.vis"):
+            (tmp_path / root / name).write_bytes(b"1")
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     files = {
         "pairs/1-2.npz": "pairs",
         "photometric/cam/a.jpg.npz": "votes",
         "state/cam/a.jpg.geometric.json": None,
+        "cloud.json": None,
     }
     for name in files:
         (killed / "colmap_sph" / name).parent.mkdir(parents=True, exist_ok=True)
         (killed / "colmap_sph" / name).write_bytes(b"1")
     finished = script.finished_files(killed)
     kill = script.judge(1.0, finished, killed, whole)
-    assert kill.finished == {"pairs": 1, "votes": 1, "maps": 2, "cloud": 0}
+    assert kill.finished == {"pairs": 1, "votes": 1, "maps": 2, "cloud": 2}
     assert (kill.remade, kill.different) == (0, 0)
     os.utime(killed / "colmap_sph/pairs/1-2.npz", ns=(5, 5))
     (killed / "stereo/normal_maps/cam/a.jpg.geometric.bin").write_bytes(b"2")
     (killed / "stereo/depth_maps/cam/a.jpg.geometric.bin").unlink()
     (killed / "stereo/.1-2.tmp").touch()
+    (killed / "colmap_sph/fusion").mkdir()
+    (killed / "fused.ply.vis").write_bytes(b"2")
     kill = script.judge(1.0, finished, killed, whole)
-    assert kill.remade == 3
-    assert kill.different == 3
+    assert kill.remade == 4
+    assert kill.different == 5
 
 
 # ---- signals -----------------------------------------------------------------------------------------------
@@ -261,7 +270,7 @@ def test_full_disk(stage: int, uninterrupted: Path, small_disk: Path) -> None:
     assert len(done) >= [0, 1, 6, 10, 10][stage]
     ballast.unlink()
     complete("--model", model, "--output", dense)
-    assert maps(dense) == truth
+    assert results(dense) == results(uninterrupted)
     assert {path: path.stat().st_mtime_ns for path in done} == done
 
 
@@ -274,7 +283,7 @@ def test_read_only_disk(uninterrupted: Path, small_disk: Path, capsys: pytest.Ca
         assert code == 3, said
         assert "Read-only file system" in said.splitlines()[-1]
         assert "Traceback" not in said
-    assert maps(dense) == maps(uninterrupted)
+    assert results(dense) == results(uninterrupted)
 
 
 def test_files_that_may_not_grow(uninterrupted: Path, tmp_path: Path) -> None:
@@ -293,4 +302,4 @@ def test_files_that_may_not_grow(uninterrupted: Path, tmp_path: Path) -> None:
     assert not list(dense.rglob("*.tmp"))
     assert not list(dense.glob("stereo/normal_maps/*.bin"))
     complete("--model", model, "--output", dense)
-    assert maps(dense) == maps(uninterrupted)
+    assert results(dense) == results(uninterrupted)

@@ -110,18 +110,80 @@ def arguments(function):
             "out weighted_depth": np.zeros((H, W), f32),
             "out weight": np.zeros((H, W), f32),
         },
+        "fuse_partner": {
+            **fused_maps(),
+            "ray_from_pixel": np.eye(3),
+            "partner_depth": np.ones((5, 6), f32),
+            "partner_normals": np.ones((3, 5, 6), f32),
+            "partner_ray_from_pixel": np.eye(3),
+            "partner_image": np.ones((5, 6, 3), u8),
+            "partner_from_reference": matrix,
+            "normal_from_partner": np.eye(3),
+            "max_reprojection_error": 0.5,
+            "max_depth_error": 0.01,
+            "min_normal_cosine": 0.9,
+            "partner_wins": True,
+            "bit": 0,
+            "out covered": np.zeros((H, W), u8),
+            "out agreeing": np.zeros((H, W), np.uint64),
+            "out colour": np.zeros((H, W, 3), np.uint16),
+        },
+        "count_points": {**fused_maps(), **verdicts(), "min_views": 1, "first_row": 0, "end_row": H},
+        "write_points": {
+            **fused_maps(),
+            **verdicts(),
+            "min_views": 1,
+            "first_row": 1,
+            "end_row": H,
+            "world_from_pixel": np.eye(3),
+            "world_from_camera": np.eye(3),
+            "centre": np.zeros(3),
+            "indices": np.arange(65, dtype=np.uint32),
+            "out points": np.zeros(((H - 1) * W, 27), u8),
+            "out visibility": np.zeros(2 * (H - 1) * W, np.uint32),
+        },
+        "confirm_depth": {
+            "depth": np.ones((H, W), f32),
+            "sigma": np.ones((H, W), f32),
+            "min_consistent": 2,
+            "max_contradiction": 0.5,
+            "min_surface": 0.8,
+            "steepest": 0.01,
+            "observing": np.ones((H, W), u8),
+            "out agreeing": np.ones((H, W), u8),
+            "out contradicting": np.zeros((H, W), u8),
+            "out weighted_depth": np.zeros((H, W), f32),
+            "out weight": np.zeros((H, W), f32),
+        },
         "fit_planes": {
             "backend": "scalar",
             "inverse_depth": np.ones((H, W), f32),
             "inverse_sigma": np.ones((H, W), f32),
+            "support": np.ones((H, W), u8),
             "K": np.eye(3, dtype=f64),
             "radius": 4,
             "tolerance": 3.0,
+            "max_shift": 1.0,
+            "shift_sigma": 2.0,
+            "min_cosine": 0.2,
+            "supported": 3,
             "out normals": np.zeros((H, W, 3), f32),
             "out fitted_depth": np.zeros((H, W), f32),
         },
     }
     return table[function]
+
+
+def fused_maps():
+    return {"depth": np.ones((H, W), np.float32), "normals": np.ones((3, H, W), np.float32)}
+
+
+def verdicts():
+    return {
+        "covered": np.zeros((H, W), np.uint8),
+        "agreeing": np.zeros((H, W), np.uint64),
+        "colour": np.zeros((H, W, 3), np.uint16),
+    }
 
 
 FUNCTIONS = [
@@ -135,6 +197,10 @@ FUNCTIONS = [
     "depth_candidates",
     "vote_depth",
     "check_consistency",
+    "fuse_partner",
+    "count_points",
+    "write_points",
+    "confirm_depth",
     "fit_planes",
 ]
 MATCHING = FUNCTIONS[:6]
@@ -164,7 +230,7 @@ FREE = {
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_valid_arguments_are_accepted(function):
-    assert call(function, arguments(function)) is None
+    assert call(function, arguments(function)) == ((H * W, 2 * H * W) if function == "count_points" else None)
 
 
 @pytest.mark.parametrize(("function", "name"), ARRAYS)
@@ -262,7 +328,9 @@ def test_output_that_overlaps_another_array_is_refused(function, name):
         start = (first.nbytes - 1) // second.itemsize * second.itemsize
         values[name] = memory[: first.nbytes].view(first.dtype).reshape(first.shape)
         values[other] = memory[start : start + second.nbytes].view(second.dtype).reshape(second.shape)
-        with pytest.raises(ValueError, match="overlaps"):
+        # With other verdicts there are other points to write, for which the arrays have not the size.
+        sized = function == "write_points" and other in ("depth", "covered", "agreeing")
+        with pytest.raises(ValueError, match="overlaps|size" if sized else "overlaps"):
             call(function, values)
 
 
@@ -330,6 +398,28 @@ def test_negative_left_right_difference_is_refused():
 def test_negative_slant_is_refused():
     with pytest.raises(ValueError, match="slant"):
         call("aggregation", {**arguments("aggregation"), "max_slant": -1})
+
+
+@pytest.mark.parametrize("bit", [-1, 64, 2**31 - 1, -(2**31)])
+def test_more_partners_than_bits_are_refused(bit):
+    with pytest.raises(ValueError, match=r"bit must lie in 0\.\.63"):
+        call("fuse_partner", {**arguments("fuse_partner"), "bit": bit})
+
+
+@pytest.mark.parametrize("function", ["count_points", "write_points"])
+@pytest.mark.parametrize("rows", [(-1, 2), (0, H + 1), (3, 2), (H + 1, H + 1), (-(2**62), 2**62)])
+def test_rows_outside_the_map_are_refused(function, rows):
+    with pytest.raises(ValueError, match="rows must lie in the map"):
+        call(function, {**arguments(function), "first_row": rows[0], "end_row": rows[1]})
+
+
+@pytest.mark.parametrize("least", [-(2**31), 0, 1, 2, 65, 2**31 - 1])
+def test_points_are_counted_for_any_number_of_views(least):
+    values = {**arguments("count_points"), "min_views": least}
+    values["agreeing"][0, 0] = 2**64 - 1
+    values["covered"][1] = 1
+    expected = {1: ((H - 1) * W, 2 * (H - 1) * W + 64), 2: (1, 66), 66: (0, 0)}
+    assert call("count_points", values) == expected[min(max(least, 1), 2) if least <= 65 else 66]
 
 
 @pytest.mark.parametrize("radius", [-1, 0, 17, 2**31 - 1])
@@ -413,7 +503,31 @@ def test_empty_maps_are_no_work(shape):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
         _native.check_consistency(reference, reference, other, other, matrix, matrix, 1.0, 4.0, *counts)
         assert not any(count.any() for count in counts)
-    _native.fit_planes("scalar", empty, empty, np.eye(3), 4, 3.0, np.zeros((*shape, 3), np.float32), empty.copy())
+        fuse_empty(reference, other, matrix)
+    _native.fit_planes(
+        "scalar",
+        empty,
+        empty,
+        np.zeros(shape, np.uint8),
+        np.eye(3),
+        *(4, 3.0, 1.0, 2.0, 0.2, 3),
+        np.zeros((*shape, 3), np.float32),
+        empty.copy(),
+    )
+
+
+def fuse_empty(reference, other, matrix):
+    """Fuse a map with another, one of which has no pixels, and write its points."""
+    maps = [(depth, np.ones((3, *depth.shape), np.float32), np.eye(3)) for depth in (reference, other)]
+    shape = reference.shape
+    verdict = [np.zeros(shape, np.uint8), np.zeros(shape, np.uint64), np.zeros((*shape, 3), np.uint16)]
+    image = np.ones((*other.shape, 3), np.uint8)
+    _native.fuse_partner(*maps[0], *maps[1], image, matrix, np.eye(3), 0.5, 0.01, 0.9, True, 63, *verdict)
+    assert not any(array.any() for array in verdict)
+    rows = (*maps[0][:2], *verdict, 2, 0, shape[0])
+    assert _native.count_points(*rows) == (0, 0)
+    none = np.zeros((0, 27), np.uint8), np.zeros(0, np.uint32)
+    _native.write_points(*rows, np.eye(3), np.eye(3), np.zeros(3), np.zeros(65, np.uint32), *none)
 
 
 def test_vote_of_no_pairs_is_no_depth():
@@ -442,6 +556,10 @@ def test_numbers_out_of_this_world_do_not_crash(odd):
                     value[chosen] = odd
             if function == "depth_candidates":
                 values["scales"], values["origins"] = (odd, 100.0), (odd, 0.0)
+            if function == "write_points":
+                count = _native.count_points(*list(values.values())[:8])
+                values["out points"] = np.zeros((count[0], 27), np.uint8)
+                values["out visibility"] = np.zeros(count[1], np.uint32)
             call(function, values)
 
 

@@ -14,7 +14,13 @@ import pycolmap
 import pytest
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
-from colmap_sph.pairs import PairOptions, PairSelection, select_pairs, triangulation_angles
+from colmap_sph.pairs import (
+    PairOptions,
+    PairSelection,
+    overlapping_views,
+    select_pairs,
+    triangulation_angles,
+)
 from colmap_sph.scene import Scene, View, read_scene
 
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
@@ -55,6 +61,16 @@ def test_ranked_by_shared_points(line: Scene) -> None:
     expected = [("1.jpg", 20), ("3.jpg", 20), ("0.jpg", 10), ("4.jpg", 10)]
     assert [(p.partner, p.shared_points) for p in selection.pairs["2.jpg"]] == expected
     assert selection.without_partner == ()
+
+
+def test_overlapping_views(line: Scene) -> None:
+    """Those that share most first, whatever the angle; of views without tracks those whose frusta meet."""
+    assert overlapping_views(line, 50)["2.jpg"] == ["1.jpg", "3.jpg", "0.jpg", "4.jpg"]
+    assert overlapping_views(line, 3)["0.jpg"] == ["1.jpg", "2.jpg"]
+    assert overlapping_views(line, 1)["3.jpg"] == ["2.jpg"]
+    # Each sees ten units of ground, and they stand within four.
+    by_frusta = overlapping_views(without_tracks(line, keep_points=True), 50)
+    assert set(by_frusta["0.jpg"]) == {f"{i}.jpg" for i in range(1, 5)}
 
 
 def test_angle_is_the_75th_percentile(line: Scene) -> None:

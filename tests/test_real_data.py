@@ -11,8 +11,9 @@ from clouds import read_fused
 from conftest import keep_images
 
 import colmap_sph
+from colmap_sph.colmap_fusion import fuse_by_colmap
 from colmap_sph.evaluation import compare_depth_map, mean_of_depth_maps, truth_at_pixel_origin
-from colmap_sph.fusion import FusionOptions, fuse
+from colmap_sph.fusion import FusionOptions
 from colmap_sph.options import RunOptions
 from colmap_sph.undistortion import UndistortionOptions
 from colmap_sph.workspace import Workspace, read_depth_map
@@ -97,7 +98,7 @@ def test_fountain(fountain: Result) -> None:
     assert min(fountain.report.coverage.values()) > 0.55
     kept = fountain.report.points
     colmaps = FusionOptions(min_num_pixels=5, max_reproj_error=2.0, max_normal_error=10.0)
-    assert kept > fuse(fountain.workspace, colmaps) > 90_000
+    assert kept > fuse_by_colmap(fountain.workspace, colmaps) > 90_000
 
 
 def test_brighton(data_dir: Path, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairOptions, select_pairs
-from colmap_sph.plan import make_plan
+from colmap_sph.plan import Plan, make_plan
 from colmap_sph.rectification import RectificationOptions
 from colmap_sph.report import RunReport
 from colmap_sph.scene import read_scene
@@ -169,10 +169,10 @@ def test_changed_options_redo_what_depends_on_them(what: str, finished: Finished
     assert counted(rewritten(before, finished.dense)) == expected
     assert (plan.pairs - plan.pairs_done, plan.fuse) == (report.made["match pairs"], bool(report.made["fuse"]))
     assert plan.images - plan.images_done == report.made["check consistency"]
-    # And back: the same files again, made anew; the cloud's order of points varies with threads.
+    # And back: the same files again, made anew.
     finished.rerun()
     after = results(finished.dense)
-    assert {name for name in before if after[name][1] != before[name][1] and "fused" not in name} == set()
+    assert {name for name in before if after[name][1] != before[name][1]} == set()
 
 
 def test_fewer_pairs_keep_their_disparity_maps(finished: Finished) -> None:
@@ -223,7 +223,7 @@ def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> Non
         assert rerun().made == NOTHING
     assert rerun(given=False).made["match pairs"] == 3
     after = results(finished.dense)
-    assert {name for name in before if after[name][1] != before[name][1] and "fused" not in name} == set()
+    assert {name for name in before if after[name][1] != before[name][1]} == set()
 
 
 def test_the_cloud_depends_on_the_origin(finished: Finished) -> None:
@@ -299,7 +299,7 @@ def test_what_is_damaged_is_made_again(what: str, damage: Callable[[Path], None]
     assert report.made == NOTHING | made
     assert report.skipped_images == {}
     after = results(finished.dense)
-    assert {name for name in before if after[name][1] != before[name][1] and "fused" not in name} == set()
+    assert {name for name in before if after[name][1] != before[name][1]} == set()
 
 
 def test_a_record_with_one_altered_byte_does_not_vouch(finished: Finished) -> None:
@@ -528,6 +528,20 @@ def test_plan_of_reduced_images(project: Path) -> None:
     )
     assert half.disk == pytest.approx(whole.disk / 4, rel=0.15)
     assert half.pairs == whole.pairs
+
+
+def test_plan_of_the_fusion(finished: Finished) -> None:
+    """The budget bounds ours, not COLMAP's, and more partners take more time."""
+
+    def plan(**changes: object) -> Plan:
+        options = {"min_num_pixels": 3, **changes}
+        tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(**options))
+        return make_plan(workspace=finished.dense, options=tight)
+
+    ours, theirs = plan(), plan(method="colmap")
+    assert ours.fuse and theirs.fuse
+    assert ours.memory <= 203e6 < theirs.memory
+    assert ours.seconds > plan(check_num_images=1).seconds > 0
 
 
 def test_plan_of_a_finished_workspace(finished: Finished) -> None:

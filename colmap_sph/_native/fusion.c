@@ -32,7 +32,7 @@ static inline float surface_area(const double *m, double column, double row, flo
 void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
                   const fusion_transfer *transfer, fusion_gates gates, int bit, const fusion_verdict *verdict) {
     const double max_error_squared = (double)gates.max_reprojection_error * gates.max_reprojection_error;
-    const double last_column = (double)(partner->width - 1), last_row = (double)(partner->height - 1);
+    const double width = (double)partner->width, height = (double)partner->height;
     for (ptrdiff_t row = 0; row < reference->height; row++) {
         for (ptrdiff_t column = 0; column < reference->width; column++) {
             const ptrdiff_t p = row * reference->width + column;
@@ -42,25 +42,22 @@ void fuse_partner(const view_maps *reference, const view_maps *partner, const ui
             }
             const vector seen =
                 transform(transfer->pixel_from_reference, transfer->translation, (double)column, (double)row, z);
-            if (!(seen.z > 0 && seen.x >= 0 && seen.y >= 0 && seen.x <= last_column * seen.z &&
-                  seen.y <= last_row * seen.z)) {
+            /* From the corner of the first pixel, so that whole numbers are pixels. */
+            const double u = seen.x / seen.z + 0.5, v = seen.y / seen.z + 0.5;
+            if (!(seen.z > 0 && u >= 0 && v >= 0 && u < width && v < height)) {
                 continue;
             }
-            const double u = seen.x / seen.z, v = seen.y / seen.z;
-            if (!(u <= last_column && v <= last_row)) {
-                continue; /* by rounding, or not a number */
-            }
-            const ptrdiff_t x = (ptrdiff_t)(u + 0.5), y = (ptrdiff_t)(v + 0.5);
+            const ptrdiff_t x = (ptrdiff_t)u, y = (ptrdiff_t)v;
             const ptrdiff_t q = y * partner->width + x;
             const float depth = partner->depth[q];
-            if (!(fabsf(depth - (float)seen.z) <= gates.max_depth_error * depth)) {
+            if (!(depth > 0 && isfinite(depth) && fabsf(depth - (float)seen.z) <= gates.max_depth_error * depth)) {
                 continue;
             }
             const direction own = normal_at(reference, p), other = normal_at(partner, q);
             if (!(cosine_after(transfer->reference_from_partner, other, own) >= gates.min_normal_cosine)) {
                 continue;
             }
-            const double du = u - (double)x, dv = v - (double)y;
+            const double du = u - 0.5 - (double)x, dv = v - 0.5 - (double)y;
             if (du * du + dv * dv <= max_error_squared) {
                 const float area = surface_area(reference->ray_from_pixel, (double)column, (double)row, z, own);
                 const float other_area = surface_area(partner->ray_from_pixel, (double)x, (double)y, depth, other);

@@ -1,0 +1,412 @@
+"""The cloud of a workspace with exact maps: its files, what a run may be given, and what may go wrong."""
+
+import shutil
+import subprocess
+import threading
+import tracemalloc
+from contextlib import contextmanager
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from clouds import read_fused, read_visibility
+from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_maps
+
+from colmap_sph import cloud_stage, memory
+from colmap_sph.cloud_files import join_parts, write_part
+from colmap_sph.cloud_stage import cloud_state, fuse_views
+from colmap_sph.colmap_fusion import fuse_by_colmap
+from colmap_sph.context import Context
+from colmap_sph.errors import NoResultError, OptionError, OutputError
+from colmap_sph.evaluation import read_geometry
+from colmap_sph.fusion import FusionOptions
+from colmap_sph.keys import Keys
+from colmap_sph.memory import parse_memory
+from colmap_sph.options import RunOptions
+from colmap_sph.scene import read_scene
+from colmap_sph.workspace import Workspace, read_depth_map, write_depth_map, write_fusion_cfg
+
+UTM = np.array([5e5 + 1 / 3, 5e6 + 1 / 7, 300.0])
+
+
+@pytest.fixture
+def workspace(tmp_path):
+    return make_workspace(tmp_path / "dense")
+
+
+def context_of(workspace, **options):
+    """A run that has come to its last stage."""
+    options = RunOptions(**{"threads": 1, **options})
+    context = Context(workspace, read_scene(workspace.sparse_dir), options, Keys(workspace, options))
+    context.report.coverage = {view.name: 1.0 for view in context.scene.views}
+    return context
+
+
+def fuse(workspace, pairs=(), **options):
+    """Run the stage; its report."""
+    context = context_of(workspace, **options)
+    fuse_views(context, pairs, {view.name: "key" for view in context.scene.views})
+    return context.report
+
+
+def cloud_bytes(workspace):
+    return [workspace.root.joinpath(name).read_bytes() for name in ("fused.ply", "fused.ply.vis")]
+
+
+def seen_as_listed(workspace, image_ids, cloud, visible):
+    """Share of the listings (point, image) whose image has the point in view, where `image_ids` are numbered."""
+    views = {view.image_id: view for view in read_scene(workspace.sparse_dir).views}
+    right = total = 0
+    for number, image_id in enumerate(image_ids):
+        view = views[image_id]
+        seen = cloud["xyz"][[number in listed for listed in visible]].astype(float)
+        pixel = (seen @ view.R.T + view.t) @ view.K.T
+        pixel = pixel[:, :2] / pixel[:, 2:]
+        right += np.count_nonzero(((pixel > -2.6) & (pixel < [view.width + 1.6, view.height + 1.6])).all(axis=1))
+        total += len(seen)
+    return right / total
+
+
+# ---- the files ---------------------------------------------------------------------------------------------
+
+
+def test_the_cloud_is_the_plane(workspace):
+    report = fuse(workspace)
+    cloud = read_fused(workspace.fused_path)
+    # Nothing hides and the images are alike: as dense as one of them, over somewhat more than one.
+    assert WIDTH * HEIGHT < report.points == len(cloud) < 3 * WIDTH * HEIGHT
+    assert np.abs(cloud["xyz"].astype(float) @ NORMAL).max() < 1e-5
+    np.testing.assert_allclose(cloud["normal"] @ NORMAL, 1, atol=1e-6)
+    assert cloud["rgb"].std() > 20
+    assert report.made["fuse"] == 1
+    assert report.seconds["fuse"] > 0
+    assert not (workspace.state_dir / "fusion").exists()
+    assert fuse(workspace).made["fuse"] == 0
+
+
+def test_visibility_names_images_as_colmap_does(tmp_path):
+    """By their place among the model's registered images, which is not the order of their names."""
+    workspace = make_workspace(tmp_path / "dense", names=[f"{letter}.png" for letter in "dbface"])
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    model.deregister_frame(model.image(3).frame_id)
+    model.write_binary(workspace.sparse_dir)
+    views = read_scene(workspace.sparse_dir).views
+    write_fusion_cfg(workspace.fusion_cfg_path, [view.name for view in views])
+    image_ids, by_name = [1, 2, 4, 5, 6], [view.image_id for view in views]
+    assert sorted(by_name) == image_ids != by_name
+
+    def shares():
+        cloud, visible = read_fused(workspace.fused_path), read_visibility(workspace.root / "fused.ply.vis")
+        assert len(cloud) == len(visible) > 5000
+        assert min(map(len, visible)) >= 2
+        assert {index for listed in visible for index in listed} == set(range(5))
+        return [seen_as_listed(workspace, ids, cloud, visible) for ids in (image_ids, by_name)]
+
+    fuse_by_colmap(workspace, FusionOptions(max_reproj_error=2.0), threads=1)
+    theirs = shares()
+    fuse(workspace)
+    for right, wrong in (theirs, shares()):
+        assert right == 1
+        assert wrong < 0.99
+
+
+def test_files_are_colmaps_to_the_byte_but_for_their_points(workspace):
+    """The same header; positions, normals and colours as 27 bytes; a count and as many lists."""
+    fuse_by_colmap(workspace, FusionOptions(), threads=1)
+    theirs = workspace.fused_path.read_bytes().partition(b"end_header\n")
+    fuse(workspace)
+    ours = workspace.fused_path.read_bytes().partition(b"end_header\n")
+
+    def without_count(header):
+        return [line for line in header.splitlines() if not line.startswith(b"element vertex")]
+
+    assert without_count(ours[0]) == without_count(theirs[0])
+    assert len(ours[2]) == 27 * len(read_visibility(workspace.root / "fused.ply.vis"))
+
+
+def test_colmap_meshes_the_cloud(workspace, tmp_path):
+    """Its own reader takes points and normals; the mesh lies on the plane."""
+    fuse(workspace)
+    options = pycolmap.PoissonMeshingOptions()
+    options.depth, options.trim, options.num_threads = 6, 0, 1
+    pycolmap.poisson_meshing(workspace.fused_path, tmp_path / "mesh.ply", options)
+    vertices = read_geometry(tmp_path / "mesh.ply").vertices
+    middle = np.linalg.norm(vertices, axis=1) < 2
+    assert middle.sum() > 100
+    assert np.abs(vertices[middle] @ NORMAL).max() < GSD
+
+
+def test_colmap_program_reads_points_and_visibility(workspace, tmp_path):
+    """Its Delaunay mesher reads both files before anything else, where it was built with CGAL."""
+    program = shutil.which("colmap")
+    if program is None:
+        pytest.skip("the colmap program is not installed (Debian: apt-get install colmap)")
+    fuse(workspace)
+    command = [program, "delaunay_mesher", "--input_path", workspace.root, "--output_path", tmp_path / "mesh.ply"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
+    if "CGAL" in done.stderr + done.stdout:
+        pytest.skip("this colmap was built without CGAL, which its Delaunay mesher needs")
+    assert done.returncode == 0, done.stderr
+    assert np.abs(read_geometry(tmp_path / "mesh.ply").vertices @ NORMAL).max() < 5 * GSD
+
+
+def test_parts_are_joined_in_the_order_given(tmp_path):
+    rng = np.random.default_rng(0)
+    stems, bodies, words = [tmp_path / name for name in ("7", "12", "3")], [], []
+    for number, stem in enumerate(stems):
+        body = rng.integers(0, 256, (number, 27), dtype=np.uint8)
+        listed = np.arange(3 * number, dtype=np.uint32)
+        bands = [(body[:1], listed[:3]), (body[1:], listed[3:])]
+        assert write_part(stem, bands) == number
+        bodies.append(body.tobytes())
+        words.append(listed.tobytes())
+    join_parts(stems[::-1], tmp_path, 3)
+    assert read_fused(tmp_path / "fused.ply").tobytes() == b"".join(bodies[::-1])
+    visible = (tmp_path / "fused.ply.vis").read_bytes()
+    assert visible == np.array(3, "<u8").tobytes() + b"".join(words[::-1])
+    assert {path.name for path in tmp_path.iterdir()} == {"fused.ply", "fused.ply.vis"}
+
+
+# ---- threads, memory, order --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("threads", [2, 4])
+def test_threads_do_not_matter(workspace, threads):
+    fuse(workspace)
+    expected = cloud_bytes(workspace)
+    shutil.rmtree(workspace.state_dir)
+    fuse(workspace, threads=threads)
+    assert cloud_bytes(workspace) == expected
+
+
+NEEDED = int(1.15 * 60 * WIDTH * HEIGHT)
+
+
+@contextmanager
+def counted(monkeypatch):
+    """Largest number of images in work at a time."""
+    original, lock, counts = cloud_stage.write_part, threading.Lock(), [0, 0]
+
+    def write(stem, bands):
+        with lock:
+            counts[0] += 1
+            counts[1] = max(counts)
+        try:
+            return original(stem, bands)
+        finally:
+            with lock:
+                counts[0] -= 1
+
+    with monkeypatch.context() as patch:
+        patch.setattr(cloud_stage, "write_part", write)
+        patch.setattr(memory, "resident", lambda: 100 << 20)
+        yield counts
+
+
+def test_little_memory_changes_nothing(workspace, monkeypatch):
+    """One image at a time where the budget is that of one; with less, the message tells what would do."""
+    fuse(workspace)
+    expected = cloud_bytes(workspace)
+    with counted(monkeypatch) as counts:
+        with pytest.raises(OptionError, match=r"too little for \w\.png; (\w+) would do") as refused:
+            fuse(workspace, threads=4, memory="100MiB", fusion=FusionOptions(cache_size=1.0))
+        enough = str(refused.value).split("; ")[1].split()[0]
+        assert parse_memory(enough) < (100 << 20) * 1.05 + 3 * NEEDED
+        for amount in (f"{(100 << 20) + NEEDED + 1000}B", enough):
+            shutil.rmtree(workspace.state_dir)
+            counts[:] = [0, 0]
+            fuse(workspace, threads=4, memory=amount)
+            assert cloud_bytes(workspace) == expected
+            if amount != enough:
+                assert counts[1] == 1
+
+
+def test_memory_is_what_is_reserved(workspace, monkeypatch):
+    """Arrays of one image at a time, without a cache: measured, against 60 bytes per pixel."""
+    monkeypatch.setattr(memory, "resident", lambda: 100 << 20)
+    options = {"memory": f"{(100 << 20) + NEEDED + 1000}B", "fusion": FusionOptions(min_num_pixels=1)}
+    fuse(workspace, **options)
+    shutil.rmtree(workspace.state_dir)
+    context = context_of(workspace, **options)
+    state = cloud_state(context, (), dict.fromkeys(NAMES, "key"), context.report.coverage)
+    tracemalloc.start()
+    try:
+        cloud_stage._fuse_by_pixel(context, state)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert 30 * WIDTH * HEIGHT < peak < NEEDED + 300_000
+
+
+# ---- what it may be given ----------------------------------------------------------------------------------
+
+
+def test_photometric_maps(workspace, tmp_path):
+    fuse(workspace)
+    other = make_workspace(tmp_path / "photometric", kind="photometric")
+    fuse(other, fusion_input="photometric")
+    assert cloud_bytes(other) == cloud_bytes(workspace)
+
+
+def test_a_model_without_tracks(workspace, tmp_path):
+    """The frusta say what overlaps; only the order of partners may differ."""
+    fuse(workspace)
+    other = make_workspace(tmp_path / "none", tracks=False)
+    fuse(other)
+    clouds = [read_fused(one.fused_path) for one in (workspace, other)]
+    assert clouds[0].tobytes() == clouds[1].tobytes()
+    listed = [read_visibility(one.root / "fused.ply.vis") for one in (workspace, other)]
+    assert [sorted(views) for views in listed[0]] == [sorted(views) for views in listed[1]]
+
+
+def test_pairs_without_common_points_agree_too(workspace):
+    """A pair that the user asked for need not share a point of the model."""
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    for index in list(model.image(1).get_observation_point2D_idxs()):
+        model.delete_observation(1, index)
+    model.write_binary(workspace.sparse_dir)
+    assert fuse(workspace).points > 0
+    alone = read_visibility(workspace.root / "fused.ply.vis")
+    assert not any(0 in listed for listed in alone)
+    fuse(workspace, pairs=[("a.png", "c.png")])
+    paired = read_visibility(workspace.root / "fused.ply.vis")
+    assert {frozenset(listed) & {0, 2} for listed in paired if 0 in listed} == {frozenset((0, 2))}
+
+
+def test_fewer_images_to_look_in(workspace):
+    fuse(workspace, fusion=FusionOptions(check_num_images=1, min_num_pixels=1))
+    visible = read_visibility(workspace.root / "fused.ply.vis")
+    assert {len(listed) for listed in visible} == {1, 2}
+
+
+def test_masks_keep_pixels_out(workspace, tmp_path):
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 2] = 0
+    for name in NAMES:
+        cv2.imwrite(str(masks / f"{name}.png"), mask)
+    fuse(workspace, fusion=FusionOptions(mask_path=masks, min_num_pixels=1))
+    cloud = read_fused(workspace.fused_path)
+    visible = read_visibility(workspace.root / "fused.ply.vis")
+    assert len(cloud) > 1000
+    for index, view in enumerate(read_scene(workspace.sparse_dir).views):
+        seen = cloud["xyz"][[index in listed for listed in visible]].astype(float)
+        pixel = (seen @ view.R.T + view.t) @ view.K.T
+        assert (pixel[:, 0] / pixel[:, 2]).min() > WIDTH // 2 - 0.501
+
+
+def test_map_coordinates(workspace, tmp_path):
+    """The same cloud, moved, to a millionth of a unit, and beside it the one near the origin."""
+    fuse(workspace)
+    far = make_workspace(tmp_path / "far")
+    model = pycolmap.Reconstruction(far.sparse_dir)
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))
+    model.write_binary(far.sparse_dir)
+    fuse(far)
+    near_cloud, far_cloud = (read_geometry(one.fused_path) for one in (workspace, far))
+    np.testing.assert_allclose(far_cloud.points - UTM, near_cloud.points, rtol=0, atol=3e-6)
+    assert cloud_bytes(far)[1] == cloud_bytes(workspace)[1]
+    local = Workspace(far.local_dir)
+    origin = np.array([float(word) for word in (local.root / "origin.txt").read_text().split()])
+    near = read_fused(local.fused_path)
+    np.testing.assert_allclose(near["xyz"] + origin, far_cloud.points, rtol=0, atol=1e-9)
+    assert near["rgb"].tobytes() == read_fused(workspace.fused_path)["rgb"].tobytes()
+    assert (local.root / "fused.ply.vis").read_bytes() == cloud_bytes(far)[1]
+    assert fuse_by_colmap(Workspace(shutil.copytree(local.root, tmp_path / "copy")), FusionOptions()) > 5000
+
+
+# ---- what goes wrong ---------------------------------------------------------------------------------------
+
+
+def test_an_image_that_fails_is_left_out_and_done_again(workspace):
+    """Its name and reason are reported, the others' cloud is as without it, and nothing vouches for that."""
+    path = workspace.depth_map_path("c.png", "geometric")
+    depth = read_depth_map(path)
+    fuse(workspace)
+    whole = cloud_bytes(workspace)
+    path.write_bytes(path.read_bytes()[:-100])
+    context = context_of(workspace, fusion=FusionOptions(max_depth_error=0.011))
+    for made in (1, 1):  # again, and again in vain
+        fuse_views(context, (), dict.fromkeys(NAMES, "key"))
+        assert list(context.report.skipped_images) == ["c.png"]
+        assert str(path) in context.report.skipped_images["c.png"]
+        assert context.report.made["fuse"] == made
+    visible = read_visibility(workspace.root / "fused.ply.vis")
+    assert {index for listed in visible for index in listed} == {0, 1, 3, 4, 5}
+    without = cloud_bytes(workspace)
+    write_maps(workspace, "c.png", depth=np.zeros((HEIGHT, WIDTH)))
+    fuse(workspace, fusion=FusionOptions(max_depth_error=0.011))
+    assert cloud_bytes(workspace) == without
+    write_depth_map(path, depth)
+    shutil.rmtree(workspace.state_dir)
+    fuse(workspace)
+    assert cloud_bytes(workspace) == whole
+
+
+def test_all_images_fail(workspace):
+    for name in NAMES:
+        workspace.normal_map_path(name, "geometric").unlink()
+    with pytest.raises(NoResultError, match=r"No image could be fused \(.*a\.png.*cannot be read"):
+        fuse(workspace)
+    assert not workspace.fused_path.exists()
+    assert not (workspace.state_dir / "fusion").exists()
+
+
+def test_no_point(workspace):
+    """The files are whole and empty, and the report says which gate it was."""
+    report = fuse(workspace, fusion=FusionOptions(min_num_pixels=7))
+    assert report.points == len(read_fused(workspace.fused_path)) == 0
+    assert read_visibility(workspace.root / "fused.ply.vis") == []
+    assert report.advice
+
+
+def test_thin_clouds_of_many_images_are_no_reason_for_advice(workspace, monkeypatch):
+    """Where most pixels are confirmed, few points only mean that many images see the same."""
+    monkeypatch.setattr(cloud_stage, "_FEW_POINTS", 2.0)
+    assert fuse(workspace).advice == ""
+    rng = np.random.default_rng(0)
+    for name in NAMES[2:]:
+        normals = rng.standard_normal((HEIGHT, WIDTH, 3))
+        write_maps(workspace, name, normals=normals / np.linalg.norm(normals, axis=2, keepdims=True))
+    report = fuse(workspace, fusion=FusionOptions(min_num_pixels=2, max_depth_error=0.011))
+    assert report.points > 0
+    assert "loosen max_normal_error" in report.advice
+
+
+@pytest.mark.parametrize("coverage", [0.0, 1.0], ids=["before", "in fusion"])
+def test_a_skipped_image_has_no_say_in_the_advice(workspace, coverage):
+    """It has no maps to look at."""
+    workspace.depth_map_path("b.png", "geometric").unlink()
+    context = context_of(workspace, fusion=FusionOptions(min_num_pixels=6))
+    context.report.coverage["b.png"] = coverage
+    fuse_views(context, (), dict.fromkeys(NAMES, "key"))
+    assert context.report.points == 0
+    assert context.report.advice
+
+
+@pytest.mark.parametrize("blocked", ["fused.ply", "fused.ply.vis", "colmap_sph/local"])
+def test_unwritable_output(workspace, blocked, monkeypatch):
+    path = workspace.root / blocked
+    if blocked == "colmap_sph/local":
+
+        def refuse(*_):
+            raise PermissionError(13, "Permission denied")
+
+        monkeypatch.setattr(cloud_stage, "move_into_place", refuse)
+    else:
+        path.mkdir()
+    before = sorted(workspace.root.rglob("*"))
+    with pytest.raises(OutputError, match=r"fused\.ply.* (is a folder|cannot be written \(Permission denied\))"):
+        fuse(workspace)
+    assert sorted(workspace.root.rglob("*")) == before
+
+
+def test_colmaps_fusion_still_warns_of_its_memory(workspace, caplog, monkeypatch):
+    monkeypatch.setattr(cloud_stage, "resident", lambda: 10**12)
+    fuse(workspace, fusion=FusionOptions(method="colmap"))
+    assert "COLMAP's fusion will take about" in caplog.text
+    caplog.clear()
+    fuse(workspace)
+    assert caplog.text == ""
