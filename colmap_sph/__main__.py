@@ -1,5 +1,6 @@
 """The program's entry: the command line, once it is loaded, which takes a second or so."""
 
+import os
 import sys
 
 
@@ -9,6 +10,9 @@ def main() -> int:
         from colmap_sph import cli
 
         return cli.main()
+    except BrokenPipeError:  # whoever reads the output has closed it, as `| head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 130

@@ -145,7 +145,7 @@ def main(arguments: list[str] | None = None) -> int:
                 raise
             return _print_error(OutOfMemoryError(), console)
         except OSError as error:
-            if error.errno is None:
+            if error.errno is None or isinstance(error, BrokenPipeError):
                 raise
             what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
             return _print_error(OutputError(f"{what} ({error.strerror}); check space and permissions."), console)
