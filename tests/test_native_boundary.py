@@ -120,6 +120,23 @@ def arguments(function):
             "out normals": np.zeros((H, W, 3), f32),
             "out fitted_depth": np.zeros((H, W), f32),
         },
+        "add_patch_equations": {
+            "backend": "scalar",
+            "image": np.zeros((H, W), u8),
+            "source": np.zeros((9, 20), u8),
+            "source_from_reference": matrix,
+            "planes": np.ones((3, H, W), f32),
+            "first_row": 0,
+            "contrast": 20.0,
+            "min_score": 0.5,
+            "out equations": np.zeros((12, H, W), f32),
+        },
+        "refine_planes": {
+            "equations": np.zeros((12, H, W), f32),
+            "sigma": np.ones((H, W), f32),
+            "slope_sigma": 0.1,
+            "out planes": np.ones((3, H, W), f32),
+        },
     }
     return table[function]
 
@@ -136,6 +153,8 @@ FUNCTIONS = [
     "vote_depth",
     "check_consistency",
     "fit_planes",
+    "add_patch_equations",
+    "refine_planes",
 ]
 MATCHING = FUNCTIONS[:6]
 
@@ -159,6 +178,8 @@ FREE = {
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
+    ("add_patch_equations", "image"): {0},
+    ("add_patch_equations", "source"): {0, 1},
 }
 
 
@@ -336,6 +357,12 @@ def test_negative_slant_is_refused():
 def test_window_radius_out_of_bounds_is_refused(radius):
     with pytest.raises(ValueError, match="radius"):
         call("fit_planes", {**arguments("fit_planes"), "radius": radius})
+
+
+@pytest.mark.parametrize("first_row", [-1, 1, 2**62])
+def test_rows_beyond_the_image_are_refused(first_row):
+    with pytest.raises(ValueError, match="rows"):
+        call("add_patch_equations", {**arguments("add_patch_equations"), "first_row": first_row})
 
 
 def test_rows_beyond_16_bits_are_refused():
