@@ -38,6 +38,7 @@ _MATCH_SECONDS = 0.14  # of both rectified images
 _VOTE_SECONDS = 0.07  # of the image, per pair
 _CHECK_SECONDS = 0.05  # of the image, per partner
 _NORMALS_SECONDS = 0.25  # of the image, for each of its two kinds of maps
+_REFINE_SECONDS = 0.12  # of the image, per partner and round
 _FUSE_SECONDS = 0.9
 # Bytes per pixel on disk, measured at the same time.
 _UNDISTORTED_BYTES = 1.0
@@ -176,7 +177,8 @@ def _survey(context: Context, pairs: Sequence[Pair], *, fresh: bool) -> _Survey:
         state = check_state(context, names, votes, view)
         maps[view.name], megapixels = state.key, view.width * view.height / 1e6
         if state.coverage is None:
-            survey.seconds += (_CHECK_SECONDS * len(names) + _NORMALS_SECONDS) * megapixels
+            per_partner = _CHECK_SECONDS + _REFINE_SECONDS * context.options.refinement.rounds
+            survey.seconds += (per_partner * len(names) + _NORMALS_SECONDS) * megapixels
             survey.disk += _MAP_BYTES * megapixels * 1e6
         else:
             coverage[view.name] = state.coverage
