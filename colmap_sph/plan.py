@@ -177,8 +177,10 @@ def _survey(context: Context, pairs: Sequence[Pair], *, fresh: bool) -> _Survey:
         state = check_state(context, names, votes, view)
         maps[view.name], megapixels = state.key, view.width * view.height / 1e6
         if state.coverage is None:
-            per_partner = _CHECK_SECONDS + _REFINE_SECONDS * context.options.refinement.rounds
-            survey.seconds += (per_partner * len(names) + _NORMALS_SECONDS) * megapixels
+            refinement = context.options.refinement
+            refined = refinement.rounds * min(len(names), refinement.max_partners)
+            seconds = _CHECK_SECONDS * len(names) + _REFINE_SECONDS * refined + _NORMALS_SECONDS
+            survey.seconds += seconds * megapixels
             survey.disk += _MAP_BYTES * megapixels * 1e6
         else:
             coverage[view.name] = state.coverage

@@ -7,7 +7,7 @@ Baltsavias, 1988): it uses all images at once, while the disparity maps saw two 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,13 @@ from colmap_sph.scene import View, pixel_transfer
 
 # Rows whose equations are in memory at a time.
 _BAND_ROWS = 32
+# Which partners say most is found on every so many rows.
+_SURVEY_ROWS = 16
+# Arrays of equations, see `kernels.h`.
+_EQUATIONS = 12
+
+# A partner's image, and where the pixels of the view lie in it.
+_Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -29,9 +36,11 @@ class RefinementOptions:
 
     rounds: int = 2
     """Times that all planes are refined; 0 leaves them as the disparity maps gave them."""
+    max_partners: int = 10
+    """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
     depth_freedom: float = 6.0
     """How far a depth may move: the standard deviation it is given, as a multiple of that of the checked depth."""
-    slope_freedom: float = 12.0
+    slope_freedom: float = 5.0
     """How far a plane may turn: the standard deviation it is given, degrees."""
     contrast: float = 20.0
     """Pixels of a window that differ from its middle by more than this (grey values) hardly count."""
@@ -44,6 +53,8 @@ class RefinementOptions:
         """Raise `OptionError` for a value out of bounds."""
         if not 0 <= self.rounds <= 16:
             raise OptionError(f"the refinement's rounds must lie in 0..16, not {self.rounds}.")
+        if not self.max_partners >= 1:
+            raise OptionError(f"max_partners must be at least 1, not {self.max_partners}.")
         for name in ("depth_freedom", "contrast"):
             if not getattr(self, name) > 0:
                 raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
@@ -84,33 +95,69 @@ def refine_maps(
     normals, depth : as the parameters
         Where there was none, there is none.
     """
+    partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
+    if options.rounds:
+        partners = _most_telling(view, image, estimate, normals, depth, partners, options)
     for done in range(options.rounds):
-        if done:
-            smooth = NormalOptions(radius=options.smoothing_radius)
-            normals, depth = fit_normals(view, DepthEstimate(depth, estimate.sigma, estimate.support), smooth)
         normals, depth = normals.copy(), depth.copy()
+        if done:
+            smooth, moved = NormalOptions(radius=options.smoothing_radius), replace(estimate, depth=depth)
+            smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
+            fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
+            normals[fitted], depth[fitted] = smooth_normals[fitted], smooth_depth[fitted]
         for first in range(0, view.height, _BAND_ROWS):
             rows = slice(first, min(first + _BAND_ROWS, view.height))
             planes = _planes_of_maps(view, normals[rows], depth[rows], first)
-            equations = np.zeros((12, *planes.shape[1:]), np.float32)
-            for source, source_image in sources:
-                _native.add_patch_equations(
-                    backend(),
-                    image,
-                    source_image,
-                    pixel_transfer(view, source),
-                    planes,
-                    first,
-                    options.contrast,
-                    options.min_score,
-                    equations,
-                )
-            with np.errstate(divide="ignore", invalid="ignore"):
-                sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
+            equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
+            for partner in partners:
+                _add_equations(image, partner, planes, first, options, equations)
+            sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma.astype(np.float32), slope_sigma, planes)
             normals[rows], depth[rows] = _maps_of_planes(view, planes, first)
     return normals, depth
+
+
+def _most_telling(
+    view: View,
+    image: NDArray[np.uint8],
+    estimate: DepthEstimate,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    partners: list[_Partner],
+    options: RefinementOptions,
+) -> list[_Partner]:
+    """The partners whose images tell most about the depth on some of the rows, in their order."""
+    if len(partners) <= options.max_partners:
+        return partners
+    information = np.zeros(len(partners))
+    for row in range(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS):
+        rows = slice(row, row + 1)
+        planes = _planes_of_maps(view, normals[rows], depth[rows], row)
+        sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
+        for index, partner in enumerate(partners):
+            equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
+            _add_equations(image, partner, planes, row, options, equations)
+            matched = equations[0] > 0
+            weight, difference, curvature = (equations[k][matched] for k in (0, 1, 6))
+            # What a pixel gains, in nats: a long baseline that few pixels match must not outdo all others.
+            gain = np.log1p(np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma[matched] ** 2)
+            information[index] += gain.sum(dtype=float)
+    best = np.argsort(-information, kind="stable")[: options.max_partners]
+    return [partners[index] for index in sorted(best)]
+
+
+def _add_equations(
+    image: NDArray[np.uint8],
+    partner: _Partner,
+    planes: NDArray[np.float32],
+    first: int,
+    options: RefinementOptions,
+    equations: NDArray[np.float32],
+) -> None:
+    _native.add_patch_equations(
+        backend(), image, *partner, planes, first, options.contrast, options.min_score, equations
+    )
 
 
 def _planes_of_maps(
