@@ -160,3 +160,16 @@ def fit_planes(
     fitted_depth: Array,
     /,
 ) -> None: ...
+def add_patch_equations(
+    backend: str,
+    image: Array,
+    source: Array,
+    source_from_reference: Array,
+    planes: Array,
+    first_row: int,
+    contrast: float,
+    min_score: float,
+    equations: Array,
+    /,
+) -> None: ...
+def refine_planes(equations: Array, sigma: Array, slope_sigma: float, planes: Array, /) -> None: ...

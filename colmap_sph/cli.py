@@ -32,6 +32,7 @@ from colmap_sph.pairs import PairOptions
 from colmap_sph.pipeline import run, workspace_root
 from colmap_sph.plan import Plan, make_plan
 from colmap_sph.rectification import RectificationOptions
+from colmap_sph.refinement import RefinementOptions
 from colmap_sph.report import RunReport
 from colmap_sph.undistortion import UndistortionOptions
 from colmap_sph.workers import is_memory_error
@@ -84,6 +85,7 @@ class RunCommand:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)
+    refinement: RefinementOptions = field(default_factory=RefinementOptions)
     fusion: Annotated[FusionOptions, tyro.conf.FlagConversionOff] = field(default_factory=FusionOptions)
 
     def options(self) -> RunOptions:

@@ -53,7 +53,9 @@ class Keys:
 
     def geometric(self, vote: str, partner_votes: Sequence[str]) -> str:
         """Of the geometric maps of a view, from its own vote and those of its partners, in their order."""
-        return digest("geometric", vote, partner_votes, self._depth_options(CHECK_OPTIONS), self._options.normals)
+        # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
+        options = (self._depth_options(CHECK_OPTIONS), self._options.normals, self._options.refinement)
+        return digest("geometric", vote, partner_votes, *options)
 
     def cloud(
         self, maps: Mapping[str, str], partners: Mapping[str, Sequence[str]], origin: NDArray[np.float64]

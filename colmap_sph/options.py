@@ -12,6 +12,7 @@ from colmap_sph.memory import budget, parse_memory
 from colmap_sph.normals import NormalOptions
 from colmap_sph.pairs import PairOptions
 from colmap_sph.rectification import RectificationOptions
+from colmap_sph.refinement import RefinementOptions
 from colmap_sph.undistortion import UndistortionOptions
 from colmap_sph.workspace import MapKind
 
@@ -32,6 +33,7 @@ class RunOptions:
     matching: MatchingOptions = field(default_factory=MatchingOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)
+    refinement: RefinementOptions = field(default_factory=RefinementOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
 
     def check(self) -> None:
@@ -48,6 +50,7 @@ class RunOptions:
             self.matching,
             self.depth,
             self.normals,
+            self.refinement,
             self.fusion,
         ):
             stage.check()

@@ -24,6 +24,7 @@ from colmap_sph.normals import fit_normals
 from colmap_sph.pair_files import disparity_bytes, read_arrays, read_pair, stored_key, write_arrays, write_pair
 from colmap_sph.pairs import partners_of
 from colmap_sph.rectification import RectifiedPair, Side, rectify_pair, resample
+from colmap_sph.refinement import refine_maps
 from colmap_sph.scene import View
 from colmap_sph.state import forget, vouch, vouched_facts
 from colmap_sph.workspace import (
@@ -42,6 +43,8 @@ _SCRATCH_BYTES = 256 << 20
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
 # of a view while its depth is voted, without its pairs' maps, or checked.
 _MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 48.0, 45.0, 40.0
+# … and refined, beside the grey images.
+_REFINE_BYTES = 75.0
 
 
 # ---- matching ----------------------------------------------------------------------------------------------
@@ -151,7 +154,8 @@ def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str,
             maps = sum(disparity_bytes(context.pair_path(*pair)) for pair in _pairs_of(pair_keys, view.name))
             with gate.reserve(maps + _VOTE_BYTES * view.width * view.height, view.name):
                 estimate = _read_estimate(context, view.name) if state.is_voted else _vote(view, state.key)
-                _write_maps(context, view, estimate, "photometric", context.keys.photometric(state.key))
+                planes = fit_normals(view, estimate, context.options.normals)
+                _write_maps(context, view, *planes, "photometric", context.keys.photometric(state.key))
         return Done(state.key, made=not state.is_done)
 
     def _vote(view: View, key: str) -> DepthEstimate:
@@ -193,8 +197,9 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
     """
     report, partners = context.report, partners_of(pairs)
     gate = MemoryGate(context.options.memory_budget)
-    cache_bytes = min(_CACHE_BYTES, gate.free // 3)
-    gate.keep(cache_bytes)
+    cache_bytes = min(_CACHE_BYTES, gate.free // 6)
+    gate.keep(2 * cache_bytes)
+    images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
     estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, cache_bytes)
 
     def work(view: View) -> Done:
@@ -202,10 +207,15 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
         state = check_state(context, names, votes, view)
         if state.coverage is not None:
             return Done(state.key, made=False, coverage=state.coverage)
-        with gate.reserve(_CHECK_BYTES * view.width * view.height, view.name):
+        with gate.reserve(_checking_bytes(context, view, names), view.name):
             others = ((context.scene.view(name), estimates.get(name)) for name in names)
             checked = check_depth(view, estimates.get(view.name), others, context.options.depth)
-            coverage = _write_maps(context, view, checked, "geometric", state.key)
+            planes = fit_normals(view, checked, context.options.normals)
+            if context.options.refinement.rounds and checked.depth.any():
+                sources = [(context.scene.view(name), images.get(name)) for name in names]
+                image, options = images.get(view.name), context.options.refinement
+                planes = refine_maps(view, image, checked, *planes, sources, options)
+            coverage = _write_maps(context, view, *planes, "geometric", state.key)
         return Done(state.key, made=True, coverage=coverage)
 
     views = [view for view in context.scene.views if view.name in votes]
@@ -252,10 +262,25 @@ def _read_estimate(context: Context, name: str) -> DepthEstimate:
     return DepthEstimate(**read_arrays(context.estimate_path(name), ("depth", "sigma", "support")))
 
 
-def _write_maps(context: Context, view: View, estimate: DepthEstimate, kind: MapKind, key: str) -> float:
-    """Fit normals, write both maps (depth is that of the fitted planes), return the share of pixels with one."""
+def _checking_bytes(context: Context, view: View, partners: Sequence[str]) -> float:
+    """Largest bytes in use while a view's depth is checked and refined."""
+    pixels = view.width * view.height
+    if not context.options.refinement.rounds:
+        return _CHECK_BYTES * pixels
+    others = (context.scene.view(name) for name in partners)
+    return (_REFINE_BYTES + 1) * pixels + sum(other.width * other.height for other in others)
+
+
+def _write_maps(
+    context: Context,
+    view: View,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    kind: MapKind,
+    key: str,
+) -> float:
+    """Write both maps of planes, return the share of pixels with one."""
     record, (depth_path, normal_path) = context.maps_record(view.name, kind), context.map_paths(view.name, kind)
-    normals, depth = fit_normals(view, estimate, context.options.normals)
     forget(record)
     write_depth_map(depth_path, depth)
     write_normal_map(normal_path, normals)

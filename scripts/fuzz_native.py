@@ -181,6 +181,23 @@ def confirm_depth(rng: Random) -> Arguments:
     return [*maps, int(rng.integers(-1, 300)), number(rng), number(rng), number(rng), *counts, *sums]
 
 
+def add_patch_equations(rng: Random) -> Arguments:
+    h, w = size(rng)
+    rows = int(rng.integers(0, h + 1))
+    image, source = filled(rng, (h, w), np.uint8), filled(rng, size(rng), np.uint8)
+    # Half of them look at the same place, so that windows do meet.
+    matrix = np.hstack([np.eye(3), np.zeros((3, 1))]) if rng.random() < 0.5 else filled(rng, (3, 4), np.float64)
+    planes, equations = filled(rng, (3, rows, w), np.float32), np.zeros((12, rows, w), np.float32)
+    first = int(rng.integers(0, h - rows + 1))
+    return [backend(rng), image, source, matrix, planes, first, number(rng), number(rng) / 10, equations]
+
+
+def refine_planes(rng: Random) -> Arguments:
+    shape = size(rng)
+    inputs = [filled(rng, (12, *shape), np.float32), filled(rng, shape, np.float32)]
+    return [*inputs, number(rng), filled(rng, (3, *shape), np.float32)]
+
+
 def backend(rng: Random) -> str:
     """A name of kernels that this processor has."""
     return str(rng.choice(_native.backends()))
@@ -209,6 +226,8 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         write_points,
         confirm_depth,
         fit_planes,
+        add_patch_equations,
+        refine_planes,
     )
 }
 

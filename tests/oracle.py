@@ -351,3 +351,71 @@ def fuse_view(reference, partners, options):
             rgb = np.floor(np.mean(colours, axis=0) + 0.5)[::-1]
             points[col, row] = (world, view.R.T @ own, rgb, tuple(views))
     return points, clearance
+
+
+def _bilinear(image, u, v):
+    x, y = int(np.floor(u)), int(np.floor(v))
+    (a, b), (c, d) = image[y : y + 2, x : x + 2].astype(float)
+    return (1 - (v - y)) * (a + (u - x) * (b - a)) + (v - y) * (c + (u - x) * (d - c))
+
+
+def patch_equations(image, source, matrix, planes, contrast, min_score):
+    """Equations (12, H, W) float64 of matching small planes in one source; see `kernels.h` for their order.
+
+    Every tap goes through the whole projection, not through an affine map at the window's middle, and the
+    derivatives are differences of sampled windows. NaN where a window is too near to the source's rim to say.
+    """
+    height, width = image.shape
+    equations = np.zeros((12, height, width))
+    taps = [(i - 2.5, j - 2.5) for j in range(6) for i in range(6)]
+    by = np.array([(1, dx, dy) for dx, dy in taps])
+    for row, column in np.ndindex(image.shape):
+        plane = planes[:, row, column].astype(float)
+        if not (plane[0] > 0 and 3 <= row <= height - 3 and 3 <= column <= width - 3):
+            continue
+
+        def place(inverse, dx, dy, row=row, column=column):
+            x, y, z = matrix @ [column + dx, row + dy, 1.0, inverse]
+            return np.array([x / z, y / z]) - 0.5
+
+        places = np.array([place(plane @ change, *tap) for tap, change in zip(taps, by, strict=True)])
+        rim = np.array([places.min(), *(np.array(source.shape[::-1]) - (1, 2) - places.max(axis=0))]).min()
+        if rim < 0.2:
+            equations[:, row, column] = 0 if rim < -0.2 else np.nan
+            continue
+        r = np.array([image[int(row + dy - 0.5), int(column + dx - 0.5)] for dx, dy in taps], float)
+        s = np.array([_bilinear(source, *p) for p in places])
+        middle = image[row - 1 : row + 1, column - 1 : column + 1].mean()
+        w = np.array([np.exp(-(dx * dx + dy * dy) / 18) for dx, dy in taps]) / (1 + ((r - middle) / contrast) ** 2)
+        # Per inverse depth: the parallax at the middle, times the slope of the source, constant within its pixel.
+        step = 1e-6 * plane[0]
+        parallax = (place(plane[0] + step, 0, 0) - place(plane[0] - step, 0, 0)) / (2 * step)
+        tiny = 1e-7
+        slope = [
+            [
+                (_bilinear(source, *(np.floor(p) + f + tiny * e)) - _bilinear(source, *(np.floor(p) + f))) / tiny
+                for e in np.eye(2)
+            ]
+            for p, f in ((p, np.clip(p - np.floor(p), 0, 1 - 2 * tiny)) for p in places)
+        ]
+        g = (np.array(slope) @ parallax)[:, None] * by
+
+        def mean(values, w=w):
+            return np.average(values, axis=0, weights=w)
+
+        r_unit = (r - mean(r)) / np.sqrt(mean(r * r) - mean(r) ** 2 + 4)
+        scale = 1 / np.sqrt(mean(s * s) - mean(s) ** 2 + 4)
+        s_unit = (s - mean(s)) * scale
+        score = mean(r_unit * s_unit)
+        if abs(score - min_score) < 1e-3:
+            equations[:, row, column] = np.nan
+        if score <= min_score:
+            continue
+        # What a change of the plane does to the normalised window: without its part along the window itself.
+        change = (g - mean(g)) * scale
+        along = mean(s_unit[:, None] * change)
+        matrix_of = mean(change[:, :, None] * change[:, None]) - np.outer(along, along)
+        right = mean(r_unit[:, None] * change) - score * along
+        upper = matrix_of[np.triu_indices(3)]
+        equations[:, row, column] += w.sum() * np.array([1, 2 * (1 - score), parallax @ parallax, *right, *upper])
+    return equations

@@ -27,6 +27,7 @@ from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 from colmap_sph.pairs import PairOptions
 from colmap_sph.rectification import RectificationOptions
+from colmap_sph.refinement import RefinementOptions
 from colmap_sph.undistortion import UndistortionOptions
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
@@ -86,6 +87,7 @@ def test_help_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
         ("matching.", MatchingOptions),
         ("depth.", DepthOptions),
         ("normals.", NormalOptions),
+        ("refinement.", RefinementOptions),
         ("fusion.", FusionOptions),
     ],
 )
@@ -94,7 +96,7 @@ def test_help_of_run_explains_every_option(prefix: str, options: type, capsys: p
     assert code == 0
     words = " ".join(output.replace("│", " ").split())
     assert "--workspace for a dense workspace" in words
-    stages = {"undistortion", "pairs", "rectification", "matching", "depth", "normals", "fusion"}
+    stages = {"undistortion", "pairs", "rectification", "matching", "depth", "normals", "refinement", "fusion"}
     for field in fields(options):
         if options is cli.RunCommand and field.name in stages:
             continue

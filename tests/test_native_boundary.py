@@ -170,6 +170,23 @@ def arguments(function):
             "out normals": np.zeros((H, W, 3), f32),
             "out fitted_depth": np.zeros((H, W), f32),
         },
+        "add_patch_equations": {
+            "backend": "scalar",
+            "image": np.zeros((H, W), u8),
+            "source": np.zeros((9, 20), u8),
+            "source_from_reference": matrix,
+            "planes": np.ones((3, H, W), f32),
+            "first_row": 0,
+            "contrast": 20.0,
+            "min_score": 0.5,
+            "out equations": np.zeros((12, H, W), f32),
+        },
+        "refine_planes": {
+            "equations": np.zeros((12, H, W), f32),
+            "sigma": np.ones((H, W), f32),
+            "slope_sigma": 0.1,
+            "out planes": np.ones((3, H, W), f32),
+        },
     }
     return table[function]
 
@@ -202,6 +219,8 @@ FUNCTIONS = [
     "write_points",
     "confirm_depth",
     "fit_planes",
+    "add_patch_equations",
+    "refine_planes",
 ]
 MATCHING = FUNCTIONS[:6]
 
@@ -225,6 +244,8 @@ FREE = {
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
+    ("add_patch_equations", "image"): {0},
+    ("add_patch_equations", "source"): {0, 1},
 }
 
 
@@ -426,6 +447,12 @@ def test_points_are_counted_for_any_number_of_views(least):
 def test_window_radius_out_of_bounds_is_refused(radius):
     with pytest.raises(ValueError, match="radius"):
         call("fit_planes", {**arguments("fit_planes"), "radius": radius})
+
+
+@pytest.mark.parametrize("first_row", [-1, 1, 2**62])
+def test_rows_beyond_the_image_are_refused(first_row):
+    with pytest.raises(ValueError, match="rows"):
+        call("add_patch_equations", {**arguments("add_patch_equations"), "first_row": first_row})
 
 
 def test_rows_beyond_16_bits_are_refused():

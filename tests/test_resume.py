@@ -25,6 +25,7 @@ from colmap_sph.options import RunOptions
 from colmap_sph.pairs import PairOptions, select_pairs
 from colmap_sph.plan import Plan, make_plan
 from colmap_sph.rectification import RectificationOptions
+from colmap_sph.refinement import RefinementOptions
 from colmap_sph.report import RunReport
 from colmap_sph.scene import read_scene
 from colmap_sph.synthetic import make_demo_block
@@ -148,6 +149,10 @@ CHANGES = {
     "normals": (
         {"normals": NormalOptions(radius=3)},
         expected_files(pairs=0, votes=0, photometric=4, geometric=4, cloud=True),
+    ),
+    "refinement": (
+        {"refinement": RefinementOptions(rounds=1)},
+        expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
     ),
     "fusion": (
         {"fusion": FusionOptions(max_reproj_error=0.7)},
@@ -346,7 +351,7 @@ def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Fin
 # ---- failures of single items ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", ["match_pair", "estimate_depth", "check_depth", "fit_normals"])
+@pytest.mark.parametrize("stage", ["match_pair", "estimate_depth", "check_depth", "fit_normals", "refine_maps"])
 def test_memory_refused_once(stage: str, finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     """One item fails, the rest goes on, and the next run completes the work."""
     original, calls = getattr(stages, stage), []

@@ -33,7 +33,8 @@
      match_##version, \
      refine_offsets_##version, \
      depth_candidates_##version, \
-     fit_planes_##version}
+     fit_planes_##version, \
+     add_patch_equations_##version}
 
 WHOLE_IMAGES(scalar)
 static const kernel_table scalar_kernels = TABLE(scalar);

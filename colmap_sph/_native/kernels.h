@@ -108,6 +108,27 @@ typedef int fit_planes_fn(const float *inverse_depth, const float *inverse_sigma
                           float *fitted_depth);
 
 typedef struct {
+    const uint8_t *values;
+    ptrdiff_t height, width;
+} grey_image;
+
+typedef struct {
+    float contrast;  /* grey values: pixels that differ by more from the middle of a window hardly count */
+    float min_score; /* windows that correlate less do not count */
+} patch_options;
+
+/* Per pixel, one plane of an array each: weight; weighted squared difference; weighted squared parallax per
+ * inverse depth; right side (3) and upper triangle (6) of the normal equations. */
+enum { PATCH_EQUATIONS = 12 };
+
+/* Adds the normal equations of matching a reference's pixels in a source. `planes` (3 arrays of inverse depth, 0 =
+ * none, and its change along x and y) and `equations` belong to rows [first_row, first_row + rows) of the
+ * reference. A pixel (x, y, 1) of inverse depth w lies at matrix (x, y, 1) + w translation in the source. */
+typedef void add_patch_equations_fn(const grey_image *reference, const grey_image *source, const double *matrix,
+                                    const double *translation, const float *planes, ptrdiff_t first_row,
+                                    ptrdiff_t rows, patch_options options, float *equations);
+
+typedef struct {
     const char *name;
     census_fn *census;
     cost_fn *cost;
@@ -117,12 +138,14 @@ typedef struct {
     refine_offsets_fn *refine_offsets;
     depth_candidates_fn *depth_candidates;
     fit_planes_fn *fit_planes;
+    add_patch_equations_fn *add_patch_equations;
 } kernel_table;
 
 census_fn census_scalar, census_avx2;
 refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
 depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
 fit_planes_fn fit_planes_scalar, fit_planes_avx2;
+add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2;
 
 /* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
 int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
@@ -173,6 +196,10 @@ typedef struct {
 void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                    const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
                    uint8_t *contradicting, float *weighted_depth, float *weight);
+
+/* Moves planes by the solution of their equations: of the inverse depth with standard deviation `sigma`, of its
+ * change per pixel with `slope_sigma` times the inverse depth. Planes without equations stay. */
+void refine_planes(const float *equations, const float *sigma, ptrdiff_t pixels, float slope_sigma, float *planes);
 
 /* A view's depth map, its normals (three planes) and K^-1. */
 typedef struct {

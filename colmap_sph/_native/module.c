@@ -558,6 +558,70 @@ static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     return finish(&arrays, status);
 }
 
+static PyObject *py_add_patch_equations(PyObject *self, PyObject *args) {
+    (void)self;
+    const char *backend;
+    PyObject *o[5];
+    Py_ssize_t first_row;
+    patch_options options;
+    if (!PyArg_ParseTuple(args, "sOOOOnffO", &backend, &o[0], &o[1], &o[2], &o[3], &first_row, &options.contrast,
+                          &options.min_score, &o[4])) {
+        return NULL;
+    }
+    const kernel_table *table = table_or_error(backend);
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[2] = {-1, -1}, source_shape[2] = {-1, -1}, matrix_shape[2] = {3, 4};
+    grey_image reference, source;
+    reference.values = table ? array_get(&arrays, o[0], "image", U8, 2, READ, shape) : NULL;
+    source.values = reference.values ? array_get(&arrays, o[1], "source", U8, 2, READ, source_shape) : NULL;
+    const double *transfer =
+        source.values ? array_get(&arrays, o[2], "source_from_reference", F64, 2, READ, matrix_shape) : NULL;
+    Py_ssize_t planes_shape[3] = {3, -1, shape[1]};
+    const float *planes = transfer ? array_get(&arrays, o[3], "planes", F32, 3, READ, planes_shape) : NULL;
+    Py_ssize_t equations_shape[3] = {PATCH_EQUATIONS, planes_shape[1], shape[1]};
+    float *equations = planes ? array_get(&arrays, o[4], "equations", F32, 3, WRITE, equations_shape) : NULL;
+    if (equations &&
+        check(first_row >= 0 && planes_shape[1] <= shape[0] && first_row <= shape[0] - planes_shape[1],
+              "the rows must lie in the image") &&
+        check_width(source_shape[1]) &&
+        check(source_shape[0] < 16384 || source_shape[0] * source_shape[1] < 1 << 30,
+              "a source is limited to 2^30 pixels") &&
+        arrays_disjoint(&arrays)) {
+        double matrix[9], translation[3];
+        split_transfer(transfer, matrix, translation);
+        reference.height = shape[0];
+        reference.width = shape[1];
+        source.height = source_shape[0];
+        source.width = source_shape[1];
+        Py_BEGIN_ALLOW_THREADS;
+        table->add_patch_equations(&reference, &source, matrix, translation, planes, first_row, planes_shape[1],
+                                   options, equations);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
+static PyObject *py_refine_planes(PyObject *self, PyObject *args) {
+    (void)self;
+    PyObject *o[3];
+    float slope_sigma;
+    if (!PyArg_ParseTuple(args, "OOfO", &o[0], &o[1], &slope_sigma, &o[2])) {
+        return NULL;
+    }
+    array_set arrays = {.count = 0};
+    Py_ssize_t shape[3] = {PATCH_EQUATIONS, -1, -1};
+    const float *equations = array_get(&arrays, o[0], "equations", F32, 3, READ, shape);
+    const float *sigma = equations ? array_get(&arrays, o[1], "sigma", F32, 2, READ, shape + 1) : NULL;
+    Py_ssize_t planes_shape[3] = {3, shape[1], shape[2]};
+    float *planes = sigma ? array_get(&arrays, o[2], "planes", F32, 3, WRITE, planes_shape) : NULL;
+    if (planes && arrays_disjoint(&arrays)) {
+        Py_BEGIN_ALLOW_THREADS;
+        refine_planes(equations, sigma, shape[1] * shape[2], slope_sigma, planes);
+        Py_END_ALLOW_THREADS;
+    }
+    return finish(&arrays, 0);
+}
+
 static PyMethodDef methods[] = {
     {"backends", py_backends, METH_NOARGS, "Names of the kernel versions this processor runs, fastest first."},
     {"census", py_census, METH_VARARGS, "census(backend, padded, valid, census)"},
@@ -596,6 +660,10 @@ static PyMethodDef methods[] = {
     {"fit_planes", py_fit_planes, METH_VARARGS,
      "fit_planes(backend, inverse_depth, inverse_sigma, support, K, radius, tolerance, max_shift, shift_sigma, "
      "min_cosine, supported, normals, fitted_depth)"},
+    {"add_patch_equations", py_add_patch_equations, METH_VARARGS,
+     "add_patch_equations(backend, image, source, source_from_reference, planes, first_row, contrast, min_score, "
+     "equations)"},
+    {"refine_planes", py_refine_planes, METH_VARARGS, "refine_planes(equations, sigma, slope_sigma, planes)"},
     {NULL, NULL, 0, NULL}};
 
 static PyModuleDef_Slot slots[] = {{0, NULL}};

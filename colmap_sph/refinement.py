@@ -1,0 +1,192 @@
+"""Checked depth and normals → refined ones, by least-squares matching of small planes.
+
+Every pixel's plane carries the window around it into the images of its partners. How far the windows differ there,
+and how that changes with the plane, gives normal equations; all partners together move the plane a little, against
+the pull of what the depth maps already know. This is multi-photo geometrically constrained matching (Grün &
+Baltsavias, 1988): it uses all images at once, while the disparity maps saw two at a time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.depth import DepthEstimate
+from colmap_sph.errors import OptionError
+from colmap_sph.kernels import backend
+from colmap_sph.normals import NormalOptions, fit_normals
+from colmap_sph.scene import View, pixel_transfer
+
+# Rows whose equations are in memory at a time.
+_BAND_ROWS = 32
+# Which partners say most is found on every so many rows.
+_SURVEY_ROWS = 16
+# Arrays of equations, see `kernels.h`.
+_EQUATIONS = 12
+
+# A partner's image, and where the pixels of the view lie in it.
+_Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """How depth and normals are refined on the images."""
+
+    rounds: int = 2
+    """Times that all planes are refined; 0 leaves them as the disparity maps gave them."""
+    max_partners: int = 10
+    """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
+    depth_freedom: float = 6.0
+    """How far a depth may move: the standard deviation it is given, as a multiple of that of the checked depth."""
+    slope_freedom: float = 5.0
+    """How far a plane may turn: the standard deviation it is given, degrees."""
+    contrast: float = 20.0
+    """Pixels of a window that differ from its middle by more than this (grey values) hardly count."""
+    min_score: float = 0.5
+    """Partners whose window correlates less than this with the image's have no say."""
+    smoothing_radius: int = 2
+    """Radius of the window, pixels, in which planes are fitted again between two rounds."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds."""
+        if not 0 <= self.rounds <= 16:
+            raise OptionError(f"the refinement's rounds must lie in 0..16, not {self.rounds}.")
+        if not self.max_partners >= 1:
+            raise OptionError(f"max_partners must be at least 1, not {self.max_partners}.")
+        for name in ("depth_freedom", "contrast"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
+        if not 0 < self.slope_freedom < 90:
+            raise OptionError(f"slope_freedom must lie between 0 and 90 degrees, not {self.slope_freedom}.")
+        if not -1 <= self.min_score < 1:
+            raise OptionError(f"min_score must lie in -1..1, not {self.min_score}.")
+        if not 1 <= self.smoothing_radius <= 16:
+            raise OptionError(f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.")
+
+
+def refine_maps(
+    view: View,
+    image: NDArray[np.uint8],
+    estimate: DepthEstimate,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    sources: Sequence[tuple[View, NDArray[np.uint8]]],
+    options: RefinementOptions,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Refine a view's maps on the images of its partners.
+
+    Parameters
+    ----------
+    view : View
+    image : (H, W) uint8 ndarray
+        Its grey image.
+    estimate : DepthEstimate
+        Checked depth, whose standard deviations say how far the planes may move.
+    normals, depth : (H, W, 3) and (H, W) float32 ndarray
+        The planes that `fit_normals` fitted to it.
+    sources : sequence of (View, (h, w) uint8 ndarray)
+        Partners and their grey images.
+    options : RefinementOptions
+
+    Returns
+    -------
+    normals, depth : as the parameters
+        Where there was none, there is none.
+    """
+    partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
+    if options.rounds:
+        partners = _most_telling(view, image, estimate, normals, depth, partners, options)
+    for done in range(options.rounds):
+        normals, depth = normals.copy(), depth.copy()
+        if done:
+            smooth, moved = NormalOptions(radius=options.smoothing_radius), replace(estimate, depth=depth)
+            smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
+            fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
+            normals[fitted], depth[fitted] = smooth_normals[fitted], smooth_depth[fitted]
+        for first in range(0, view.height, _BAND_ROWS):
+            rows = slice(first, min(first + _BAND_ROWS, view.height))
+            planes = _planes_of_maps(view, normals[rows], depth[rows], first)
+            equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
+            for partner in partners:
+                _add_equations(image, partner, planes, first, options, equations)
+            sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
+            slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
+            _native.refine_planes(equations, sigma.astype(np.float32), slope_sigma, planes)
+            normals[rows], depth[rows] = _maps_of_planes(view, planes, first)
+    return normals, depth
+
+
+def _most_telling(
+    view: View,
+    image: NDArray[np.uint8],
+    estimate: DepthEstimate,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    partners: list[_Partner],
+    options: RefinementOptions,
+) -> list[_Partner]:
+    """The partners whose images tell most about the depth on some of the rows, in their order."""
+    if len(partners) <= options.max_partners:
+        return partners
+    information = np.zeros(len(partners))
+    for row in range(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS):
+        rows = slice(row, row + 1)
+        planes = _planes_of_maps(view, normals[rows], depth[rows], row)
+        sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
+        for index, partner in enumerate(partners):
+            equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
+            _add_equations(image, partner, planes, row, options, equations)
+            matched = equations[0] > 0
+            weight, difference, curvature = (equations[k][matched] for k in (0, 1, 6))
+            # What a pixel gains, in nats: a long baseline that few pixels match must not outdo all others.
+            gain = np.log1p(np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma[matched] ** 2)
+            information[index] += gain.sum(dtype=float)
+    best = np.argsort(-information, kind="stable")[: options.max_partners]
+    return [partners[index] for index in sorted(best)]
+
+
+def _add_equations(
+    image: NDArray[np.uint8],
+    partner: _Partner,
+    planes: NDArray[np.float32],
+    first: int,
+    options: RefinementOptions,
+    equations: NDArray[np.float32],
+) -> None:
+    _native.add_patch_equations(
+        backend(), image, *partner, planes, first, options.contrast, options.min_score, equations
+    )
+
+
+def _planes_of_maps(
+    view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], first: int
+) -> NDArray[np.float32]:
+    """(3, h, W) inverse depth and its change per column and row; 0 where there is none."""
+    # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d.
+    gradient = normals @ np.linalg.inv(view.K)
+    column, row = _pixels(view, len(depth), first)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = 1 / depth.astype(float)
+        scale = inverse / (gradient[..., 0] * column + gradient[..., 1] * row + gradient[..., 2])
+        planes = np.stack([inverse, gradient[..., 0] * scale, gradient[..., 1] * scale])
+    return np.where(np.isfinite(planes).all(axis=0) & (depth > 0), planes, 0).astype(np.float32)
+
+
+def _maps_of_planes(
+    view: View, planes: NDArray[np.float32], first: int
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Inverse of `_planes_of_maps`: normals (h, W, 3) and depth (h, W)."""
+    inverse, along_x, along_y = planes.astype(float)
+    column, row = _pixels(view, len(inverse), first)
+    away = np.stack([along_x, along_y, inverse - along_x * column - along_y * row], axis=-1) @ view.K
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normals = -away / np.linalg.norm(away, axis=-1, keepdims=True)
+        depth = 1 / inverse
+    found = inverse > 0
+    return np.where(found[..., None], normals, 0).astype(np.float32), np.where(found, depth, 0).astype(np.float32)
+
+
+def _pixels(view: View, rows: int, first: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    return np.arange(view.width, dtype=float)[None], np.arange(first, first + rows, dtype=float)[:, None]

@@ -1,0 +1,324 @@
+"""Refined planes against exact depth of rendered scenes; the kernel against its oracle."""
+
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import oracle
+import pytest
+
+import colmap_sph
+from colmap_sph import _native
+from colmap_sph import synthetic as syn
+from colmap_sph.depth import DepthEstimate
+from colmap_sph.errors import OptionError
+from colmap_sph.refinement import RefinementOptions, refine_maps
+from colmap_sph.scene import View, read_scene
+from colmap_sph.workspace import Workspace, read_depth_map, read_normal_map
+
+OPTIONS = RefinementOptions()
+NAME = "F_0.jpg"
+
+
+# ---- the kernel --------------------------------------------------------------------------------------------
+
+
+def texture(shape, seed):
+    """Smooth random grey image, of which windows of a few pixels can be told apart."""
+    noise = np.random.default_rng(seed).normal(0, 1, shape)
+    smooth = cv2.GaussianBlur(noise, (0, 0), 1.2)
+    return np.clip(128 + 45 * smooth / smooth.std(), 0, 255).astype(np.uint8)
+
+
+def equations_of(backend, image, source, matrix, planes, options=OPTIONS):
+    equations = np.zeros((12, *image.shape), np.float32)
+    _native.add_patch_equations(
+        backend, image, source, matrix, planes, 0, options.contrast, options.min_score, equations
+    )
+    return equations
+
+
+def slanted_planes(shape, seed, slope=0.002):
+    """Inverse depth about 1 with random changes per pixel; some pixels without."""
+    rng = np.random.default_rng(seed)
+    planes = np.stack([rng.uniform(0.8, 1.2, shape), *rng.uniform(-slope, slope, (2, *shape))])
+    return np.where(rng.random(shape) < 0.9, planes, 0).astype(np.float32)
+
+
+# A shift, a rotated and enlarged source, and one that looks at the plane from the side.
+AFFINE = np.array([[1, 0, 2.3, 1.5], [0, 1, 3.6, 0.4], [0, 0, 1, 0]])
+TURNED = np.array([[0.9, -0.5, 12.2, 2.5], [0.5, 1.1, 6.4, -1.4], [0, 0, 1, 0]])
+PROJECTIVE = np.array([[1.02, 0.01, 1.3, 2], [0.02, 0.98, -0.6, 1], [3e-4, -2e-4, 1, 2e-3]])
+
+
+@pytest.mark.parametrize("backend", _native.backends())
+@pytest.mark.parametrize(("matrix", "tolerance"), [(AFFINE, 2e-3), (TURNED, 2e-3), (PROJECTIVE, 3e-2)])
+@pytest.mark.parametrize("size", [(12, 21), (7, 8), (6, 6), (5, 30)])
+def test_equations_are_the_oracles(backend, matrix, tolerance, size):
+    image, source = texture((40, 40), 1)[: size[0], : size[1]].copy(), texture((33, 35), 1)
+    planes, options = slanted_planes(size, 2), replace(OPTIONS, min_score=-0.999)
+    expected = oracle.patch_equations(image, source, matrix, planes, options.contrast, options.min_score)
+    found = equations_of(backend, image, source, matrix, planes, options)
+    known = np.isfinite(expected)
+    scale = np.abs(np.where(known, expected, 0)).max(axis=(1, 2), keepdims=True) + 1e-9
+    close = np.abs(found - expected) <= tolerance * scale
+    # A tap that rounding puts into the neighbouring pixel of the source has another slope.
+    assert close[known].mean() > 0.98
+    np.testing.assert_array_equal((found[0] > 0)[known[0]], (expected[0] > 0)[known[0]])
+    assert (found[0] > 0).any() == (size[0] >= 6)
+
+
+@pytest.mark.parametrize("size", [(6, 6), (9, 7), (17, 40), (11, 29)])
+@pytest.mark.parametrize("matrix", [AFFINE, TURNED, PROJECTIVE])
+def test_equations_do_not_depend_on_the_backend(size, matrix):
+    image, source, planes = texture(size, 3), texture((30, 31), 4), slanted_planes(size, 5)
+    options = replace(OPTIONS, min_score=-0.5)
+    results = [equations_of(backend, image, source, matrix, planes, options) for backend in _native.backends()]
+    assert results[0].any()
+    for other in results[1:]:
+        np.testing.assert_array_equal(results[0], other)
+
+
+@pytest.mark.parametrize("backend", _native.backends())
+def test_an_image_matches_itself(backend):
+    """At infinite depth the image lies on itself, half a pixel of COLMAP's origin included: nothing is to do."""
+    image = texture((20, 30), 6)
+    identity = np.hstack([np.eye(3), [[1.0], [0], [0]]])
+    planes = np.zeros((3, 20, 30), np.float32)
+    planes[0] = 1e-7
+    equations = equations_of(backend, image, image, identity, planes)
+    # Windows that touch the rim have no bilinear neighbours there, and one row below them is read along.
+    assert (equations[0, 4:16, 4:27] > 0).all()
+    matched = equations[0] > 0
+    weight = equations[0][matched]
+    # What noise takes from the score of windows of variance v, all above 75: 2 (1 - v / (v + 4)).
+    assert (equations[1][matched] / weight < 0.1).all()
+    curvature = equations[6][matched]
+    assert (np.abs(equations[3][matched]) < 0.02 * curvature).all()
+
+
+@pytest.mark.parametrize("shift", [-0.5, -0.2, 0.3, 0.5])
+def test_a_shifted_image_gives_its_shift(shift):
+    """One step from a wrong parallax goes most of the way to the true one."""
+    y, x = np.mgrid[0:24, 0:48].astype(float)
+
+    def picture(x, y):
+        return 128 + 40 * np.sin(0.9 * x + 0.3 * y) + 40 * np.sin(0.5 * y - 0.4 * x)
+
+    image = np.rint(picture(x, y)).astype(np.uint8)
+    source = np.rint(picture(x - 4 - shift, y)).astype(np.uint8)
+    matrix = np.hstack([np.eye(3), [[4.0], [0], [0]]])
+    planes = np.zeros((3, 24, 48), np.float32)
+    planes[0] = 1
+    equations = equations_of(_native.backends()[0], image, source, matrix, planes)
+    matched = equations[0] > 0
+    assert matched.mean() > 0.5
+    _native.refine_planes(equations, np.full((24, 48), 1e3, np.float32), 1e-6, planes)
+    left = np.abs(planes[0][matched] * 4 - (4 + shift))
+    assert left.max() < 0.5 * abs(shift) and np.median(left) < 0.25 * abs(shift)
+    assert (planes[0][~matched] == 1).all()
+
+
+def test_planes_without_equations_or_freedom_stay():
+    equations = np.ones((12, 2, 3), np.float32)
+    equations[[7, 8, 10]] = 0
+    planes, sigma = np.ones((3, 2, 3), np.float32), np.ones((2, 3), np.float32)
+    equations[0, 0, 0], sigma[0, 1], planes[0, 0, 2] = 0, 0, 0
+    equations[3:, 1, 0] = np.nan
+    before = planes.copy()
+    _native.refine_planes(equations, sigma, 0.1, planes)
+    changed = (planes != before).any(axis=0)
+    np.testing.assert_array_equal(changed, [[False, False, False], [False, True, True]])
+
+
+def test_the_solution_is_the_weighted_mean_of_image_and_depth():
+    """Equations of curvature a and right side b: the step is b i / (a i + 1 / sigma²), i = 1 / (2 (q + 0.02))."""
+    a, b, q, sigma = 5.0, 0.3, 0.08, 0.4
+    equations = np.zeros((12, 1, 1), np.float32)
+    equations[[0, 1, 3, 6]] = np.array([1, q, b, a])[:, None, None]
+    planes = np.array([2, 0, 0], np.float32).reshape(3, 1, 1)
+    _native.refine_planes(equations, np.full((1, 1), sigma, np.float32), 0.1, planes)
+    information = 0.5 / (q + 0.02)
+    assert planes[0, 0, 0] == pytest.approx(2 + b * information / (a * information + sigma**-2), rel=1e-6)
+
+
+# ---- rendered scenes ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(block):
+    views = read_scene(block.sparse_dir)
+    images = {
+        view.name: cv2.imread(str(block.images_dir / view.name), cv2.IMREAD_GRAYSCALE) for view in views.views
+    }
+    return views, images
+
+
+def rays(view):
+    """Rays (H, W, 3) of the depth map's pixels in the camera's frame."""
+    column, row = np.meshgrid(np.arange(view.width), np.arange(view.height))
+    return np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(view.K).T
+
+
+def disturbed(view, truth, normals, pixels, degrees, seed=0):
+    """Exact maps with smooth errors of depth, in pixels on the ground, and turned normals."""
+    rng = np.random.default_rng(seed)
+    found = (truth > 0) & normals.any(axis=-1)
+    wave = cv2.GaussianBlur(rng.normal(0, 1, truth.shape), (0, 0), 2.0)
+    sigma = np.where(found, pixels * truth / view.K[0, 0], 0).astype(np.float32)
+    depth = np.where(found, truth + sigma * wave / wave.std(), 0).astype(np.float32)
+    turned = normals + np.tan(np.radians(degrees)) * rng.normal(0, 0.7, normals.shape)
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    turned *= -np.sign((turned * rays(view)).sum(axis=-1, keepdims=True))  # still towards the camera
+    turned = np.where(found[..., None], turned, 0).astype(np.float32)
+    return DepthEstimate(depth, sigma, np.full(depth.shape, 3, np.uint8)), turned
+
+
+def angle(normals, truth):
+    return np.degrees(np.arccos(np.clip((normals * truth).sum(axis=-1), -1, 1)))
+
+
+@pytest.mark.parametrize("name", [NAME, "N_0_1.jpg"])
+def test_refinement_comes_nearer_to_the_truth(block, scene, name):
+    """Depth errors shrink by a third and more, and normals turn towards the true ones."""
+    views, images = scene
+    assert name in images, sorted(images)
+    view = views.view(name)
+    truth, true_normals = block.truth(name)
+    estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
+    sources = [(other, images[other.name]) for other in views.views if other.name != name]
+    refined, depth = refine_maps(view, images[name], estimate, normals, estimate.depth, sources, OPTIONS)
+    found = (estimate.depth > 0) & (depth > 0)
+    np.testing.assert_array_equal(depth > 0, estimate.depth > 0)
+    assert not depth[estimate.depth == 0].any() and not refined[depth == 0].any()
+    before, after = (np.abs(values - truth)[found] for values in (estimate.depth, depth))
+    assert np.median(after) < 0.67 * np.median(before)
+    assert np.median(angle(refined, true_normals)[found]) < np.median(angle(normals, true_normals)[found])
+    np.testing.assert_allclose(np.linalg.norm(refined[found], axis=-1), 1, atol=1e-5)
+
+
+def test_without_partners_or_rounds_maps_stay(block, scene):
+    views, images = scene
+    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
+    sources = [(other, images[other.name]) for other in views.views if other.name != NAME]
+    for partners, rounds in (([], 1), (sources, 0)):
+        options = replace(OPTIONS, rounds=rounds)
+        refined, depth = refine_maps(view, images[NAME], estimate, normals, estimate.depth, partners, options)
+        np.testing.assert_allclose(depth, estimate.depth, rtol=1e-6)
+        np.testing.assert_allclose(refined, normals, atol=1e-5)
+
+
+def test_partners_that_see_something_else_have_no_say(block, scene):
+    """Pictures of noise correlate with nothing: depth stays where it was."""
+    views, images = scene
+    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=0)
+    rng = np.random.default_rng(1)
+    sources = [
+        (other, rng.integers(0, 256, images[other.name].shape, np.uint8))
+        for other in views.views
+        if other.name != NAME
+    ]
+    options = replace(OPTIONS, rounds=1)
+    _, depth = refine_maps(view, images[NAME], estimate, normals, estimate.depth, sources, options)
+    found = depth > 0
+    assert (np.abs(depth - estimate.depth)[found] < 1e-4 * depth[found]).mean() > 0.95
+
+
+def test_partners_that_tell_most_are_chosen(block, scene):
+    """Of true pictures and pictures of noise the true ones: the same maps as from these alone."""
+    views, images = scene
+    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
+    others = [other for other in views.views if other.name != NAME][:4]
+    rng, true, mixed = np.random.default_rng(2), [], []
+    for other in others:
+        true.append((other, images[other.name]))
+        mixed += [(other, rng.integers(0, 256, images[other.name].shape, np.uint8)), true[-1]]
+    options = replace(OPTIONS, max_partners=4)
+    alone, chosen = (
+        refine_maps(view, images[NAME], estimate, normals, estimate.depth, sources, options)
+        for sources in (true, mixed)
+    )
+    for one, other in zip(alone, chosen, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_bands_of_rows_leave_no_trace(block, scene, monkeypatch):
+    views, images = scene
+    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
+    sources = [(other, images[other.name]) for other in views.views[:3]]
+    results = []
+    for rows in (7, 1000):
+        monkeypatch.setattr("colmap_sph.refinement._BAND_ROWS", rows)
+        results.append(refine_maps(view, images[NAME], estimate, normals, estimate.depth, sources, OPTIONS))
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_slanted_plane_is_found_from_a_frontal_one():
+    """Both depth and slope: the plane is rendered exactly, the first guess faces the camera."""
+    pair = syn.slanted_plane_pair(30.0, focal_length=300.0, size=(160, 120))
+    view, other = (
+        View(k, name, c.width, c.height, c.K, c.R, c.t, np.zeros(0, np.int64))
+        for k, (name, c) in enumerate((("a", pair.left), ("b", pair.right)))
+    )
+    image, source = (cv2.cvtColor(pair.render(side).image, cv2.COLOR_RGB2GRAY) for side in ("left", "right"))
+    truth, true_normals, _ = syn.exact_geometry(pair.surfaces, pair.left, origin=0.0)
+    normals = np.zeros((*truth.shape, 3), np.float32)
+    normals[..., 2] = -1
+    sigma = (0.3 * truth / 300).astype(np.float32)
+    estimate = DepthEstimate(truth.astype(np.float32), sigma, np.ones(truth.shape, np.uint8))
+    options = replace(OPTIONS, rounds=6, slope_freedom=45.0)
+    refined, depth = refine_maps(view, image, estimate, normals, estimate.depth, [(other, source)], options)
+    inner = (slice(15, -15), slice(15, -15))
+    assert np.median(angle(refined, true_normals)[inner]) < 10
+    assert np.median(np.abs(depth - truth)[inner] / sigma[inner]) < 1
+
+
+def test_a_run_refines_its_geometric_maps(block, finished, tmp_path):
+    """Against the same run without refinement: nearer to the truth, at the same pixels."""
+    plain = tmp_path / "dense"
+    shutil.copytree(finished.dense, plain)
+    report = colmap_sph.run(workspace=plain, options=colmap_sph.RunOptions(refinement=RefinementOptions(rounds=0)))
+    assert report.made["match pairs"] == report.made["estimate depth"] == 0
+    assert report.coverage == finished.report.coverage
+
+    def errors(dense):
+        depths, angles = [], []
+        for name in block.names:
+            truth, true_normals = block.truth(name)
+            depth = read_depth_map(Workspace(dense).depth_map_path(name, "geometric"))
+            normals = read_normal_map(Workspace(dense).normal_map_path(name, "geometric"))
+            found = (depth > 0) & (truth > 0) & true_normals.any(axis=-1)
+            depths.append(np.abs(depth / truth - 1)[found])
+            angles.append(angle(normals, true_normals)[found])
+        return np.median(np.concatenate(depths)), (np.concatenate(angles) < 5).mean()
+
+    depth_error, true_normals = errors(finished.dense)
+    plain_depth_error, plain_true_normals = errors(plain)
+    assert depth_error < 0.9 * plain_depth_error
+    assert true_normals > plain_true_normals
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("rounds", -1),
+        ("rounds", 17),
+        ("max_partners", 0),
+        ("depth_freedom", 0.0),
+        ("slope_freedom", 90.0),
+        ("slope_freedom", 0.0),
+        ("contrast", -1.0),
+        ("min_score", 1.0),
+        ("min_score", float("nan")),
+        ("smoothing_radius", 0),
+    ],
+)
+def test_options_out_of_bounds_are_refused(name, value):
+    with pytest.raises(OptionError, match=name.split("_")[0]):
+        replace(OPTIONS, **{name: value}).check()
