@@ -23,6 +23,8 @@ from colmap_sph.scene import View, pixel_transfer
 _BAND_ROWS = 32
 # Which partners say most is found on every so many rows.
 _SURVEY_ROWS = 16
+# Partners that bring the planes near in the rounds before the last.
+_FIRST_PARTNERS = 3
 # Arrays of equations, see `kernels.h`.
 _EQUATIONS = 12
 
@@ -109,7 +111,8 @@ def refine_maps(
             rows = slice(first, min(first + _BAND_ROWS, view.height))
             planes = _planes_of_maps(view, normals[rows], depth[rows], first)
             equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
-            for partner in partners:
+            last = done == options.rounds - 1
+            for partner in partners if last else partners[:_FIRST_PARTNERS]:
                 _add_equations(image, partner, planes, first, options, equations)
             sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
@@ -127,9 +130,7 @@ def _most_telling(
     partners: list[_Partner],
     options: RefinementOptions,
 ) -> list[_Partner]:
-    """The partners whose images tell most about the depth on some of the rows, in their order."""
-    if len(partners) <= options.max_partners:
-        return partners
+    """The partners whose images tell most about the depth on some of the rows, those which tell most first."""
     information = np.zeros(len(partners))
     for row in range(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS):
         rows = slice(row, row + 1)
@@ -144,7 +145,7 @@ def _most_telling(
             gain = np.log1p(np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma[matched] ** 2)
             information[index] += gain.sum(dtype=float)
     best = np.argsort(-information, kind="stable")[: options.max_partners]
-    return [partners[index] for index in sorted(best)]
+    return [partners[index] for index in best]
 
 
 def _add_equations(
@@ -164,29 +165,45 @@ def _planes_of_maps(
     view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], first: int
 ) -> NDArray[np.float32]:
     """(3, h, W) inverse depth and its change per column and row; 0 where there is none."""
-    # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d.
-    gradient = normals @ np.linalg.inv(view.K)
+    # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d. No matrix product: it would wake BLAS's
+    # threads for three columns.
+    (a, b, c), (_, d, e), _ = np.linalg.inv(view.K).astype(np.float32)
+    x, y, z = (normals[..., axis] for axis in range(3))
     column, row = _pixels(view, len(depth), first)
+    planes = np.empty((3, *depth.shape), np.float32)
+    inverse, along_x, along_y = planes
+    np.multiply(x, a, out=along_x)
+    np.add(x * b, y * d, out=along_y)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1 / depth.astype(float)
-        scale = inverse / (gradient[..., 0] * column + gradient[..., 1] * row + gradient[..., 2])
-        planes = np.stack([inverse, gradient[..., 0] * scale, gradient[..., 1] * scale])
-    return np.where(np.isfinite(planes).all(axis=0) & (depth > 0), planes, 0).astype(np.float32)
+        np.divide(1, depth, out=inverse)
+        scale = inverse / (along_x * column + along_y * row + (x * c + y * e + z))
+        planes[1:] *= scale
+    planes[:, ~((depth > 0) & np.isfinite(planes).all(axis=0))] = 0
+    return planes
 
 
 def _maps_of_planes(
     view: View, planes: NDArray[np.float32], first: int
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Inverse of `_planes_of_maps`: normals (h, W, 3) and depth (h, W)."""
-    inverse, along_x, along_y = planes.astype(float)
+    inverse, along_x, along_y = planes
+    (a, b, c), (_, d, e), _ = view.K.astype(np.float32)
     column, row = _pixels(view, len(inverse), first)
-    away = np.stack([along_x, along_y, inverse - along_x * column - along_y * row], axis=-1) @ view.K
+    normals = np.empty((*inverse.shape, 3), np.float32)
+    x, y, z = (normals[..., axis] for axis in range(3))
+    np.multiply(along_x, -a, out=x)
+    np.negative(along_x * b + along_y * d, out=y)
+    np.negative(along_x * c + along_y * e + (inverse - along_x * column - along_y * row), out=z)
     with np.errstate(divide="ignore", invalid="ignore"):
-        normals = -away / np.linalg.norm(away, axis=-1, keepdims=True)
+        normals /= np.sqrt(x * x + y * y + z * z)[..., None]
         depth = 1 / inverse
-    found = inverse > 0
-    return np.where(found[..., None], normals, 0).astype(np.float32), np.where(found, depth, 0).astype(np.float32)
+    lost = ~(inverse > 0)
+    normals[lost], depth[lost] = 0, 0
+    return normals, depth
 
 
-def _pixels(view: View, rows: int, first: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    return np.arange(view.width, dtype=float)[None], np.arange(first, first + rows, dtype=float)[:, None]
+def _pixels(view: View, rows: int, first: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    return (
+        np.arange(view.width, dtype=np.float32)[None],
+        np.arange(first, first + rows, dtype=np.float32)[:, None],
+    )
