@@ -38,7 +38,7 @@ class RefinementOptions:
 
     rounds: int = 2
     """Times that all planes are refined; 0 leaves them as the disparity maps gave them."""
-    max_partners: int = 10
+    max_partners: int = 8
     """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
     depth_freedom: float = 6.0
     """How far a depth may move: the standard deviation it is given, as a multiple of that of the checked depth."""
