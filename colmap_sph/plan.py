@@ -34,7 +34,7 @@ _MATCH_SECONDS = 0.14  # of both rectified images
 _VOTE_SECONDS = 0.07  # of the image, per pair
 _CHECK_SECONDS = 0.05  # of the image, per partner
 _NORMALS_SECONDS = 0.25  # of the image, for each of its two kinds of maps
-_REFINE_SECONDS = 0.12  # of the image, per partner and round
+_REFINE_SECONDS = 0.13  # of the image, per partner in each round
 _COLMAP_FUSE_SECONDS = 0.9
 # With 33 images of 1.1 megapixels, each of which 32 others overlap.
 _FUSE_SECONDS, _FUSE_PARTNER_SECONDS = 0.05, 0.011  # of the image, and per overlapping image
@@ -175,8 +175,7 @@ def _survey(context: Context, pairs: Sequence[Pair], *, fresh: bool) -> _Survey:
         state = check_state(context, names, votes, view)
         maps[view.name], megapixels = state.key, view.width * view.height / 1e6
         if state.coverage is None:
-            refinement = context.options.refinement
-            refined = refinement.rounds * min(len(names), refinement.max_partners)
+            refined = context.options.refinement.images_used(len(names))
             seconds = _CHECK_SECONDS * len(names) + _REFINE_SECONDS * refined + _NORMALS_SECONDS
             survey.seconds += seconds * megapixels
             survey.disk += _MAP_BYTES * megapixels * 1e6

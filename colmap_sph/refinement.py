@@ -67,6 +67,11 @@ class RefinementOptions:
         if not 1 <= self.smoothing_radius <= 16:
             raise OptionError(f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.")
 
+    def images_used(self, partners: int) -> int:
+        """How often a partner's image is matched in, all rounds together, where there are so many partners."""
+        last = min(partners, self.max_partners)
+        return (self.rounds - 1) * min(last, _FIRST_PARTNERS) + last if self.rounds else 0
+
 
 def refine_maps(
     view: View,
@@ -77,7 +82,7 @@ def refine_maps(
     sources: Sequence[tuple[View, NDArray[np.uint8]]],
     options: RefinementOptions,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Refine a view's maps on the images of its partners.
+    """Refine a view's maps, in place, on the images of its partners.
 
     Parameters
     ----------
@@ -87,21 +92,20 @@ def refine_maps(
     estimate : DepthEstimate
         Checked depth, whose standard deviations say how far the planes may move.
     normals, depth : (H, W, 3) and (H, W) float32 ndarray
-        The planes that `fit_normals` fitted to it.
+        The planes that `fit_normals` fitted to it; changed.
     sources : sequence of (View, (h, w) uint8 ndarray)
         Partners and their grey images.
     options : RefinementOptions
 
     Returns
     -------
-    normals, depth : as the parameters
-        Where there was none, there is none.
+    normals, depth
+        The parameters; where there was none, there is none.
     """
     partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
     if options.rounds:
         partners = _most_telling(view, image, estimate, normals, depth, partners, options)
     for done in range(options.rounds):
-        normals, depth = normals.copy(), depth.copy()
         if done:
             smooth, moved = NormalOptions(radius=options.smoothing_radius), replace(estimate, depth=depth)
             smooth_normals, smooth_depth = fit_normals(view, moved, smooth)

@@ -44,7 +44,7 @@ _SCRATCH_BYTES = 256 << 20
 # of a view while its depth is voted, without its pairs' maps, or checked.
 _MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 48.0, 45.0, 40.0
 # … and refined, beside the grey images.
-_REFINE_BYTES = 75.0
+_REFINE_BYTES = 55.0
 
 
 # ---- matching ----------------------------------------------------------------------------------------------
@@ -197,7 +197,9 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
     """
     report, partners = context.report, partners_of(pairs)
     gate = MemoryGate(context.options.memory_budget)
-    cache_bytes = min(_CACHE_BYTES, gate.free // 6)
+    # The caches take nothing that the largest view needs.
+    most = max(_checking_bytes(context, view, partners.get(view.name, [])) for view in context.scene.views)
+    cache_bytes = int(min(_CACHE_BYTES, max(gate.free - 1.2 * most, 0) / 2))
     gate.keep(2 * cache_bytes)
     images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
     estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, cache_bytes)

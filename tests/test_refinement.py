@@ -188,7 +188,9 @@ def test_refinement_comes_nearer_to_the_truth(block, scene, name):
     truth, true_normals = block.truth(name)
     estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
     sources = [(other, images[other.name]) for other in views.views if other.name != name]
-    refined, depth = refine_maps(view, images[name], estimate, normals, estimate.depth, sources, OPTIONS)
+    refined, depth = refine_maps(
+        view, images[name], estimate, normals.copy(), estimate.depth.copy(), sources, OPTIONS
+    )
     found = (estimate.depth > 0) & (depth > 0)
     np.testing.assert_array_equal(depth > 0, estimate.depth > 0)
     assert not depth[estimate.depth == 0].any() and not refined[depth == 0].any()
@@ -205,7 +207,9 @@ def test_without_partners_or_rounds_maps_stay(block, scene):
     sources = [(other, images[other.name]) for other in views.views if other.name != NAME]
     for partners, rounds in (([], 1), (sources, 0)):
         options = replace(OPTIONS, rounds=rounds)
-        refined, depth = refine_maps(view, images[NAME], estimate, normals, estimate.depth, partners, options)
+        refined, depth = refine_maps(
+            view, images[NAME], estimate, normals.copy(), estimate.depth.copy(), partners, options
+        )
         np.testing.assert_allclose(depth, estimate.depth, rtol=1e-6)
         np.testing.assert_allclose(refined, normals, atol=1e-5)
 
@@ -222,7 +226,7 @@ def test_partners_that_see_something_else_have_no_say(block, scene):
         if other.name != NAME
     ]
     options = replace(OPTIONS, rounds=1)
-    _, depth = refine_maps(view, images[NAME], estimate, normals, estimate.depth, sources, options)
+    _, depth = refine_maps(view, images[NAME], estimate, normals.copy(), estimate.depth.copy(), sources, options)
     found = depth > 0
     assert (np.abs(depth - estimate.depth)[found] < 1e-4 * depth[found]).mean() > 0.95
 
@@ -239,7 +243,7 @@ def test_partners_that_tell_most_are_chosen(block, scene):
         mixed += [(other, rng.integers(0, 256, images[other.name].shape, np.uint8)), true[-1]]
     options = replace(OPTIONS, max_partners=4)
     alone, chosen = (
-        refine_maps(view, images[NAME], estimate, normals, estimate.depth, sources, options)
+        refine_maps(view, images[NAME], estimate, normals.copy(), estimate.depth.copy(), sources, options)
         for sources in (true, mixed)
     )
     for one, other in zip(alone, chosen, strict=True):
@@ -254,7 +258,9 @@ def test_bands_of_rows_leave_no_trace(block, scene, monkeypatch):
     results = []
     for rows in (7, 1000):
         monkeypatch.setattr("colmap_sph.refinement._BAND_ROWS", rows)
-        results.append(refine_maps(view, images[NAME], estimate, normals, estimate.depth, sources, OPTIONS))
+        results.append(
+            refine_maps(view, images[NAME], estimate, normals.copy(), estimate.depth.copy(), sources, OPTIONS)
+        )
     for one, other in zip(*results, strict=True):
         np.testing.assert_array_equal(one, other)
 
@@ -273,7 +279,9 @@ def test_a_slanted_plane_is_found_from_a_frontal_one():
     sigma = (0.3 * truth / 300).astype(np.float32)
     estimate = DepthEstimate(truth.astype(np.float32), sigma, np.ones(truth.shape, np.uint8))
     options = replace(OPTIONS, rounds=6, slope_freedom=45.0)
-    refined, depth = refine_maps(view, image, estimate, normals, estimate.depth, [(other, source)], options)
+    refined, depth = refine_maps(
+        view, image, estimate, normals.copy(), estimate.depth.copy(), [(other, source)], options
+    )
     inner = (slice(15, -15), slice(15, -15))
     assert np.median(angle(refined, true_normals)[inner]) < 10
     assert np.median(np.abs(depth - truth)[inner] / sigma[inner]) < 1
