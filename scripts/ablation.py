@@ -3,7 +3,7 @@
     python scripts/ablation.py --model SPARSE --output FOLDER [--reference DEPTHS --depth-scale S --gsd G]
 
 Every variant starts from a copy of the default run and redoes only what depends on its option, so that hours
-become minutes; the seconds are those of its stages made anew in place of the default's. With exact depth maps
+become minutes; the seconds are those of the stages made anew. With exact depth maps
 (--reference) coverage, shares of right depths, and accuracy, completeness and F-score of the cloud are given;
 without them the distance of the cloud from the sparse points that five images or more track within 0.7 pixels.
 """
@@ -13,7 +13,6 @@ import json
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +24,9 @@ from scipy.spatial import cKDTree
 from colmap_sph.cloud_files import POINT
 
 _VARIANTS: dict[str, list[str]] = {
-    "default": [],
+    "default": ["--overwrite"],
     "not refined on the images": ["--refinement.rounds", "0"],
-    "refined once": ["--refinement.rounds", "1"],
+    "refined twice": ["--refinement.rounds", "2"],
     "fusion by COLMAP": ["--fusion.method", "colmap"],
     "three images must agree on a point": ["--fusion.min-num-pixels", "3"],
     "what one view confirms needs no surface around it": ["--depth.min-surface", "0"],
@@ -46,15 +45,6 @@ _VARIANTS: dict[str, list[str]] = {
 _MIN_TRACK, _MAX_ERROR = 5, 0.7
 
 
-@dataclass
-class Outcome:
-    """Of one variant."""
-
-    seconds: dict[str, float]
-    points: int
-    columns: list[str] = field(default_factory=list)
-
-
 def run(command: list[str]) -> None:
     """Run the program; end with its message where it fails."""
     done = subprocess.run([sys.executable, "-m", "colmap_sph", *command], capture_output=True, text=True)
@@ -62,23 +52,23 @@ def run(command: list[str]) -> None:
         sys.exit(f"colmap_sph {' '.join(command)} failed:\n{done.stdout}{done.stderr}")
 
 
-def reconstruct(arguments: argparse.Namespace, name: str, options: list[str], base: Outcome | None) -> Outcome:
-    """Run a variant, from the default's results where there are any."""
+def measure(arguments: argparse.Namespace, name: str, options: list[str]) -> list[str]:
+    """Run a variant, from the default's results but for the default itself; its row of the table."""
     folder = arguments.output / name.replace(" ", "-").replace(",", "")
-    if base is not None and not folder.exists():
-        # The program replaces files and never writes into them.
-        shutil.copytree(arguments.output / "default", folder, copy_function=lambda a, b: Path(b).hardlink_to(a))
+    if name != "default" and not folder.exists():
+        # The program replaces all files but its log, into which it writes.
+        shutil.copytree(
+            arguments.output / "default",
+            folder,
+            copy_function=lambda a, b: Path(b).hardlink_to(a),
+            ignore=shutil.ignore_patterns("log.txt"),
+        )
     size = ["--max-image-size", str(arguments.max_image_size)]
     run(["run", "--model", str(arguments.model), "--output", str(folder), *size, *options])
     report = json.loads((folder / "colmap_sph" / "report.json").read_text())
-    seconds = {
-        stage: report["seconds"][stage] if base is None or report["made"].get(stage) else base.seconds[stage]
-        for stage in report["seconds"]
-    }
-    outcome = Outcome(seconds, report["points"])
+    seconds = sum(report["seconds"][stage] for stage, made in report["made"].items() if made)
     score = exact_scores if arguments.reference else sparse_scores
-    outcome.columns = score(arguments, folder, report)
-    return outcome
+    return [name, f"{seconds:.0f}", f"{report['points']:,}", *score(arguments, folder, report)]
 
 
 def exact_scores(arguments: argparse.Namespace, folder: Path, _report: dict[str, Any]) -> list[str]:
@@ -88,12 +78,9 @@ def exact_scores(arguments: argparse.Namespace, folder: Path, _report: dict[str,
     truth = ["--reference", str(arguments.reference), "--depth-scale", str(arguments.depth_scale)]
     run([*cloud, *truth, "--gsd", str(arguments.gsd)])
     scores = json.loads(file.read_text())
-    maps, cloud_scores = scores["depth_maps"], scores["clouds"][0]
-    means = [np.mean([row["coverage"] for row in maps]), *np.mean([row["within"] for row in maps], axis=0)[:2]]
-    rows = [
-        [f"{100 * share[k]:.1f}" for k in range(3)]
-        for share in (cloud_scores["accuracy"], cloud_scores["f_score"])
-    ]
+    maps, cloud_scores = scores["depth_maps"]["mean"], scores["clouds"][0]["thresholds"]
+    rows = [[f"{100 * one[k]:.1f}" for one in cloud_scores] for k in ("accuracy", "completeness", "f_score")]
+    means = [maps["coverage"], *maps["within"][:2]]
     return [*(f"{100 * mean:.1f}" for mean in means), *(" / ".join(row) for row in rows)]
 
 
@@ -118,15 +105,13 @@ def main() -> None:
     parser.add_argument("--gsd", type=float, default=1.0)
     parser.add_argument("--only", nargs="*", choices=list(_VARIANTS), help="these variants, beside the default")
     arguments = parser.parse_args()
-    truth = ["coverage %", "< 1 GSD %", "< 2 GSD %", "accuracy 1 / 2 / 4 GSD", "F 1 / 2 / 4 GSD"]
+    truth = ["coverage %", "< 1 GSD %", "< 2 GSD %", "accuracy 1 / 2 / 4 GSD", "completeness", "F"]
     if not arguments.reference:
         truth = ["coverage %", "median to sparse points, mm", "within 5 / 10 mm, %"]
-    rows, base = [], None
+    rows = []
     for name, options in _VARIANTS.items():
-        if base is None or not arguments.only or name in arguments.only:
-            outcome = reconstruct(arguments, name, options, base)
-            base = base or outcome
-            rows.append([name, f"{sum(outcome.seconds.values()):.0f}", f"{outcome.points:,}", *outcome.columns])
+        if name == "default" or not arguments.only or name in arguments.only:
+            rows.append(measure(arguments, name, options))
             print(rows[-1], file=sys.stderr)
     print(f"{machine()}\n\n{table(['variant', 'seconds', 'points', *truth], rows)}")
 
