@@ -120,9 +120,7 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
     check_places(workspace)
     gate = MemoryGate(options.memory_budget)
     pixels = [view.width * view.height for view in map(scene.view, state.names)]
-    # The cache takes nothing that the largest view needs.
-    spare = max(gate.free - 2 * FUSE_BYTES * max(pixels), 0) / 2
-    cache_bytes = int(min(MAPS_BYTES * sum(pixels), spare))
+    cache_bytes = int(min(MAPS_BYTES * sum(pixels), gate.spare(2 * FUSE_BYTES * max(pixels)) / 2))
     gate.keep(cache_bytes)
     index_of = {image_id: index for index, image_id in enumerate(scene.image_ids)}
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.cloud_files import POINT
 from colmap_sph.errors import InputError, OptionError
+from colmap_sph.image_check import read_undistorted
 from colmap_sph.masks import read_mask
 from colmap_sph.scene import View, pixel_transfer
 from colmap_sph.workspace import MapKind, Workspace, mask_path, read_depth_map, read_normal_planes
@@ -123,10 +124,7 @@ def read_view_maps(workspace: Workspace, view: View, index: int, kind: MapKind, 
     """
     depth = read_depth_map(workspace.depth_map_path(view.name, kind))
     normals = read_normal_planes(workspace.normal_map_path(view.name, kind))
-    path = workspace.image_path(view.name)
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
+    image = read_undistorted(workspace.image_path(view.name), cv2.IMREAD_COLOR)
     shape = (view.height, view.width)
     if depth.shape != shape or normals.shape[1:] != shape or image.shape[:2] != shape:
         raise InputError(
@@ -136,7 +134,7 @@ def read_view_maps(workspace: Workspace, view: View, index: int, kind: MapKind, 
     mask = None if masks is None else read_mask(mask_path(masks, view.name), view.width, view.height)
     if mask is not None:
         depth[mask == 0] = 0
-    return ViewMaps(view, index, depth, normals, np.asarray(image, np.uint8))
+    return ViewMaps(view, index, depth, normals, image)
 
 
 def fuse_view(

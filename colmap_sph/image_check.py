@@ -9,7 +9,11 @@ import struct
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
 
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 # Start-of-frame markers; 0xC4, 0xC8 and 0xCC among them have other meanings.
@@ -19,6 +23,21 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 
 class _DamagedError(ValueError):
     """The header makes no sense or the file ends too early."""
+
+
+def read_undistorted(path: Path, colour: int) -> NDArray[np.uint8]:
+    """Read an undistorted image as OpenCV does, with its flag for grey or colour.
+
+    Raises
+    ------
+    InputError
+        It is missing or damaged.
+    """
+    # Undistorted images have their camera's orientation; an EXIF tag must not turn them.
+    image = cv2.imread(str(path), colour | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
+    return np.asarray(image, dtype=np.uint8)
 
 
 def image_problem(path: Path, width: int, height: int) -> str | None:

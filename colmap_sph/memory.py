@@ -87,6 +87,10 @@ class MemoryGate:
         """Bytes of the budget that neither the process has in use nor caches keep."""
         return max(self._total - self._outside, 0)
 
+    def spare(self, needed: float) -> float:
+        """Bytes for caches: of what is free, what the largest piece of work, of `needed` bytes, leaves."""
+        return max(self.free - needed, 0)
+
     def keep(self, amount: int) -> None:
         """Take `amount` bytes for caches and scratch memory, for good; before any work begins."""
         self._outside += amount

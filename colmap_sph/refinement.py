@@ -118,9 +118,9 @@ def refine_maps(
             last = done == options.rounds - 1
             for partner in partners if last else partners[:_FIRST_PARTNERS]:
                 _add_equations(image, partner, planes, first, options, equations)
-            sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
+            sigma = _freedom(estimate.sigma[rows], planes, options)
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
-            _native.refine_planes(equations, sigma.astype(np.float32), slope_sigma, planes)
+            _native.refine_planes(equations, sigma, slope_sigma, planes)
             normals[rows], depth[rows] = _maps_of_planes(view, planes, first)
     return normals, depth
 
@@ -139,7 +139,7 @@ def _most_telling(
     for row in range(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS):
         rows = slice(row, row + 1)
         planes = _planes_of_maps(view, normals[rows], depth[rows], row)
-        sigma = options.depth_freedom * estimate.sigma[rows] * planes[0] ** 2
+        sigma = _freedom(estimate.sigma[rows], planes, options)
         for index, partner in enumerate(partners):
             equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
             _add_equations(image, partner, planes, row, options, equations)
@@ -150,6 +150,13 @@ def _most_telling(
             information[index] += gain.sum(dtype=float)
     best = np.argsort(-information, kind="stable")[: options.max_partners]
     return [partners[index] for index in best]
+
+
+def _freedom(
+    sigma: NDArray[np.float32], planes: NDArray[np.float32], options: RefinementOptions
+) -> NDArray[np.float32]:
+    """Standard deviation that planes' inverse depths are given, from that of their checked depth."""
+    return np.asarray(options.depth_freedom * sigma * planes[0] ** 2, np.float32)
 
 
 def _add_equations(

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from colmap_sph.context import Context, Done, Pair
 from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate_depth
-from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.errors import NoResultError
+from colmap_sph.image_check import read_undistorted
 from colmap_sph.load_cache import LoadCache
 from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, Scratch, match_pair
@@ -197,9 +198,8 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
     """
     report, partners = context.report, partners_of(pairs)
     gate = MemoryGate(context.options.memory_budget)
-    # The caches take nothing that the largest view needs.
     most = max(_checking_bytes(context, view, partners.get(view.name, [])) for view in context.scene.views)
-    cache_bytes = int(min(_CACHE_BYTES, max(gate.free - 1.2 * most, 0) / 2))
+    cache_bytes = int(min(_CACHE_BYTES, gate.spare(1.2 * most) / 2))
     gate.keep(2 * cache_bytes)
     images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
     estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, cache_bytes)
@@ -247,12 +247,7 @@ def _pairs_of(pairs: Iterable[Pair], name: str) -> list[Pair]:
 
 
 def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:
-    path = workspace.image_path(name)
-    # Undistorted images have their camera's orientation; an EXIF tag must not turn them.
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
-    return np.asarray(image, dtype=np.uint8)
+    return read_undistorted(workspace.image_path(name), cv2.IMREAD_GRAYSCALE)
 
 
 def _read_mask(context: Context, name: str) -> NDArray[np.uint8] | None:

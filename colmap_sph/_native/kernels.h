@@ -201,6 +201,8 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
  * change per pixel with `slope_sigma` times the inverse depth. Planes without equations stay. */
 void refine_planes(const float *equations, const float *sigma, ptrdiff_t pixels, float slope_sigma, float *planes);
 
+enum { MAX_FUSION_PARTNERS = 64 }; /* a bit for each of them */
+
 /* A view's depth map, its normals (three planes) and K^-1. */
 typedef struct {
     const float *depth, *normals;

@@ -339,21 +339,27 @@ static int copy_transfer(array_set *arrays, PyObject *forward, PyObject *back, v
     return 1;
 }
 
-/* Depth, normals and K^-1 of a view, from three objects. */
-static int get_maps(array_set *arrays, PyObject *const *objects, view_maps *maps) {
-    Py_ssize_t shape[2] = {-1, -1}, matrix_shape[2] = {3, 3};
+/* Depth, normals and their size of a view, from two objects. */
+static int get_planes(array_set *arrays, PyObject *const *objects, view_maps *maps) {
+    Py_ssize_t shape[2] = {-1, -1};
     maps->depth = array_get(arrays, objects[0], "depth", F32, 2, READ, shape);
     Py_ssize_t normals_shape[3] = {3, shape[0], shape[1]};
     maps->normals = maps->depth ? array_get(arrays, objects[1], "normals", F32, 3, READ, normals_shape) : NULL;
-    const double *inverse =
-        maps->normals ? array_get(arrays, objects[2], "ray_from_pixel", F64, 2, READ, matrix_shape) : NULL;
-    if (!inverse) {
-        return 0;
-    }
     maps->height = shape[0];
     maps->width = shape[1];
-    memcpy(maps->ray_from_pixel, inverse, sizeof maps->ray_from_pixel);
-    return 1;
+    return maps->normals != NULL;
+}
+
+/* The same, and K^-1, from three objects. */
+static int get_maps(array_set *arrays, PyObject *const *objects, view_maps *maps) {
+    Py_ssize_t shape[2] = {3, 3};
+    const double *inverse = get_planes(arrays, objects, maps)
+                                ? array_get(arrays, objects[2], "ray_from_pixel", F64, 2, READ, shape)
+                                : NULL;
+    if (inverse) {
+        memcpy(maps->ray_from_pixel, inverse, sizeof maps->ray_from_pixel);
+    }
+    return inverse != NULL;
 }
 
 static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
@@ -415,7 +421,7 @@ static PyObject *py_fuse_partner(PyObject *self, PyObject *args) {
     verdict.covered = back ? array_get(&arrays, o[9], "covered", U8, 2, WRITE, shape) : NULL;
     verdict.agreeing = verdict.covered ? array_get(&arrays, o[10], "agreeing", U64, 2, WRITE, shape) : NULL;
     verdict.colour = verdict.agreeing ? array_get(&arrays, o[11], "colour", U16, 3, WRITE, shape) : NULL;
-    if (verdict.colour && check(bit >= 0 && bit < 64, "the partner's bit must lie in 0..63") &&
+    if (verdict.colour && check(bit >= 0 && bit < MAX_FUSION_PARTNERS, "the partner's bit must lie in 0..63") &&
         arrays_disjoint(&arrays)) {
         split_transfer(forward, transfer.pixel_from_reference, transfer.translation);
         memcpy(transfer.reference_from_partner, back, sizeof transfer.reference_from_partner);
@@ -429,15 +435,11 @@ static PyObject *py_fuse_partner(PyObject *self, PyObject *args) {
 /* Maps and verdict of a view from five objects, and rows of them; 0 with an error set. */
 static int get_fused_rows(array_set *arrays, PyObject *const *objects, view_maps *maps, fusion_verdict *verdict,
                           fused_rows *rows) {
-    Py_ssize_t shape[3] = {-1, -1, 3};
-    maps->depth = array_get(arrays, objects[0], "depth", F32, 2, READ, shape);
-    Py_ssize_t normals_shape[3] = {3, shape[0], shape[1]};
-    maps->normals = maps->depth ? array_get(arrays, objects[1], "normals", F32, 3, READ, normals_shape) : NULL;
-    verdict->covered = maps->normals ? array_get(arrays, objects[2], "covered", U8, 2, READ, shape) : NULL;
+    const int ready = get_planes(arrays, objects, maps);
+    Py_ssize_t shape[3] = {maps->height, maps->width, 3};
+    verdict->covered = ready ? array_get(arrays, objects[2], "covered", U8, 2, READ, shape) : NULL;
     verdict->agreeing = verdict->covered ? array_get(arrays, objects[3], "agreeing", U64, 2, READ, shape) : NULL;
     verdict->colour = verdict->agreeing ? array_get(arrays, objects[4], "colour", U16, 3, READ, shape) : NULL;
-    maps->height = shape[0];
-    maps->width = shape[1];
     rows->maps = maps;
     rows->verdict = verdict;
     return verdict->colour &&
@@ -479,7 +481,7 @@ static PyObject *py_write_points(PyObject *self, PyObject *args) {
     fusion_verdict verdict;
     point_frame frame;
     ptrdiff_t num_points = 0, num_words = 0;
-    Py_ssize_t matrix_shape[2] = {3, 3}, vector_shape[1] = {3}, indices_shape[1] = {1 + 64};
+    Py_ssize_t matrix_shape[2] = {3, 3}, vector_shape[1] = {3}, indices_shape[1] = {1 + MAX_FUSION_PARTNERS};
     const int ready = get_fused_rows(&arrays, o, &maps, &verdict, &rows);
     const double *pixel = ready ? array_get(&arrays, o[5], "world_from_pixel", F64, 2, READ, matrix_shape) : NULL;
     const double *camera =
@@ -646,8 +648,7 @@ static PyMethodDef methods[] = {
      "weighted_depth, weight)"},
     {"confirm_depth", py_confirm_depth, METH_VARARGS,
      "confirm_depth(depth, sigma, min_consistent, max_contradiction, min_surface, steepest, observing, "
-     "agreeing, "
-     "contradicting, weighted_depth, weight)"},
+     "agreeing, contradicting, weighted_depth, weight)"},
     {"fuse_partner", py_fuse_partner, METH_VARARGS,
      "fuse_partner(depth, normals, ray_from_pixel, partner_depth, partner_normals, partner_ray_from_pixel, "
      "partner_image, partner_from_reference, normal_from_partner, max_reprojection_error, max_depth_error, "
