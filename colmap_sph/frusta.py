@@ -31,7 +31,7 @@ def observe_points(scene: Scene, points: NDArray[np.float64]) -> list[NDArray[np
     Of many points every n-th is used, in such a way that all views use the same.
     """
     rows = np.arange(0, len(points), -(-len(points) // _MAX_POINTS), dtype=np.int64)
-    return [rows[_sees(view, points[rows])] for view in scene.views]
+    return [rows[sees(view, points[rows])] for view in scene.views]
 
 
 def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
@@ -63,7 +63,7 @@ def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
         for k, i in enumerate(posed):
             tested = np.sort(nearest[k])
             rows = (tested[:, None] * count + np.arange(count)).ravel()
-            observed[i].append(first + rows[_sees(views[k], block[tested].reshape(-1, 3))])
+            observed[i].append(first + rows[sees(views[k], block[tested].reshape(-1, 3))])
     return np.concatenate(points), [np.concatenate([*rows, np.empty(0, np.int64)]) for rows in observed]
 
 
@@ -92,8 +92,8 @@ def _sample(view: View, depth: float) -> NDArray[np.float64]:
     return np.asarray((depth * rays - view.t) @ view.R)
 
 
-def _sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of (N, 3) points lie before the camera and inside its image."""
+def sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of (N, 3) points lie before the camera and inside its image; occlusion is not considered."""
     camera = points @ view.R.T + view.t
     pixels = camera @ view.K.T
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):

@@ -18,6 +18,7 @@ from scipy import sparse
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.frusta import observe_frusta, observe_points
+from colmap_sph.partner_choice import choose, triangulation_angles, worth_of
 from colmap_sph.scene import Scene
 from colmap_sph.workspace import SourceImages
 
@@ -27,9 +28,10 @@ PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
 
 # COLMAP numbers a pair `image_id1 * 2147483647 + image_id2`.
 _MAX_NUM_IMAGES = 2147483647
-# A view's candidates whose angles are looked at before giving up, and the points that tell a pair's angle.
-_MAX_CANDIDATES = 200
+# Candidates of a view that are looked at, and the points that tell a pair's angle and its worth.
+_MAX_CANDIDATES = 100
 _MAX_ANGLE_POINTS = 512
+_MAX_WORTH_POINTS = 512
 _ANGLE_PERCENTILE = 75
 
 
@@ -206,6 +208,19 @@ class _Graph:
             self._angles[key] = self._compute_angle(*key)
         return self._angles[key]
 
+    def worth(self, i: int, j: int) -> NDArray[np.float32]:
+        """Return how well view `j` would serve the points of view `i`, or an even part of them."""
+        rows = self._observed[i]
+        rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
+        self._is_observed[self._observed[j]] = True
+        believed: NDArray[np.bool_] | float = self._is_observed[rows]
+        self._is_observed[self._observed[j]] = False
+        if self.source == "database":
+            most = self._weights.data[self._weights.indptr[i] : self._weights.indptr[i + 1]].max()
+            believed = float(self.weight(i, j) / most)
+        views = self.scene.views
+        return worth_of(views[i], views[j], self._points[rows], believed)
+
     def _compute_angle(self, i: int, j: int) -> float:
         self._is_observed[self._observed[i]] = True
         shared = self._observed[j][self._is_observed[self._observed[j]]]
@@ -216,16 +231,6 @@ class _Graph:
         points = self._points[shared[:: -(-len(shared) // _MAX_ANGLE_POINTS)]]
         angles = triangulation_angles(points, self.centers[i], self.centers[j])
         return float(np.percentile(angles, _ANGLE_PERCENTILE))
-
-
-def triangulation_angles(
-    points: NDArray[np.float64], center1: NDArray[np.float64], center2: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return the angles in degrees, 0 to 180, between the rays from (N, 3) points to two centres."""
-    rays1, rays2 = center1 - points, center2 - points
-    # Unlike the arc cosine, exact for small angles.
-    sines = np.linalg.norm(np.cross(rays1, rays2), axis=1)
-    return np.asarray(np.degrees(np.arctan2(sines, np.einsum("ij,ij->i", rays1, rays2))))
 
 
 def _build_graph(scene: Scene, options: PairOptions, database: Path | None) -> _Graph:
@@ -295,11 +300,12 @@ def _verified_matches(scene: Scene, database: Path, least: int) -> sparse.csr_ar
 
 
 def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]:
-    """Return the best pairs of view `i`: those which share most, after them those under a wide angle."""
+    """Return the best pairs of view `i`: those that together see most of it, then those under a wide angle."""
     near: list[Pair] = []
     wide: list[Pair] = []
+    worths: list[NDArray[np.float32]] = []
     for j, weight in zip(*graph.candidates(i), strict=True):
-        if len(near) == options.num_pairs or len(near) + len(wide) >= _MAX_CANDIDATES:
+        if len(near) == _MAX_CANDIDATES:
             break
         angle = graph.angle(i, int(j))
         if np.isnan(angle) and np.array_equal(graph.centers[i], graph.centers[j]):
@@ -307,8 +313,13 @@ def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]
         if angle < options.min_triangulation_angle:
             continue
         pair = Pair(graph.scene.views[i].name, graph.scene.views[j].name, int(weight), angle)
-        (wide if angle > options.max_triangulation_angle else near).append(pair)
-    return tuple((near + wide)[: options.num_pairs])
+        if angle > options.max_triangulation_angle:
+            wide.append(pair)
+        else:
+            near.append(pair)
+            worths.append(graph.worth(i, int(j)))
+    chosen = [near[k] for k in choose(worths, options.num_pairs)]
+    return tuple((chosen + wide)[: options.num_pairs])
 
 
 def _explicit_selection(

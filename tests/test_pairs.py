@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -18,9 +19,10 @@ from colmap_sph.pairs import (
     PairOptions,
     PairSelection,
     overlapping_views,
+    partners_of,
     select_pairs,
-    triangulation_angles,
 )
+from colmap_sph.partner_choice import choose, triangulation_angles, worth_of
 from colmap_sph.scene import Scene, View, read_scene
 
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
@@ -58,8 +60,10 @@ def test_ranked_by_shared_points(line: Scene) -> None:
     selection = select_pairs(line, FEW)
     assert selection.source == "tracks"
     assert [(p.partner, p.shared_points) for p in selection.pairs["0.jpg"]] == [("1.jpg", 20), ("2.jpg", 10)]
-    expected = [("1.jpg", 20), ("3.jpg", 20), ("0.jpg", 10), ("4.jpg", 10)]
-    assert [(p.partner, p.shared_points) for p in selection.pairs["2.jpg"]] == expected
+    # Of two that share the same number the one with more parallax comes first.
+    expected = [("3.jpg", 20), ("1.jpg", 20), ("4.jpg", 10), ("0.jpg", 10)]
+    assert {(p.partner, p.shared_points) for p in selection.pairs["2.jpg"]} == set(expected)
+    assert [p.shared_points for p in selection.pairs["2.jpg"]] == [20, 20, 10, 10]
     assert selection.without_partner == ()
 
 
@@ -74,8 +78,7 @@ def test_overlapping_views(line: Scene) -> None:
 
 
 def test_angle_is_the_75th_percentile(line: Scene) -> None:
-    pair = select_pairs(line, FEW).pairs["1.jpg"][0]
-    assert pair.partner == "0.jpg"
+    (pair,) = (pair for pair in select_pairs(line, FEW).pairs["1.jpg"] if pair.partner == "0.jpg")
     points = line.points[10:30]
     to0, to1 = points - [0, 0, 0], points - [1, 0, 0]
     cosines = (to0 * to1).sum(1) / np.linalg.norm(to0, axis=1) / np.linalg.norm(to1, axis=1)
@@ -89,8 +92,68 @@ def test_triangulation_angle_of_known_triangles() -> None:
 
 
 def test_number_of_pairs_and_bounds(line: Scene) -> None:
-    assert partners(select_pairs(line, PairOptions(num_pairs=1)), "2.jpg") == ["1.jpg"]
-    assert partners(select_pairs(line, PairOptions(min_shared_points=11)), "2.jpg") == ["1.jpg", "3.jpg"]
+    assert partners(select_pairs(line, PairOptions(num_pairs=1)), "0.jpg") == ["1.jpg"]
+    assert set(partners(select_pairs(line, PairOptions(num_pairs=2)), "2.jpg")) == {"1.jpg", "3.jpg"}
+    assert set(partners(select_pairs(line, PairOptions(min_shared_points=11)), "2.jpg")) == {"1.jpg", "3.jpg"}
+
+
+def test_worth_of_a_candidate() -> None:
+    """Closed formula: (what is believed) * (what the parallax is good for), 0 outside the candidate's image."""
+    points = np.array([[0.0, 0, 10], [0, 0, 10], [4.99, 0, 10], [0, 0, 200]])
+    view, candidate = view_at([0, 0, 0], "a"), view_at([2, 0, 0], "b")
+    both = np.array([True, False, False, False])
+    angles = np.degrees(np.arctan([0.2, 0.2, 0.499, 0.01]) - np.arctan([0, 0, 0.299, 0]))
+    assert (angles[:3] > 6).all() and angles[3] < 6
+    np.testing.assert_allclose(
+        worth_of(view, candidate, points, both), [1, 0.5, 0.5, 0.5 * angles[3] / 6], rtol=1e-6
+    )
+    away = view_at([-2, 0, 0], "c")  # its image ends at x = 3
+    np.testing.assert_allclose(worth_of(view, away, points, 0.5)[[0, 2]], [0.75, 0], rtol=1e-6)
+    wide = view_at([10 * np.tan(np.radians(60)), 0, 0], "d")  # out of its image, but what is observed is in sight
+    np.testing.assert_allclose(worth_of(view, wide, points, both)[:2], [0.5, 0], rtol=1e-6)
+
+
+def test_what_few_see_is_served_before_what_many_see() -> None:
+    left, right = np.repeat([1.0, 0], [90, 10]), np.repeat([0, 1.0], [90, 10])
+    worths = [w.astype(np.float32) for w in (left, 0.99 * left, right, 0.98 * left, np.zeros(100), 0.5 * right)]
+    # 90, then 0.4 * 89.1; 14.3 > 10 > 5.6; then what is left of the left side against half of the right one's.
+    assert choose(worths, 6) == [0, 1, 3, 2, 5, 4]
+    assert choose(worths, 4) == [0, 1, 3, 2]
+    assert choose([], 3) == []
+
+
+def test_partners_see_what_others_see(data_dir: Path) -> None:
+    """With exact depth: what any image sees under a usable angle, partners should see; shared points alone leave
+    1.7 % of a view, and 13 % of the worst, to images that are no partners."""
+    scene = read_scene(data_dir / "penta" / "sparse" / "0")
+    partners_by_name = partners_of(select_pairs(scene, PairOptions()).unique_pairs())
+    read = {view.name: data_dir / "penta" / "depth" / f"{Path(view.name).stem}.png" for view in scene.views}
+    depths = {name: 0.005 * cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for name, path in read.items()}
+    missed = []
+    for view in scene.views:
+        rows, columns = (axis.ravel() for axis in np.mgrid[8 : view.height : 16, 8 : view.width : 16])
+        z = depths[view.name][rows, columns]
+        rays = np.column_stack([columns + 0.5, rows + 0.5, np.ones(len(z))]) @ np.linalg.inv(view.K).T
+        points = ((rays * z[:, None])[z > 0] - view.t) @ view.R
+        seen, served = np.zeros(len(points), bool), np.zeros(len(points), bool)
+        for other in scene.views:
+            if other.name != view.name:
+                angles = triangulation_angles(points, view.center, other.center)
+                visible = in_view(other, depths[other.name], points) & (angles > 2) & (angles < 60)
+                seen |= visible
+                served |= visible & (other.name in partners_by_name[view.name])
+        missed.append(np.mean(seen & ~served))
+    assert np.mean(missed) < 0.01 and max(missed) < 0.05
+
+
+def in_view(view: View, depth: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Which points a view sees, going by its exact depth."""
+    camera = points @ view.R.T + view.t
+    pixels = camera @ view.K.T
+    column, row = (np.floor(pixels[:, k] / pixels[:, 2]).astype(int) for k in (0, 1))
+    inside = (camera[:, 2] > 0) & (column >= 0) & (row >= 0) & (column < view.width) & (row < view.height)
+    exact = depth[np.where(inside, row, 0), np.where(inside, column, 0)]
+    return inside & (np.abs(exact - camera[:, 2]) < 0.005 * camera[:, 2])
 
 
 def test_unique_pairs(line: Scene) -> None:
@@ -171,7 +234,7 @@ def test_patch_match_cfg_is_obeyed(line: Scene, caplog: pytest.LogCaptureFixture
     # No gate for what the user wrote; "__auto__" means our choice of our number.
     assert [(p.partner, p.shared_points) for p in selection.pairs["4.jpg"]] == [("0.jpg", 0)]
     assert np.isnan(selection.pairs["4.jpg"][0].angle)
-    assert partners(selection, "2.jpg") == ["1.jpg", "3.jpg"]
+    assert set(partners(selection, "2.jpg")) == {"1.jpg", "3.jpg"}
     assert partners(selection, "1.jpg") == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
     assert "gone.jpg" in caplog.text and "lost.jpg" in caplog.text
 
@@ -276,10 +339,6 @@ def test_real_tracks_agree_with_colmap(data_dir: Path) -> None:
             assert pair.shared_points == shared[name, pair.partner]
             angle = np.degrees(radians[index(name)][index(pair.partner)])
             assert pair.angle == pytest.approx(angle, rel=0.05)
-        # Whoever was passed over shares less, or is seen under too wide an angle.
-        for other in model.images.values():
-            if other.name not in partners(selection, name) and shared[name, other.name] > pairs[-1].shared_points:
-                assert np.degrees(radians[index(name)][index(other.name)]) > 59
 
 
 @pytest.mark.parametrize(("keep_points", "share"), [(True, 0.9), (False, 0.8)])
@@ -304,7 +363,7 @@ def test_large_block_is_fast() -> None:
         first, last = np.searchsorted(points[:, 0], [x - 30, x + 30])
         near = first + np.flatnonzero(np.abs(points[first:last, 1] - y) < 30)
         views.append(view_at([x, y, 0], f"{i:03d}.jpg", near.tolist()))
-    start = time.perf_counter()
+    start = time.process_time()
     selection = select_pairs(Scene(tuple(views), points), PairOptions())
-    assert time.perf_counter() - start < 10
+    assert time.process_time() - start < 10
     assert set(partners(selection, "210.jpg")[:4]) == {"209.jpg", "211.jpg", "190.jpg", "230.jpg"}
