@@ -13,10 +13,10 @@ uint64_t *cost_row_buffer(match_size size) {
 }
 
 int selection_begin(selection_buffers *buffers, match_size size) {
-    /* One more: no target pixel at all must not look like no memory. */
-    buffers->least = malloc(((size_t)size.target_width * 2 + 1) * sizeof *buffers->least);
-    buffers->best_column = buffers->least ? buffers->least + size.target_width : NULL;
-    return buffers->least ? 0 : -1;
+    const ptrdiff_t keys = (size.target_width + 2 * size.depth + 1) / 2 * 2;
+    buffers->keys = malloc((size_t)(keys + size.width) * sizeof *buffers->keys);
+    buffers->winner = buffers->keys ? (int32_t *)(buffers->keys + keys) : NULL;
+    return buffers->keys ? 0 : -1;
 }
 
 int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
@@ -60,7 +60,7 @@ int select_rows(const row_kernels *kernels, const uint16_t *aggregated, const in
                                target + y * size.target_width, size, max_left_right_difference, &buffers,
                                offset + row);
     }
-    free(buffers.least);
+    free(buffers.keys);
     return 0;
 }
 
@@ -142,7 +142,7 @@ int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band
     free(m.checkpoints);
     free(m.row_sums);
     free(m.cost_buffer);
-    free(m.selection.least);
+    free(m.selection.keys);
     free(m.backward.memory);
     free(m.forward.memory);
     return status;

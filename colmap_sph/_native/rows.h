@@ -37,12 +37,16 @@ typedef void sweep_row_fn(sweep_state *state, ptrdiff_t y, const uint8_t *cost, 
 
 /* ---- selection --------------------------------------------------------------------------------------------- */
 
-/* Of every target pixel: the least sum that points at it, and from which column. */
+/* Of every target pixel the least sum that points at it, and from which column, as one number: sum << 16 | column.
+ * Of equal sums the leftmost wins, in whatever order they come. */
 typedef struct {
-    uint16_t *least, *best_column;
+    uint32_t *keys;  /* room for a target row with `depth` pixels on both sides, in any order, */
+    int32_t *winner; /* and for a number per pixel */
 } selection_buffers;
 
-/* 0, or -1 without memory; ended by free(buffers->least). */
+#define NO_KEY UINT32_C(0xffff0000) /* which a sum of 65535 never beats */
+
+/* 0, or -1 without memory; ended by free(buffers->keys). */
 int selection_begin(selection_buffers *buffers, match_size size);
 typedef void selection_row_fn(const uint16_t *sums, const int32_t *base, const uint64_t *reference,
                               const uint64_t *target, match_size size, int32_t max_left_right_difference,
