@@ -4,7 +4,7 @@
 
 /* The kernels on whole images that are made of row kernels. */
 #define WHOLE_IMAGES(version) \
-    static const row_kernels rows_##version = {cost_row_##version, sweep_begin_##version, sweep_row_##version, \
+    static const row_kernels rows_##version = {cost_row_##version, sweep_begin_##version, sweep_rows_##version, \
                                                selection_row_##version}; \
     static int cost_##version(const uint64_t *reference, const uint64_t *target, const int32_t *base, \
                               match_size size, uint8_t *cost) { \

@@ -53,31 +53,6 @@ ALWAYS_INLINE int32_t first_minimum(const uint16_t *sums, ptrdiff_t depth) {
     return first;
 }
 
-ALWAYS_INLINE void first_pass(const uint16_t *sums, const int32_t *base, const uint64_t *reference,
-                              match_size size, const selection_buffers *buffers, const ptrdiff_t depth) {
-    const ptrdiff_t keys = (size.target_width + 2 * depth + 1) / 2 * 2;
-    for (ptrdiff_t k = 0; k < keys; k++) {
-        buffers->keys[k] = NO_KEY;
-    }
-    /* Neighbours point at almost the same target pixels, and would wait for each other's keys to reach the cache:
-     * pixels from all over the row take turns. */
-    enum { TURNS = 8 };
-    const ptrdiff_t part = (size.width + TURNS - 1) / TURNS;
-    for (ptrdiff_t k = 0; k < part; k++) {
-        for (ptrdiff_t x = k; x < size.width; x += part) {
-            if (reference[x] & CENSUS_INVALID) {
-                buffers->winner[x] = 0;
-                continue;
-            }
-            const ptrdiff_t reach = x + base[x] + depth, end = size.target_width + depth;
-            const ptrdiff_t first = reach < 0 ? 0 : reach < end ? reach : end;
-            uint32_t *even = buffers->keys + first / 2, *odd = even + keys / 2;
-            match_target_pixels(sums + x * depth, x, depth, first % 2 ? odd : even, first % 2 ? even + 1 : odd);
-            buffers->winner[x] = first_minimum(sums + x * depth, depth);
-        }
-    }
-}
-
 /* subpixel_offset of eight pixels. Quotients are at most 128, with divisors of 16 bits: 32-bit floats round none
  * of them up to the next whole number. */
 ALWAYS_INLINE __m256i subpixel_offsets(__m256i before, __m256i best, __m256i after) {
@@ -91,7 +66,7 @@ ALWAYS_INLINE __m256i subpixel_offsets(__m256i before, __m256i best, __m256i aft
 }
 
 /* Pixels x to x + 7 of the row, those that `there` says. */
-ALWAYS_INLINE void second_pass(const uint16_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+static inline void check_eight(const uint16_t *sums, const int32_t *base, const uint64_t *target, match_size size,
                                int32_t max_difference, const selection_buffers *buffers, int32_t x, __m256i there,
                                int32_t *offset) {
     const __m256i zero = _mm256_setzero_si256(), minus_one = _mm256_set1_epi32(-1);
@@ -134,26 +109,14 @@ ALWAYS_INLINE void second_pass(const uint16_t *sums, const int32_t *base, const 
     _mm256_maskstore_epi32(offset + x, there, result);
 }
 
-void selection_row_avx2(const uint16_t *sums, const int32_t *base, const uint64_t *reference,
-                        const uint64_t *target, match_size size, int32_t max_left_right_difference,
-                        selection_buffers *buffers, int32_t *offset) {
-    /* The usual numbers of disparities as constants, for which the compiler unrolls loops. */
-    switch (size.depth) {
-    case 32:
-        first_pass(sums, base, reference, size, buffers, 32);
-        break;
-    case 64:
-        first_pass(sums, base, reference, size, buffers, 64);
-        break;
-    case 128:
-        first_pass(sums, base, reference, size, buffers, 128);
-        break;
-    default:
-        first_pass(sums, base, reference, size, buffers, size.depth);
-    }
+void check_winners_avx2(const uint16_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+                        int32_t max_left_right_difference, const selection_buffers *buffers, int32_t *offset) {
     for (int32_t x = 0; x < (int32_t)size.width; x += 8) {
         const __m256i left = _mm256_set1_epi32((int)size.width - x);
         const __m256i there = _mm256_cmpgt_epi32(left, _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
-        second_pass(sums, base, target, size, max_left_right_difference, buffers, x, there, offset);
+        check_eight(sums, base, target, size, max_left_right_difference, buffers, x, there, offset);
     }
 }
+
+#define SELECTION_ROW selection_row_avx2
+#include "selection.inc"
