@@ -51,10 +51,7 @@ static int has_avx2(void) {
 
 #ifdef COLMAP_SPH_HAVE_AVX512
 #define census_avx512 census_avx2
-#define refine_offsets_avx512 refine_offsets_avx2
 #define depth_candidates_avx512 depth_candidates_avx2
-#define fit_planes_avx512 fit_planes_avx2
-#define add_patch_equations_avx512 add_patch_equations_avx2
 WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
 

@@ -142,10 +142,10 @@ typedef struct {
 } kernel_table;
 
 census_fn census_scalar, census_avx2;
-refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
+refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2, refine_offsets_avx512;
 depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
-fit_planes_fn fit_planes_scalar, fit_planes_avx2;
-add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2;
+fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512;
+add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512;
 
 /* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
 int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
