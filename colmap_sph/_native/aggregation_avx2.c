@@ -35,8 +35,9 @@ ALWAYS_INLINE __m128i horizontal_min(vector v) {
     return _mm_minpos_epu16(_mm_min_epu8(m, _mm_srli_epi16(m, 8)));
 }
 
-/* out[0..31] = in[0..31] + a + b + c + d, 8 bits to 16; without `in` for the first sweep. */
-ALWAYS_INLINE void add_paths(const uint16_t *in, uint16_t *out, vector a, vector b, vector c, vector d) {
+/* out[0..31] = a + b + c + d (+ in[0..31]), 8 bits to 16. */
+ALWAYS_INLINE void add_paths(int add_in, const uint16_t *in, uint16_t *out, vector a, vector b, vector c,
+                             vector d) {
     const vector ones = _mm256_set1_epi8(1);
     const vector low = _mm256_add_epi16(_mm256_maddubs_epi16(_mm256_unpacklo_epi8(a, b), ones),
                                         _mm256_maddubs_epi16(_mm256_unpacklo_epi8(c, d), ones));
@@ -44,7 +45,7 @@ ALWAYS_INLINE void add_paths(const uint16_t *in, uint16_t *out, vector a, vector
                                          _mm256_maddubs_epi16(_mm256_unpackhi_epi8(c, d), ones));
     vector first = _mm256_permute2x128_si256(low, high, 0x20);
     vector second = _mm256_permute2x128_si256(low, high, 0x31);
-    if (in) {
+    if (add_in) {
         first = _mm256_add_epi16(first, _mm256_loadu_si256((const vector *)(const void *)in));
         second = _mm256_add_epi16(second, _mm256_loadu_si256((const vector *)(const void *)(in + 16)));
     }

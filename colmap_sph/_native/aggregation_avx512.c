@@ -36,8 +36,9 @@ ALWAYS_INLINE __m128i horizontal_min(vector v) {
     return _mm_minpos_epu16(_mm_min_epu8(m, _mm_srli_epi16(m, 8)));
 }
 
-/* out[0..63] = in[0..63] + a + b + c + d, 8 bits to 16; without `in` for the first sweep. */
-ALWAYS_INLINE void add_paths(const uint16_t *in, uint16_t *out, vector a, vector b, vector c, vector d) {
+/* out[0..63] = a + b + c + d (+ in[0..63]), 8 bits to 16. */
+ALWAYS_INLINE void add_paths(int add_in, const uint16_t *in, uint16_t *out, vector a, vector b, vector c,
+                             vector d) {
     const vector ones = _mm512_set1_epi8(1);
     const vector low = _mm512_add_epi16(_mm512_maddubs_epi16(_mm512_unpacklo_epi8(a, b), ones),
                                         _mm512_maddubs_epi16(_mm512_unpacklo_epi8(c, d), ones));
@@ -45,7 +46,7 @@ ALWAYS_INLINE void add_paths(const uint16_t *in, uint16_t *out, vector a, vector
                                          _mm512_maddubs_epi16(_mm512_unpackhi_epi8(c, d), ones));
     vector first = _mm512_permutex2var_epi64(low, _mm512_setr_epi64(0, 1, 8, 9, 2, 3, 10, 11), high);
     vector second = _mm512_permutex2var_epi64(low, _mm512_setr_epi64(4, 5, 12, 13, 6, 7, 14, 15), high);
-    if (in) {
+    if (add_in) {
         first = _mm512_add_epi16(first, _mm512_loadu_si512(in));
         second = _mm512_add_epi16(second, _mm512_loadu_si512(in + 32));
     }
