@@ -1,5 +1,5 @@
-/* The matching kernels row by row, scalar and AVX2, so that the matcher can pass rows from one to the next while
- * in cache. All pointers to pixels are to the row in question unless said otherwise. */
+/* The matching kernels row by row, so that the matcher can pass rows from one to the next while in cache.
+ * All pointers to pixels are to the row in question unless said otherwise. */
 #ifndef COLMAP_SPH_ROWS_H
 #define COLMAP_SPH_ROWS_H
 

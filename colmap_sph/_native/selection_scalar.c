@@ -4,7 +4,7 @@
 
 /* Equiangular ("V") fit through three costs, 1/256 pixel, within [-128, 128]. Where every path matches to the bit
  * the images differ by whole pixels: without motion the offset is exactly zero. */
-int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after) {
+static int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after) {
     const int32_t rise = (before > after ? before : after) - best;
     if (rise <= 0 || best == 0) {
         return 0;
