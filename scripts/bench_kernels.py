@@ -38,28 +38,47 @@ P2 = np.round(OPTIONS.p2_min + (OPTIONS.p2 - OPTIONS.p2_min) / (1 + np.arange(25
 )
 OFFSET_INVALID = np.iinfo(np.int32).min
 
-# Vector arithmetic and shuffles per 32 slots in the C sources, without loads, stores and what is done per pixel.
-# cost_avx2.c: hamming_4 has 10 (xor, 2 and, shift, 2 shuffles, add, sad, compare, blend), 8 times; shift and or,
-# 7 times; then shuffle, extract, 2 unpacks, insert.
-COST_OPS = 8 * 10 + 7 * 2 + 5
-# aggregation_avx2.c: `advance` has 7 (3 min, 2 add, subtract, running min) for each of 4 paths; 2 permutes and
-# 2 alignr bring the neighbouring slots of the path along the row; `add_paths` has 4 unpacks, 4 maddubs, 2 adds and
-# 2 permutes, and in the backward sweep 2 adds of the forward sums.
-SWEEP_OPS = 4 * 7 + 4 + 12
-AGGREGATION_OPS = 2 * SWEEP_OPS + 2
-# selection_avx2.c, 16 slots to a register: `match_target_pixels` has 9 (2 max, 3 compares, 2 andnot, min, blend);
-# `first_minimum` has a min, then compare and movemask until the minimum is found, halfway in the mean.
-SELECTION_OPS = 2 * 9 + 2 * 1 + 2
+REGISTER_BYTES = {"avx2": 32, "avx512": 64}
 # Bytes of the volumes read and written per slot; that stored lines are first read into the cache is not counted.
 # Costs have 1 byte, sums 2. `aggregation` reads costs twice and sums once, and writes sums twice; `match` writes
 # costs and forward sums, and reads both, while the sums of all paths stay in the cache.
-LIMITS = {
-    "matching_cost": (COST_OPS, 1),
-    "aggregation": (AGGREGATION_OPS, 2 * 1 + 3 * 2),
-    "selection": (SELECTION_OPS, 2),
-    "match": (COST_OPS + AGGREGATION_OPS + SELECTION_OPS, 2 * (1 + 2)),
-}
-"""Kernel → vector instructions per 32 slots, and bytes of memory traffic per slot."""
+TRAFFIC = {"matching_cost": 1, "aggregation": 2 * 1 + 3 * 2, "selection": 2, "match": 2 * (1 + 2)}
+"""Kernel → bytes of memory traffic per slot."""
+
+
+def sweep_instructions(register: int, depth: int) -> float:
+    """Vector instructions per register of both sweeps, in aggregation.inc and the files that include it."""
+    # `advance` has 6 (3 min, 2 add, subtract) for each of 4 paths, and from the second register on the running
+    # minimum; `one_up` and `one_down` have 2 each; `add_paths` has 4 unpacks, 4 maddubs, 2 adds and 2 permutes,
+    # and in the backward sweep 2 adds of the forward sums.
+    return 2 * (4 * (7 - register / depth) + 4 + 12) + 2
+
+
+def instructions(version: str, name: str, depth: int) -> dict[int, float]:
+    """Vector arithmetic and shuffles per 32 slots, by bytes of a register, as the C sources have them.
+
+    Without loads, stores and what is done per pixel.
+    """
+    if name == "match":
+        steps = [instructions(version, step, depth) for step in ("matching_cost", "aggregation", "selection")]
+        return {register: sum(step.get(register, 0) for step in steps) for register in set().union(*steps)}
+    if version == "avx512" and name == "aggregation" and depth % 64:
+        return instructions("avx2", name, depth)
+    register = REGISTER_BYTES[version]
+    counts = {
+        # hamming_4 has 10 (xor, 2 and, shift, 2 shuffles, add, sad, compare, blend), 8 times; shift and or, 7
+        # times; then shuffle, extract, 2 unpacks, insert.
+        ("avx2", "matching_cost"): 8 * 10 + 7 * 2 + 5,
+        # Four times xor and popcnt; 3 shifts; ternary logic, or, permute, blend.
+        ("avx512", "matching_cost"): 4 * 2 + 3 + 4,
+        # For 16 sums match_target_pixels has 5 (shift, or, blend, 2 min); for 32 first_minimum has 2 min, 2
+        # compares, pack, permute and movemask.
+        ("avx2", "selection"): 2 * 5 + 7,
+        # The same 5 for 32 sums; a min and a compare.
+        ("avx512", "selection"): 5 + 2,
+        (version, "aggregation"): sweep_instructions(register, depth) * 32 / register,
+    }
+    return {register: counts[version, name]}
 
 
 @dataclass(frozen=True, eq=False)
@@ -320,36 +339,46 @@ def time_matchers(scene: Scene, ours: Kernel, ours_seconds: float, runs: int) ->
     ]
 
 
-def limit_mde(name: str, instructions: float, bandwidth: float) -> float:
-    """What a kernel could reach, MDE/s, with so many vector instructions and copied bytes per second."""
-    operations, traffic = LIMITS[name]
-    return min(instructions * 32 / operations, bandwidth / traffic) / 1e6
+def limit_mde(work: dict[int, float], traffic: float, throughput: dict[int, float], bandwidth: float) -> float:
+    """What a kernel could reach, MDE/s.
+
+    Parameters
+    ----------
+    work, throughput
+        Vector instructions per 32 slots, and per second, by bytes of a register.
+    traffic, bandwidth
+        Bytes read and written per slot, and copied per second.
+    """
+    seconds = sum(count / throughput[register] for register, count in work.items()) / 32
+    return 1 / max(seconds, traffic / bandwidth) / 1e6
 
 
-def print_limits(timings: Sequence[Timing]) -> None:
-    """The machine's limits, and how near to them the matching kernels come."""
-    bandwidth, instructions = copy_bandwidth(), vector_throughput()
-    operations, traffic = LIMITS["match"]
+def print_limits(version: str, timings: Sequence[Timing]) -> None:
+    """The machine's limits, and how near to them this version's matching kernels come."""
+    bandwidth, traffic = copy_bandwidth(), TRAFFIC["match"]
     print(
         f"\nCopy bandwidth, read and written: {bandwidth / 1e9:.1f} GB/s; `match` moves {traffic} bytes per ",
         end="",
     )
     print(f"slot: at most {bandwidth / traffic / 1e6:.0f} MDE/s.")
-    if isinstance(instructions, str):
-        print(f"No arithmetic bound: {instructions}.")
-        return
-    print(
-        f"Independent vector instructions: {instructions / 1e9:.1f} billion/s; `match` has {operations} per ",
-        end="",
-    )
-    print(f"32 slots (cost {COST_OPS}, sweeps {AGGREGATION_OPS}, selection {SELECTION_OPS}): at most ", end="")
-    print(f"{instructions * 32 / operations / 1e6:.0f} MDE/s.\n")
+    throughput: dict[int, float] = {}
+    for register in sorted(size for size in REGISTER_BYTES.values() if size <= REGISTER_BYTES[version]):
+        measured = vector_throughput(register)
+        if isinstance(measured, str):
+            print(f"No arithmetic bound: {measured}.")
+            return
+        throughput[register] = measured
+        print(f"Independent vector instructions of {register} bytes: {measured / 1e9:.1f} billion/s.")
+    print()
     rows = []
     for timing in timings:
-        limit = limit_mde(timing.name, instructions, bandwidth)
+        depth = timing.depth or 0
+        work = instructions(version, timing.name, depth)
+        limit = limit_mde(work, TRAFFIC[timing.name], throughput, bandwidth)
+        counts = " + ".join(f"{count:.0f} x {register}" for register, count in sorted(work.items()))
         share = f"{100 * timing.speed / limit:.0f} %"
-        rows.append([timing.name, str(timing.depth), f"{timing.speed:.0f}", f"{limit:.0f}", share])
-    print(table(["kernel", "disparities", "MDE/s", "bound, MDE/s", "share"], rows))
+        rows.append([timing.name, str(depth), counts, f"{timing.speed:.0f}", f"{limit:.0f}", share])
+    print(table(["kernel", "disparities", "per 32 slots", "MDE/s", "bound, MDE/s", "share"], rows))
     print(
         "\nThe rest: loads and stores, what is done per pixel (penalties, horizontal minima, shifted ranges, "
         "sub-pixel fit), shuffles that fewer units can do, and each pixel's wait for the one before it on its row."
@@ -378,8 +407,8 @@ def bench(width: int, height: int, disparities: int, runs: int) -> None:
     print(table(header, comparison))
     if share < 0.95:
         print(f"\nOnly {100 * share:.0f} % of the time on a processor: other programs share its caches, too.")
-    if backends[0] == "avx2":
-        print_limits([timing for timing in timings if timing.depth])
+    if backends[0] in REGISTER_BYTES:
+        print_limits(backends[0], [timing for timing in timings if timing.depth])
 
 
 def main() -> None:

@@ -247,7 +247,7 @@ def spoiled(value: Any, others: Arguments, rng: Random) -> Any:
         return FLOATS[int(rng.integers(len(FLOATS)))]
     if isinstance(value, tuple):
         return [value[:1], (*value, 1.0), (None, None), list(value), (np.nan, np.inf)][int(rng.integers(5))]
-    return ["", "avx512", "scalar\0", "é" * 1000][int(rng.integers(4))]
+    return ["", "avx1024", "scalar\0", "é" * 1000][int(rng.integers(4))]
 
 
 def spoiled_array(array: np.ndarray, others: Arguments, rng: Random) -> Any:

@@ -17,20 +17,34 @@ _VECTOR_PROGRAM = r"""
 #include <stdio.h>
 #include <time.h>
 
-#define TWELVE(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7) DO(8) DO(9) DO(10) DO(11)
-#define START(i) __m256i v##i = _mm256_set1_epi8((char)(argc + i));
-#define STEP(i) \
-    v##i = _mm256_add_epi8(_mm256_min_epu8(v##i, limit), one); \
-    __asm__ volatile("" : "+x"(v##i));
-#define GATHER(i) sum = _mm256_xor_si256(sum, v##i);
+#if BYTES == 64
+typedef __m512i vector;
+#define SET _mm512_set1_epi8
+#define MIN _mm512_min_epu8
+#define ADD _mm512_add_epi8
+#define XOR _mm512_xor_si512
+#define LOW(v) _mm_cvtsi128_si32(_mm512_castsi512_si128(v))
+#define SUPPORTED __builtin_cpu_supports("avx512bw")
+#else
+typedef __m256i vector;
+#define SET _mm256_set1_epi8
+#define MIN _mm256_min_epu8
+#define ADD _mm256_add_epi8
+#define XOR _mm256_xor_si256
+#define LOW(v) _mm_cvtsi128_si32(_mm256_castsi256_si128(v))
+#define SUPPORTED __builtin_cpu_supports("avx2")
+#endif
 
-int main(int argc, char **argv) {
-    (void)argv;
-    if (!__builtin_cpu_supports("avx2")) {
-        return 2;
-    }
+#define TWELVE(DO) DO(0) DO(1) DO(2) DO(3) DO(4) DO(5) DO(6) DO(7) DO(8) DO(9) DO(10) DO(11)
+#define START(i) vector v##i = SET((char)(argc + i));
+#define STEP(i) \
+    v##i = ADD(MIN(v##i, limit), one); \
+    __asm__ volatile("" : "+x"(v##i));
+#define GATHER(i) sum = XOR(sum, v##i);
+
+static int run(int argc) {
     const long rounds = 100000000;
-    const __m256i limit = _mm256_set1_epi8((char)(argc + 200)), one = _mm256_set1_epi8((char)argc);
+    const vector limit = SET((char)(argc + 200)), one = SET((char)argc);
     TWELVE(START)
     struct timespec start, end;
     clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &start);
@@ -38,14 +52,20 @@ int main(int argc, char **argv) {
         TWELVE(STEP)
     }
     clock_gettime(CLOCK_PROCESS_CPUTIME_ID, &end);
-    __m256i sum = _mm256_setzero_si256();
+    vector sum = SET(0);
     TWELVE(GATHER)
     const double seconds = (double)(end.tv_sec - start.tv_sec) + 1e-9 * (double)(end.tv_nsec - start.tv_nsec);
     /* The sum is printed so that the work cannot be left out. */
-    printf("%.6g %d\n", 24.0 * (double)rounds / seconds, _mm256_extract_epi8(sum, 0));
+    printf("%.6g %d\n", 24.0 * (double)rounds / seconds, LOW(sum));
     return 0;
 }
+
+int main(int argc, char **argv) {
+    (void)argv;
+    return SUPPORTED ? run(argc) : 2;
+}
 """
+_FLAGS = {32: ("AVX2", "-mavx2"), 64: ("AVX-512", "-mavx512bw")}
 
 
 def copy_bandwidth(runs: int = 5) -> float:
@@ -60,25 +80,35 @@ def copy_bandwidth(runs: int = 5) -> float:
     return 2 * _COPY_BYTES / min(seconds)
 
 
-def vector_throughput(runs: int = 3) -> float | str:
-    """Independent 32-byte vector instructions per second of one core, the best of `runs`; or why that is unknown.
+def vector_throughput(register: int, runs: int = 3) -> float | str:
+    """Independent vector instructions per second of one core, the best of `runs`; or why that is unknown.
+
+    Parameters
+    ----------
+    register : int
+        Bytes of a vector: 32 or 64.
+    runs : int
+        Times to measure.
 
     Returns
     -------
     float or str
-        Instructions per second, or a sentence where there is no C compiler or no AVX2.
+        Instructions per second, or a sentence where there is no C compiler or no such vector.
     """
     compiler = shutil.which("cc")
     if compiler is None:
         return "there is no C compiler (cc)"
+    name, flag = _FLAGS[register]
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "vectors"
         source = program.with_suffix(".c")
         source.write_text(_VECTOR_PROGRAM, encoding="utf-8")
-        built = subprocess.run([compiler, "-O2", "-mavx2", source, "-o", program], capture_output=True)
+        built = subprocess.run(
+            [compiler, "-O2", flag, f"-DBYTES={register}", source, "-o", program], capture_output=True
+        )
         if built.returncode:
-            return "the C compiler knows no AVX2"
+            return f"the C compiler knows no {name}"
         results = [subprocess.run([program], capture_output=True, text=True) for _ in range(runs)]
     if any(result.returncode for result in results):
-        return "the processor has no AVX2"
+        return f"the processor has no {name}"
     return max(float(result.stdout.split()[0]) for result in results)

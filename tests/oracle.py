@@ -122,7 +122,7 @@ def _offset_plane(differences, inside):
     if n < 6 or determinant <= 0:
         return None
     solution = [sum(cofactor(r, k) * right_side[k] for k in range(3)) * (256.0 / determinant) for r in range(3)]
-    return None if max(map(abs, solution)) > 256 * 512 * 5 else [int(np.trunc(value)) for value in solution]
+    return None if max(map(abs, solution)) >= 256 * 512 * 5 else [int(np.trunc(value)) for value in solution]
 
 
 def _costs_around(offset, reference, target, y, x):

@@ -51,7 +51,7 @@ def test_the_pair_has_its_disparities(kernels, same_range):
 
 def test_the_whole_benchmark_of_kernels(kernels, monkeypatch, capsys):
     monkeypatch.setattr(kernels, "copy_bandwidth", lambda: 6e9)
-    monkeypatch.setattr(kernels, "vector_throughput", lambda: "there is no compiler")
+    monkeypatch.setattr(kernels, "vector_throughput", lambda register: "there is no compiler")
     arguments = ["bench_kernels.py", "--width", "200", "--height", "60", "--disparities", "96", "--runs", "1"]
     monkeypatch.setattr(sys, "argv", arguments)
     kernels.main()
@@ -64,7 +64,7 @@ def test_the_whole_benchmark_of_kernels(kernels, monkeypatch, capsys):
         right = re.search(rf"^\| colmap_sph match \| {depth} \| ([\d.]+) \|", printed, re.MULTILINE)
         assert right and float(right[1]) > 60
         assert re.search(rf"^\| OpenCV MODE_HH \| {depth} \|.*\| 1\.00 \|$", printed, re.MULTILINE)
-    if "avx2" in _native.backends():
+    if _native.backends()[0] != "scalar":
         assert "6.0 GB/s; `match` moves 6 bytes per slot: at most 1000 MDE/s." in printed
         assert "No arithmetic bound: there is no compiler." in printed
 
@@ -89,20 +89,33 @@ def test_a_version_that_writes_nothing_ends_the_benchmark(kernels):
         kernels.check_equality(kernel, ["fast", "slow"])
 
 
-def test_the_nearer_limit_bounds(kernels, monkeypatch):
-    monkeypatch.setitem(kernels.LIMITS, "match", (200, 6))
-    assert kernels.limit_mde("match", 10e9, 24e9) == pytest.approx(1600)  # 10e9 * 32 / 200 slots per second
-    assert kernels.limit_mde("match", 10e9, 6e9) == pytest.approx(1000)
+def test_the_nearer_limit_bounds(kernels):
+    throughput = {32: 10e9, 64: 5e9}
+    assert kernels.limit_mde({32: 200}, 6, throughput, 24e9) == pytest.approx(1600)  # 10e9 * 32 / 200 per second
+    assert kernels.limit_mde({32: 100, 64: 50}, 6, throughput, 24e9) == pytest.approx(1600)
+    assert kernels.limit_mde({32: 200}, 6, throughput, 6e9) == pytest.approx(1000)
 
 
-def test_limits_are_measured():
+@pytest.mark.parametrize("version", ["avx2", "avx512"])
+@pytest.mark.parametrize("depth", [32, 64, 96, 128])
+def test_the_matcher_has_its_steps_instructions(kernels, version, depth):
+    steps = [kernels.instructions(version, name, depth) for name in ("matching_cost", "aggregation", "selection")]
+    match = kernels.instructions(version, "match", depth)
+    assert sum(match.values()) == pytest.approx(sum(sum(step.values()) for step in steps))
+    # 32 slots fill half a register of 64 bytes: sweeps of such depths have AVX2's.
+    assert (32 in match) == (version == "avx2" or depth % 64 == 32)
+    assert (64 in match) == (version == "avx512")
+
+
+@pytest.mark.parametrize(("register", "version"), [(32, "avx2"), (64, "avx512")])
+def test_limits_are_measured(register, version):
     limits = importlib.import_module("machine_limits")
     assert 1e8 < limits.copy_bandwidth(runs=1) < 1e13
-    instructions = limits.vector_throughput(runs=1)
-    if "avx2" not in _native.backends():
+    instructions = limits.vector_throughput(register, runs=1)
+    if version in _native.backends():
+        assert isinstance(instructions, str) or 1e8 < instructions < 1e11
+    elif register == 32:
         assert isinstance(instructions, str)
-    elif not isinstance(instructions, str):
-        assert 1e8 < instructions < 1e11
 
 
 # ---- pipeline ----------------------------------------------------------------------------------------------

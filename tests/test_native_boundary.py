@@ -364,7 +364,7 @@ def test_wrong_number_of_arguments_is_refused(function):
 
 
 @pytest.mark.parametrize("function", MATCHING)
-@pytest.mark.parametrize("backend", ["", "AVX2", "avx512", "scalar ", "scälar"])
+@pytest.mark.parametrize("backend", ["", "AVX2", "avx1024", "scalar ", "scälar"])
 def test_unknown_backend_is_refused(function, backend):
     with pytest.raises(ValueError, match="no kernels named"):
         call(function, {**arguments(function), "backend": backend})

@@ -50,7 +50,7 @@ int sweep_begin_scalar(sweep_state *state, const int32_t *base, const uint8_t *i
 }
 
 /* The four paths that come from pixels already visited, top-left to bottom-right or back. */
-void sweep_row_scalar(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
+static void sweep_row(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
                       uint16_t *sums_out) {
     const ptrdiff_t step = s->backward ? -1 : 1, width = s->size.width, depth = s->size.depth;
     uint8_t *rows[2][4]; /* [this row or the one before][path] */
@@ -79,4 +79,13 @@ void sweep_row_scalar(sweep_state *s, ptrdiff_t y, const uint8_t *cost, const ui
         }
     }
     s->done++;
+}
+
+void sweep_rows_scalar(sweep_state *s, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost, const uint16_t *sums_in,
+                       uint16_t *sums_out) {
+    const ptrdiff_t step = s->backward ? -1 : 1;
+    for (ptrdiff_t r = 0; r < rows; r++) {
+        const ptrdiff_t row = r * step * s->size.width * s->size.depth;
+        sweep_row(s, y + r * step, cost + row, s->backward ? sums_in + row : NULL, sums_out + row);
+    }
 }

@@ -4,7 +4,7 @@
 
 /* The kernels on whole images that are made of row kernels. */
 #define WHOLE_IMAGES(version) \
-    static const row_kernels rows_##version = {cost_row_##version, sweep_begin_##version, sweep_row_##version, \
+    static const row_kernels rows_##version = {cost_row_##version, sweep_begin_##version, sweep_rows_##version, \
                                                selection_row_##version}; \
     static int cost_##version(const uint64_t *reference, const uint64_t *target, const int32_t *base, \
                               match_size size, uint8_t *cost) { \
@@ -49,6 +49,20 @@ static int has_avx2(void) {
 }
 #endif
 
+#ifdef COLMAP_SPH_HAVE_AVX512
+#define census_avx512 census_avx2
+#define depth_candidates_avx512 depth_candidates_avx2
+WHOLE_IMAGES(avx512)
+static const kernel_table avx512_kernels = TABLE(avx512);
+
+static int has_avx512(void) {
+    __builtin_cpu_init();
+    return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
+           __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
+           __builtin_cpu_supports("avx512vbmi") && __builtin_cpu_supports("avx512vpopcntdq");
+}
+#endif
+
 const kernel_table *kernels_by_name(const char *name) {
     if (strcmp(name, "scalar") == 0) {
         return &scalar_kernels;
@@ -58,10 +72,21 @@ const kernel_table *kernels_by_name(const char *name) {
         return &avx2_kernels;
     }
 #endif
+#ifdef COLMAP_SPH_HAVE_AVX512
+    if (strcmp(name, "avx512") == 0 && has_avx512()) {
+        return &avx512_kernels;
+    }
+#endif
     return NULL;
 }
 
 const kernel_table *kernels_best(void) {
-    const kernel_table *table = kernels_by_name("avx2");
-    return table ? table : &scalar_kernels;
+    const char *names[] = {"avx512", "avx2"};
+    for (size_t k = 0; k < sizeof names / sizeof *names; k++) {
+        const kernel_table *table = kernels_by_name(names[k]);
+        if (table) {
+            return table;
+        }
+    }
+    return &scalar_kernels;
 }

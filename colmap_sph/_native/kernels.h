@@ -31,7 +31,7 @@ typedef struct {
     ptrdiff_t height, width, target_width, depth;
 } match_size;
 
-/* ---- kernels with a scalar and an AVX2 version, equal to the bit ------------------------------------------- */
+/* ---- kernels with versions per instruction set, equal to the bit ------------------------------------------- */
 
 /* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}; bit set where the neighbour is darker. */
 typedef void census_fn(const uint8_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
@@ -142,13 +142,10 @@ typedef struct {
 } kernel_table;
 
 census_fn census_scalar, census_avx2;
-refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2;
+refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2, refine_offsets_avx512;
 depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
-fit_planes_fn fit_planes_scalar, fit_planes_avx2;
-add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2;
-
-/* The sub-pixel curve, shared by both versions of the selection: minimum of three aggregated costs. */
-int32_t subpixel_offset(uint16_t before, uint16_t best, uint16_t after);
+fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512;
+add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512;
 
 /* The table of this name, NULL when the processor or the build has no such version. */
 const kernel_table *kernels_by_name(const char *name);

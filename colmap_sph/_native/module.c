@@ -54,7 +54,7 @@ static PyObject *py_backends(PyObject *self, PyObject *args) {
     (void)self;
     (void)args;
     PyObject *names = PyList_New(0);
-    const char *known[] = {"avx2", "scalar"};
+    const char *known[] = {"avx512", "avx2", "scalar"};
     for (size_t k = 0; names && k < sizeof known / sizeof *known; k++) {
         PyObject *name = kernels_by_name(known[k]) ? PyUnicode_FromString(known[k]) : NULL;
         if (name && PyList_Append(names, name)) {

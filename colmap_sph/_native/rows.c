@@ -4,19 +4,19 @@
 #include <string.h>
 
 uint64_t *cost_row_buffer(match_size size) {
-    const ptrdiff_t padded_width = size.target_width + 2 * size.depth;
-    uint64_t *buffer = malloc((size_t)padded_width * sizeof *buffer);
-    for (ptrdiff_t i = 0; buffer && i < padded_width; i++) {
-        buffer[i] = CENSUS_INVALID;
+    const ptrdiff_t padded_width = size.target_width + 2 * size.depth, bits = padded_width / 64 + 2;
+    uint64_t *buffer = malloc((size_t)(padded_width + bits) * sizeof *buffer);
+    for (ptrdiff_t i = 0; buffer && i < padded_width + bits; i++) {
+        buffer[i] = i < padded_width ? CENSUS_INVALID : 0;
     }
     return buffer;
 }
 
 int selection_begin(selection_buffers *buffers, match_size size) {
-    /* One more: no target pixel at all must not look like no memory. */
-    buffers->least = malloc(((size_t)size.target_width * 2 + 1) * sizeof *buffers->least);
-    buffers->best_column = buffers->least ? buffers->least + size.target_width : NULL;
-    return buffers->least ? 0 : -1;
+    const ptrdiff_t keys = (size.target_width + 2 * size.depth + 1) / 2 * 2;
+    buffers->keys = malloc((size_t)(keys + size.width) * sizeof *buffers->keys);
+    buffers->winner = buffers->keys ? (int32_t *)(buffers->keys + keys) : NULL;
+    return buffers->keys ? 0 : -1;
 }
 
 int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
@@ -38,9 +38,10 @@ int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_
         if (kernels->sweep_begin(&state, base, image, size, penalties, backward)) {
             return -1;
         }
-        for (ptrdiff_t n = 0; n < size.height; n++) {
-            const ptrdiff_t y = backward ? size.height - 1 - n : n, row = y * size.width * size.depth;
-            kernels->sweep_row(&state, y, cost + row, backward ? aggregated + row : NULL, aggregated + row);
+        const ptrdiff_t y = backward ? size.height - 1 : 0, row = y * size.width * size.depth;
+        if (size.height > 0) {
+            kernels->sweep_rows(&state, y, size.height, cost + row, backward ? aggregated + row : NULL,
+                                aggregated + row);
         }
         free(state.memory);
     }
@@ -60,7 +61,7 @@ int select_rows(const row_kernels *kernels, const uint16_t *aggregated, const in
                                target + y * size.target_width, size, max_left_right_difference, &buffers,
                                offset + row);
     }
-    free(buffers.least);
+    free(buffers.keys);
     return 0;
 }
 
@@ -77,47 +78,60 @@ typedef struct {
     uint8_t *checkpoints; /* what the forward sweep brings to each band but the first */
 } matcher;
 
-static void forward_row(matcher *m, ptrdiff_t y, uint8_t *cost, uint16_t *sums) {
+/* A group is as many rows as are swept at once and still are in the cache for the next step. */
+enum { GROUP = 2 };
+
+static void forward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost, uint16_t *sums) {
     const match_input *in = m->input;
-    m->kernels->cost_row(in->reference + y * in->size.width, in->target + y * in->size.target_width,
-                         in->base + y * in->size.width, in->size, m->cost_buffer, cost);
-    m->kernels->sweep_row(&m->forward, y, cost, NULL, sums);
+    for (ptrdiff_t r = y; r < y + rows; r++) {
+        m->kernels->cost_row(in->reference + r * in->size.width, in->target + r * in->size.target_width,
+                             in->base + r * in->size.width, in->size, m->cost_buffer,
+                             cost + (r - y) * m->row_size);
+    }
+    m->kernels->sweep_rows(&m->forward, y, rows, cost, NULL, sums);
 }
 
-static void backward_row(matcher *m, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums, int32_t *offset) {
+/* Rows up to y, whose costs and sums are given. */
+static void backward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost, const uint16_t *sums,
+                          int32_t *offset) {
     const match_input *in = m->input;
-    const ptrdiff_t row = y * in->size.width;
-    m->kernels->sweep_row(&m->backward, y, cost, sums, m->row_sums);
-    m->kernels->selection_row(m->row_sums, in->base + row, in->reference + row,
-                              in->target + y * in->size.target_width, in->size, in->max_left_right_difference,
-                              &m->selection, offset + row);
+    uint16_t *row_sums = m->row_sums + (rows - 1) * m->row_size;
+    m->kernels->sweep_rows(&m->backward, y, rows, cost, sums, row_sums);
+    for (ptrdiff_t r = 0; r < rows; r++) {
+        const ptrdiff_t row = (y - r) * in->size.width;
+        m->kernels->selection_row(row_sums - r * m->row_size, in->base + row, in->reference + row,
+                                  in->target + (y - r) * in->size.target_width, in->size,
+                                  in->max_left_right_difference, &m->selection, offset + row);
+    }
 }
+
+static ptrdiff_t lesser(ptrdiff_t a, ptrdiff_t b) { return a < b ? a : b; }
 
 /* The last band first. Its forward sweep starts from what was noted when the rows above it were swept for that
  * alone: the result is that of one piece, to the bit. */
 static void match_bands(matcher *m, ptrdiff_t bands, uint16_t *sums, int32_t *offset) {
     const ptrdiff_t height = m->input->size.height, row_size = m->row_size;
     uint8_t *cost = (uint8_t *)(sums + m->band_rows * row_size);
-    for (ptrdiff_t y = 0; y < (bands - 1) * m->band_rows; y++) {
-        forward_row(m, y, cost, sums);
-        if ((y + 1) % m->band_rows == 0) {
-            const size_t band = (size_t)(y / m->band_rows);
-            memcpy(m->checkpoints + band * m->forward.memory_size, m->forward.memory, m->forward.memory_size);
+    for (ptrdiff_t band = 0; band < bands - 1; band++) {
+        const ptrdiff_t first = band * m->band_rows;
+        for (ptrdiff_t n = 0; n < m->band_rows; n += GROUP) {
+            forward_rows(m, first + n, lesser(GROUP, m->band_rows - n), cost, sums);
         }
+        memcpy(m->checkpoints + (size_t)band * m->forward.memory_size, m->forward.memory, m->forward.memory_size);
     }
     for (ptrdiff_t band = bands - 1; band >= 0; band--) {
-        const ptrdiff_t first = band * m->band_rows;
-        const ptrdiff_t end = first + m->band_rows < height ? first + m->band_rows : height;
+        const ptrdiff_t first = band * m->band_rows, count = lesser(m->band_rows, height - first);
         m->forward.done = first;
         if (band > 0) {
             memcpy(m->forward.memory, m->checkpoints + (size_t)(band - 1) * m->forward.memory_size,
                    m->forward.memory_size);
         }
-        for (ptrdiff_t y = first; y < end; y++) {
-            forward_row(m, y, cost + (y - first) * row_size, sums + (y - first) * row_size);
+        for (ptrdiff_t n = 0; n < count; n += GROUP) {
+            forward_rows(m, first + n, lesser(GROUP, count - n), cost + n * row_size, sums + n * row_size);
         }
-        for (ptrdiff_t y = end - 1; y >= first; y--) {
-            backward_row(m, y, cost + (y - first) * row_size, sums + (y - first) * row_size, offset);
+        for (ptrdiff_t n = count; n > 0; n -= lesser(GROUP, n)) {
+            backward_rows(m, first + n - 1, lesser(GROUP, n), cost + (n - 1) * row_size, sums + (n - 1) * row_size,
+                          offset);
         }
     }
 }
@@ -132,7 +146,7 @@ int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band
         !kernels->sweep_begin(&m.backward, in->base, in->image, in->size, in->penalties, 1) &&
         !selection_begin(&m.selection, in->size)) {
         m.cost_buffer = cost_row_buffer(in->size);
-        m.row_sums = malloc(((size_t)m.row_size + 1) * sizeof *m.row_sums);
+        m.row_sums = malloc(((size_t)(m.row_size * GROUP) + 1) * sizeof *m.row_sums);
         m.checkpoints = malloc((size_t)(bands > 1 ? bands - 1 : 1) * m.forward.memory_size);
         if (m.cost_buffer && m.row_sums && m.checkpoints) {
             match_bands(&m, bands, scratch, offset);
@@ -142,7 +156,7 @@ int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band
     free(m.checkpoints);
     free(m.row_sums);
     free(m.cost_buffer);
-    free(m.selection.least);
+    free(m.selection.keys);
     free(m.backward.memory);
     free(m.forward.memory);
     return status;

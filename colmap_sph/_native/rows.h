@@ -1,5 +1,5 @@
-/* The matching kernels row by row, scalar and AVX2, so that the matcher can pass rows from one to the next while
- * in cache. All pointers to pixels are to the row in question unless said otherwise. */
+/* The matching kernels row by row, so that the matcher can pass rows from one to the next while in cache.
+ * All pointers to pixels are to the row in question unless said otherwise. */
 #ifndef COLMAP_SPH_ROWS_H
 #define COLMAP_SPH_ROWS_H
 
@@ -10,7 +10,7 @@
 /* Costs of one row, `size.width * size.depth` of them; `buffer` is one of cost_row_buffer. */
 typedef void cost_row_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
                          uint64_t *buffer, uint8_t *cost);
-/* Room for one target row with `depth` unseen pixels on both sides; NULL without memory. */
+/* One target row with `depth` unseen pixels on both sides, and a bit for each, which is 0; NULL without memory. */
 uint64_t *cost_row_buffer(match_size size);
 
 /* ---- path aggregation -------------------------------------------------------------------------------------- */
@@ -31,36 +31,45 @@ typedef struct {
 /* 0, or -1 without memory; ended by free(state->memory). */
 typedef int sweep_begin_fn(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
                            path_penalties penalties, int backward);
-/* The next row, y: sums_out = sums_in (NULL: 0) + the four paths. */
-typedef void sweep_row_fn(sweep_state *state, ptrdiff_t y, const uint8_t *cost, const uint16_t *sums_in,
-                          uint16_t *sums_out);
+/* The next `rows` rows, from y on: sums_out = the four paths of a forward sweep, sums_in + those of a backward
+ * one, whose rows lie before the one that the pointers are to. */
+typedef void sweep_rows_fn(sweep_state *state, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost,
+                           const uint16_t *sums_in, uint16_t *sums_out);
 
 /* ---- selection --------------------------------------------------------------------------------------------- */
 
-/* Of every target pixel: the least sum that points at it, and from which column. */
+/* Of every target pixel the least sum that points at it, and from which column, as one number: sum << 16 | column.
+ * Of equal sums the leftmost wins, in whatever order they come. */
 typedef struct {
-    uint16_t *least, *best_column;
+    uint32_t *keys;  /* room for a target row with `depth` pixels on both sides, in any order, */
+    int32_t *winner; /* and for a number per pixel */
 } selection_buffers;
 
-/* 0, or -1 without memory; ended by free(buffers->least). */
+#define NO_KEY UINT32_C(0xffff0000) /* which a sum of 65535 never beats */
+
+/* 0, or -1 without memory; ended by free(buffers->keys). */
 int selection_begin(selection_buffers *buffers, match_size size);
 typedef void selection_row_fn(const uint16_t *sums, const int32_t *base, const uint64_t *reference,
                               const uint64_t *target, match_size size, int32_t max_left_right_difference,
                               selection_buffers *buffers, int32_t *offset);
+
+/* The second half of selection_row_avx2, which AVX-512 has, too: what is left of `buffers->winner`, refined. */
+void check_winners_avx2(const uint16_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+                        int32_t max_left_right_difference, const selection_buffers *buffers, int32_t *offset);
 
 /* ---- whole images from rows -------------------------------------------------------------------------------- */
 
 typedef struct {
     cost_row_fn *cost_row;
     sweep_begin_fn *sweep_begin;
-    sweep_row_fn *sweep_row;
+    sweep_rows_fn *sweep_rows;
     selection_row_fn *selection_row;
 } row_kernels;
 
-cost_row_fn cost_row_scalar, cost_row_avx2;
-sweep_begin_fn sweep_begin_scalar, sweep_begin_avx2;
-sweep_row_fn sweep_row_scalar, sweep_row_avx2;
-selection_row_fn selection_row_scalar, selection_row_avx2;
+cost_row_fn cost_row_scalar, cost_row_avx2, cost_row_avx512;
+sweep_begin_fn sweep_begin_scalar, sweep_begin_avx2, sweep_begin_avx512;
+sweep_rows_fn sweep_rows_scalar, sweep_rows_avx2, sweep_rows_avx512;
+selection_row_fn selection_row_scalar, selection_row_avx2, selection_row_avx512;
 
 int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
                  const int32_t *base, match_size size, uint8_t *cost);
