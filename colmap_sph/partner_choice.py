@@ -17,9 +17,9 @@ from colmap_sph.scene import View
 # something may hide it, is worth the rest.
 _OBSERVED = 0.5
 # What is left of a point's worth with each partner that sees it well.
-_SEEN_AGAIN = 0.4
+_SEEN_AGAIN = 0.2
 # Parallax angles in degrees: matched best between the middle two, worth nothing beyond the outer two.
-_ANGLES = (0.0, 6.0, 55.0, 65.0)
+_ANGLES = (0.0, 6.0, 40.0, 70.0)
 
 
 def triangulation_angles(
