@@ -96,8 +96,9 @@ class Scene:
     points : (N, 3) float64 ndarray
         Sparse points in the world frame, in model units.
     origin : (3,) float64 ndarray
-        Where the scene's world origin lies in the model's coordinates: zero, but for a model in map
-        coordinates, whose scene is moved near its origin.
+        What the cloud's coordinates are relative to: zero, but for a model in map coordinates a point near it.
+    anchor : (3,) float64 ndarray
+        Where the scene's own origin lies, relative to `origin`: zero as read; see `anchor.anchored`.
     image_ids : tuple of int
         COLMAP's ids of all registered images of the model, in its order, the unusable ones among them.
     """
@@ -105,6 +106,7 @@ class Scene:
     views: tuple[View, ...]
     points: NDArray[np.float64]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    anchor: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     image_ids: tuple[int, ...] = ()
 
     @cached_property
@@ -157,7 +159,7 @@ def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
     if not usable:
         raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
     views_by_name = tuple(sorted(usable, key=lambda view: view.name))
-    return Scene(views_by_name, points - origin, origin, tuple(model.reg_image_ids()))
+    return Scene(views_by_name, points - origin, origin, image_ids=tuple(model.reg_image_ids()))
 
 
 def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
