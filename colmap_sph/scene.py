@@ -8,7 +8,7 @@ the first pixel's centre is at (0.5, 0.5).
 import logging
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pycolmap
@@ -190,8 +190,7 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         model = pycolmap.Reconstruction()
         (model.read_binary if binary else model.read_text)(sparse_dir)
         registered = model.reg_image_ids()
-        for image_id in registered:
-            _ = model.image(image_id).name
+        names = [model.image(image_id).name for image_id in registered]
     except UnicodeDecodeError as error:
         raise InputError(
             f"The model in {sparse_dir} has the image name {error.object!r}, which is not UTF-8; "
@@ -205,7 +204,23 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         raise InputError(
             f"The model in {sparse_dir} has no registered image; run COLMAP's mapper or give another model."
         )
+    _check_names(names, sparse_dir)
     return model
+
+
+def _check_names(names: list[str], sparse_dir: Path) -> None:
+    """Every image needs a place of its own; COLMAP ends the process where one lies in the other's."""
+    known = set(names)
+    if len(known) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"The model in {sparse_dir} has two images named {twice!r}; rename one of them.")
+    for name in names:
+        inside = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in known), None)
+        if inside is not None:
+            raise InputError(
+                f"The model in {sparse_dir} has the images {inside!r} and {name!r}, "
+                "and a file cannot be a folder; rename one of them."
+            )
 
 
 def image_names(model: pycolmap.Reconstruction) -> list[str]:
@@ -244,12 +259,16 @@ def make_pinhole(camera: pycolmap.Camera) -> None:
 def model_files(sparse_dir: Path) -> list[Path]:
     """Return the files that make up the model in a folder; `InputError` where they are not complete."""
     if not sparse_dir.is_dir():
-        raise InputError(f"The model folder {sparse_dir} does not exist; give the folder of a COLMAP model.")
+        is_file = sparse_dir.is_file()
+        raise InputError(
+            f"The model folder {sparse_dir} {'is a file' if is_file else 'does not exist'}; "
+            "give the folder of a COLMAP model."
+        )
     for extension in (".bin", ".txt"):
         if all((sparse_dir / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
             files = [sparse_dir / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
             return [path for path in files if path.is_file()]
-    inside = sorted(child for child in sparse_dir.glob("*/") if (child / "cameras.bin").is_file())
+    inside = sorted(path.parent for depth in ("*", "*/*") for path in sparse_dir.glob(f"{depth}/cameras.bin"))
     hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
     raise InputError(
         f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
