@@ -6,7 +6,8 @@ on a grid: far coarser than a nanometre, and far finer than any poses are known.
 
 The grid is counted from one of the cameras, since one counted from the model's origin would not move along with
 the model. A camera within a nanometre of the border between two places of the grid can still come out in the
-other one, and its maps then differ in some pixels: in a model of 11 images with pixels of 5 mm, once in 500.
+other one, and its maps then differ in some pixels: of 4000 models of 11 images, whose pixels cover 2 mm, moved
+to random UTM coordinates, 11 had such a camera.
 """
 
 from dataclasses import replace
