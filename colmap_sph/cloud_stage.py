@@ -142,7 +142,7 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
         def work(name: str) -> Done:
             view = scene.view(name)
             with gate.reserve(FUSE_BYTES * view.width * view.height, name):
-                bands = fuse_view(maps.get(name), partners(name), options.fusion)
+                bands = fuse_view(maps.get(name), partners(name), options.fusion, scene.anchor)
                 return Done(state.key, made=True, points=write_part(stems[name], bands))
 
         done = context.for_all("fuse", work, state.names, context.skip_view)

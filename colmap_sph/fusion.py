@@ -138,7 +138,10 @@ def read_view_maps(workspace: Workspace, view: View, index: int, kind: MapKind, 
 
 
 def fuse_view(
-    reference: ViewMaps, partners: Iterable[ViewMaps], options: FusionOptions
+    reference: ViewMaps,
+    partners: Iterable[ViewMaps],
+    options: FusionOptions,
+    offset: NDArray[np.float64] | float = 0.0,
 ) -> Iterator[tuple[NDArray[np.void], NDArray[np.uint32]]]:
     """Make the points of a cloud which one view sees better than any other.
 
@@ -154,11 +157,13 @@ def fuse_view(
     partners : iterable of ViewMaps
         At most 64 are looked at, one after the other.
     options : FusionOptions
+    offset : (3,) float64 ndarray or 0
+        Added to the points before they become 32-bit floats.
 
     Yields
     ------
     points : (n,) ndarray of `cloud_files.POINT`
-        World frame; the colour is the mean over the views that agree.
+        World frame and `offset`; the colour is the mean over the views that agree.
     visibility : (m,) uint32 ndarray
         For each point the number of these views and their indices: ``fused.ply.vis``.
     """
@@ -190,7 +195,8 @@ def fuse_view(
         )
     view, step = reference.view, max(_BAND_PIXELS // shape[1], 1)
     pixels = (reference.depth, reference.normals, covered, agreeing, colour, options.min_num_pixels)
-    frame = (np.ascontiguousarray(view.R.T @ np.linalg.inv(view.K)), np.ascontiguousarray(view.R.T), view.center)
+    world_from_pixel, world_from_camera = view.R.T @ np.linalg.inv(view.K), view.R.T
+    frame = (np.ascontiguousarray(world_from_pixel), np.ascontiguousarray(world_from_camera), view.center + offset)
     for first in range(0, shape[0], step):
         rows = (first, min(first + step, shape[0]))
         num_points, num_words = _native.count_points(*pixels, *rows)

@@ -85,7 +85,10 @@ def read_originals(model_dir: Path, image_dir: Path | None, mask_dir: Path | Non
     if image_dir is None:
         image_dir = find_images(model_dir, image_names(model))
     elif not image_dir.is_dir():
-        raise InputError(f"The image folder {image_dir} does not exist; check --images.")
+        is_file = image_dir.is_file()
+        raise InputError(
+            f"The image folder {image_dir} {'is a file' if is_file else 'does not exist'}; check --images."
+        )
     return Originals(model_dir, image_dir, mask_dir, model)
 
 

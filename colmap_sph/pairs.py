@@ -360,6 +360,8 @@ def _report(selection: PairSelection, options: PairOptions) -> None:
         "patch-match.cfg": "patch-match.cfg",
     }
     num_unique = len(selection.unique_pairs())
+    if num_unique == 0 and selection.source == "patch-match.cfg":
+        raise NoResultError("No pair of the model's usable images comes of patch-match.cfg; mend or delete it.")
     if num_unique == 0:
         raise NoResultError(
             f"No pair of images overlaps, going by {words[selection.source]}: at least "

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, replace
 from pathlib import Path
 
+from colmap_sph.anchor import anchored
 from colmap_sph.claim import claimed
 from colmap_sph.cloud_stage import fuse_views
 from colmap_sph.context import Context, timed_stage
@@ -160,7 +161,7 @@ def reconstruct(
     progress, report = Silent() if progress is None else progress, report or RunReport()
     make_dir(workspace.state_dir)
     with one_opencv_thread():
-        whole = read_scene(workspace.sparse_dir)
+        whole = anchored(read_scene(workspace.sparse_dir))
         scene = leave_out_bad_images(whole, workspace)
         for name in sorted({*expected, *whole.index_of} - scene.index_of.keys()):
             report.skipped_images[name] = "its image is missing, damaged or not of its camera's size; see the log"

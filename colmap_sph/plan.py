@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from colmap_sph.anchor import anchored
 from colmap_sph.cloud_stage import COLMAP_FUSION_BYTES, FUSE_BYTES, MAPS_BYTES, cloud_state
 from colmap_sph.context import Context, Pair
 from colmap_sph.errors import ColmapSphError
@@ -121,10 +122,11 @@ def make_plan(
             Path(model), image_dir, root, options.undistortion, mask_dir, overwrite=overwrite
         )
     if foreseen is None:
-        scene = leave_out_bad_images(read_scene(dense.sparse_dir), dense)
+        scene = leave_out_bad_images(anchored(read_scene(dense.sparse_dir)), dense)
         selection = choose_pairs(dense, scene, options, database)
     else:
-        scene, selection = foreseen.scene, select_pairs(foreseen.scene, options.pairs, database=database)
+        scene = anchored(foreseen.scene)
+        selection = select_pairs(scene, options.pairs, database=database)
     context = Context(dense, wanted_scene(scene, selection), options, Keys(dense, options))
     fresh = overwrite or foreseen is not None
     survey = _survey(context, selection.unique_pairs(), fresh=fresh)

@@ -10,6 +10,7 @@ ray is (x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described
 array coordinate = (angle or tangent) · scale − origin, with pixel centres at whole array coordinates.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -29,6 +30,10 @@ _SEAM_ROWS = 32
 # Fewer shared points than this say too little about the range of parallaxes.
 _MIN_RANGE_POINTS = 8
 _SIDE_SAMPLES = 33
+# In units of the depth: a parallax of some hundredths of a pixel, and more than centres on a grid are off.
+_LEAST_BASELINE = 1e-5
+# What follows from sparse points is rounded to so many binary digits, so that the last of theirs does not count.
+_DIGITS = 11
 # cv2.remap takes no more rows or columns.
 _MAX_SIDE = 32766
 # Images are resampled in bands of this many rows, which bounds the memory for their maps.
@@ -140,7 +145,7 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
     baseline = float(np.linalg.norm(right.center - left.center))
     depths = (scene.points[left.point_indices] - left.center) @ left.viewing_direction
     scale = float(np.median(depths)) if len(depths) else 0.0
-    if not baseline > 1e-9 * max(scale, float(np.abs(left.center).max()) * 1e-3):
+    if not baseline > max(_LEAST_BASELINE * scale, 1e-12 * float(np.abs(left.center).max())):
         raise RectificationError("the two images have the same projection centre")
     rotation = _rectifying_rotation(left, right)
     points = _points_in_both(scene, left, right)
@@ -315,7 +320,7 @@ def _finest_scale(left: View, right: View, points: Float) -> float:
         else:
             cosine = np.ones(1)
         scales.append(float(np.sqrt(view.K[0, 0] * view.K[1, 1]) * np.mean(cosine**-1.5)))
-    return max(scales)
+    return _few_digits(max(scales), np.round)
 
 
 # ---- layouts ------------------------------------------------------------------------------------------------
@@ -418,8 +423,13 @@ def _parallax_range(parallax: Float, options: RectificationOptions) -> tuple[flo
     if len(parallax) < _MIN_RANGE_POINTS:
         return np.radians(0.3), np.radians(60)
     least, most = np.percentile(parallax, [1, 99])
-    least, most = max(float(least), 1e-4), max(float(most), 1e-4)
+    least, most = _few_digits(max(float(least), 1e-4), np.floor), _few_digits(max(float(most), 1e-4), np.ceil)
     return least / options.far_margin, most * options.near_margin
+
+
+def _few_digits(value: float, rounded: Callable[[float], float]) -> float:
+    fraction, exponent = np.frexp(value)
+    return float(np.ldexp(rounded(fraction * 2**_DIGITS), exponent - _DIGITS))
 
 
 def _crop(

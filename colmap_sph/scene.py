@@ -8,7 +8,7 @@ the first pixel's centre is at (0.5, 0.5).
 import logging
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pycolmap
@@ -96,8 +96,9 @@ class Scene:
     points : (N, 3) float64 ndarray
         Sparse points in the world frame, in model units.
     origin : (3,) float64 ndarray
-        Where the scene's world origin lies in the model's coordinates: zero, but for a model in map
-        coordinates, whose scene is moved near its origin.
+        What the cloud's coordinates are relative to: zero, but for a model in map coordinates a point near it.
+    anchor : (3,) float64 ndarray
+        Where the scene's own origin lies, relative to `origin`: zero as read; see `anchor.anchored`.
     image_ids : tuple of int
         COLMAP's ids of all registered images of the model, in its order, the unusable ones among them.
     """
@@ -105,6 +106,7 @@ class Scene:
     views: tuple[View, ...]
     points: NDArray[np.float64]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    anchor: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     image_ids: tuple[int, ...] = ()
 
     @cached_property
@@ -157,7 +159,7 @@ def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
     if not usable:
         raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
     views_by_name = tuple(sorted(usable, key=lambda view: view.name))
-    return Scene(views_by_name, points - origin, origin, tuple(model.reg_image_ids()))
+    return Scene(views_by_name, points - origin, origin, image_ids=tuple(model.reg_image_ids()))
 
 
 def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
@@ -188,8 +190,7 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         model = pycolmap.Reconstruction()
         (model.read_binary if binary else model.read_text)(sparse_dir)
         registered = model.reg_image_ids()
-        for image_id in registered:
-            _ = model.image(image_id).name
+        names = [model.image(image_id).name for image_id in registered]
     except UnicodeDecodeError as error:
         raise InputError(
             f"The model in {sparse_dir} has the image name {error.object!r}, which is not UTF-8; "
@@ -203,7 +204,23 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         raise InputError(
             f"The model in {sparse_dir} has no registered image; run COLMAP's mapper or give another model."
         )
+    _check_names(names, sparse_dir)
     return model
+
+
+def _check_names(names: list[str], sparse_dir: Path) -> None:
+    """Every image needs a place of its own; COLMAP ends the process where one lies in the other's."""
+    known = set(names)
+    if len(known) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"The model in {sparse_dir} has two images named {twice!r}; rename one of them.")
+    for name in names:
+        inside = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in known), None)
+        if inside is not None:
+            raise InputError(
+                f"The model in {sparse_dir} has the images {inside!r} and {name!r}, "
+                "and a file cannot be a folder; rename one of them."
+            )
 
 
 def image_names(model: pycolmap.Reconstruction) -> list[str]:
@@ -242,12 +259,16 @@ def make_pinhole(camera: pycolmap.Camera) -> None:
 def model_files(sparse_dir: Path) -> list[Path]:
     """Return the files that make up the model in a folder; `InputError` where they are not complete."""
     if not sparse_dir.is_dir():
-        raise InputError(f"The model folder {sparse_dir} does not exist; give the folder of a COLMAP model.")
+        is_file = sparse_dir.is_file()
+        raise InputError(
+            f"The model folder {sparse_dir} {'is a file' if is_file else 'does not exist'}; "
+            "give the folder of a COLMAP model."
+        )
     for extension in (".bin", ".txt"):
         if all((sparse_dir / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
             files = [sparse_dir / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
             return [path for path in files if path.is_file()]
-    inside = sorted(child for child in sparse_dir.glob("*/") if (child / "cameras.bin").is_file())
+    inside = sorted(path.parent for depth in ("*", "*/*") for path in sparse_dir.glob(f"{depth}/cameras.bin"))
     hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
     raise InputError(
         f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"

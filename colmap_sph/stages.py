@@ -232,8 +232,10 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
         known = "no depth of it is confirmed by another image"
         report.skipped_images.setdefault(name, known if name in partners else "no pair of it could be matched")
     if not report.images:
+        masked = context.workspace.masks_dir.is_dir()
         raise NoResultError(
-            "No depth was confirmed by a second image; are the model's poses right for these images?"
+            "No depth was confirmed by a second image; are the model's poses right for these images"
+            + (", and is black in the masks what is to be ignored?" if masked else "?")
         )
     return {view.name: done.key for view, done in results.items()}
 

@@ -21,6 +21,8 @@ from colmap_sph.errors import InputError, OutputError
 MapKind = Literal["photometric", "geometric"]
 SourceImages = list[str] | int | Literal["__all__"]
 
+# What a file system takes, less the longest ending: ``.photometric.json``.
+_MAX_NAME_BYTES = 255 - 17
 _MAX_HEADER = 30
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
 
@@ -362,8 +364,13 @@ def _parse_sources(line: str, reference: str, where: str) -> SourceImages:
 
 
 def _checked_name(name: str) -> str:
-    """Refuse a name that would lead out of the workspace."""
+    """Refuse a name that would lead out of the workspace, or that leaves no room for the endings of our files."""
     parts = PurePosixPath(name)
     if not name or parts.is_absolute() or ".." in parts.parts:
         raise InputError(f"The image name {name!r} leads out of the workspace; rename the image in the model.")
+    if len(parts.name.encode()) > _MAX_NAME_BYTES:
+        raise InputError(
+            f"The image name '{parts.name[:20]}…' is longer than the {_MAX_NAME_BYTES} bytes for which the names "
+            "of its maps fit the disk; rename the image."
+        )
     return name

@@ -14,6 +14,7 @@ from clouds import read_fused, read_visibility
 from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_maps
 
 from colmap_sph import cloud_stage, memory
+from colmap_sph.anchor import anchored
 from colmap_sph.cloud_files import join_parts, write_part
 from colmap_sph.cloud_stage import cloud_state, fuse_views
 from colmap_sph.colmap_fusion import fuse_by_colmap
@@ -35,17 +36,18 @@ def workspace(tmp_path):
     return make_workspace(tmp_path / "dense")
 
 
-def context_of(workspace, **options):
+def context_of(workspace, scene=None, **options):
     """A run that has come to its last stage."""
     options = RunOptions(**{"threads": 1, **options})
-    context = Context(workspace, read_scene(workspace.sparse_dir), options, Keys(workspace, options))
+    scene = scene or read_scene(workspace.sparse_dir)
+    context = Context(workspace, scene, options, Keys(workspace, options))
     context.report.coverage = {view.name: 1.0 for view in context.scene.views}
     return context
 
 
-def fuse(workspace, pairs=(), **options):
+def fuse(workspace, pairs=(), scene=None, **options):
     """Run the stage; its report."""
-    context = context_of(workspace, **options)
+    context = context_of(workspace, scene, **options)
     fuse_views(context, pairs, {view.name: "key" for view in context.scene.views})
     return context.report
 
@@ -83,6 +85,16 @@ def test_the_cloud_is_the_plane(workspace):
     assert report.seconds["fuse"] > 0
     assert not (workspace.state_dir / "fusion").exists()
     assert fuse(workspace).made["fuse"] == 0
+
+
+def test_an_anchored_scene_gives_the_cloud_in_the_models_coordinates(workspace):
+    """Its origin is a camera; the plane lies where it did, to a thousandth of what a pixel covers, 0.07 units."""
+    scene = anchored(read_scene(workspace.sparse_dir))
+    assert np.linalg.norm(scene.anchor) > 9
+    fuse(workspace, scene=scene)
+    cloud = read_fused(workspace.fused_path)
+    assert len(cloud) > WIDTH * HEIGHT
+    assert np.abs(cloud["xyz"].astype(float) @ NORMAL).max() < 1e-4
 
 
 def test_visibility_names_images_as_colmap_does(tmp_path):

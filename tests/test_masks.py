@@ -203,6 +203,16 @@ def test_a_black_mask_leaves_its_image_out(project: Path, capsys: pytest.Capture
     assert not depth.any()
 
 
+def test_masks_that_are_black_all_over(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """White may be what somebody wanted to be ignored: the message says which is which."""
+    keep_images(project, NADIR)
+    (project / "masks").mkdir()
+    for name in NADIR:
+        cv2.imwrite(str(project / "masks" / f"{name}.png"), np.zeros((240, 320), np.uint8))
+    assert cli.main(["run", "--model", str(project / "sparse/0"), "--masks", str(project / "masks")]) == 4
+    assert "is black in the masks what is to be ignored?" in " ".join(capsys.readouterr().err.split())
+
+
 def spoil_nothing(folder: Path) -> None:
     shutil.rmtree(folder)
 

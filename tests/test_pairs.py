@@ -209,6 +209,9 @@ def test_no_pair_at_all(line: Scene) -> None:
     apart = (view_at([0, 0, 0], "a"), view_at([1, 0, 0], "b", R=np.diag([-1.0, 1, -1])))
     with pytest.raises(NoResultError, match="frusta"):
         select_pairs(Scene(apart, np.empty((0, 3))), FEW)
+    for explicit in ({}, {"0.jpg": ["gone.jpg"]}):
+        with pytest.raises(NoResultError, match=r"comes of patch-match\.cfg; mend or delete it"):
+            select_pairs(line, FEW, explicit=explicit)
 
 
 @pytest.mark.parametrize(

@@ -15,6 +15,7 @@ from conftest import FinishedRun, keep_images
 import colmap_sph
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
+from colmap_sph.anchor import anchored
 from colmap_sph.cloud_stage import fuse_views
 from colmap_sph.context import Context
 from colmap_sph.depth import DepthOptions
@@ -147,7 +148,7 @@ def test_stages_one_by_one(project: Path) -> None:
     keep_images(project, NADIR)
     whole = colmap_sph.run(project / "sparse/0", output=project / "whole", options=FEW_PAIRS)
     workspace = prepare_workspace(project / "sparse/0", None, project / "stages", UndistortionOptions())
-    scene = read_scene(workspace.sparse_dir)
+    scene = anchored(read_scene(workspace.sparse_dir))
     selection = select_pairs(scene, FEW_PAIRS.pairs)
     context = Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS))
     pairs = match_pairs(context, selection.unique_pairs())

@@ -181,3 +181,19 @@ def test_impossible_calibrations_are_told(tmp_path: Path, params: list[float]) -
     model.write_binary(tmp_path)
     with pytest.raises(InputError, match="No image of the model"):
         read_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("sub/2.png", r"two images named 'sub/2\.png'; rename"),
+        ("sub/2.png/x.png", r"images 'sub/2\.png' and 'sub/2\.png/x\.png', and a file cannot be a folder"),
+        ("sub/2.png/a/b.png", "a file cannot be a folder"),
+    ],
+)
+def test_images_in_one_place_are_told(tmp_path: Path, name: str, words: str) -> None:
+    model = make_model()
+    model.image(1).name = name
+    model.write_binary(tmp_path)
+    with pytest.raises(InputError, match=words):
+        read_scene(tmp_path)

@@ -39,6 +39,17 @@ def test_paths_follow_colmap() -> None:
     assert workspace.normal_map_path("a.jpg", "photometric") == expected
 
 
+def test_a_name_leaves_room_for_the_endings_of_our_files(tmp_path: Path) -> None:
+    """255 bytes are what a file system takes; a letter may be several."""
+    longest = "ü" * 117 + ".jpg"
+    (tmp_path / f"{longest}.photometric.json").touch()
+    workspace = Workspace(tmp_path)
+    assert workspace.image_path(longest).name == longest
+    assert workspace.image_path(f"{'x' * 250}/a.jpg").name == "a.jpg"
+    with pytest.raises(InputError, match="is longer than the 238 bytes"):
+        workspace.image_path(f"x{longest}")
+
+
 @pytest.mark.parametrize("name", ["../a.jpg", "/etc/a.jpg", "a/../../b.jpg", ""])
 def test_names_stay_inside_the_workspace(name: str) -> None:
     with pytest.raises(InputError, match="leads out"):
