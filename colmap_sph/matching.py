@@ -49,9 +49,9 @@ class MatchingOptions:
     """Disparities searched per pixel at the levels between the coarsest and the finest; a multiple of 32."""
     max_coarsest_disparities: int = 128
     """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
-    range_radius: int = 3
+    range_radius: int = 4
     """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches."""
-    max_slant: int = 2
+    max_slant: int = 3
     """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
