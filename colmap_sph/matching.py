@@ -26,6 +26,9 @@ _MAX_DEPTH = 1024
 _MAX_SURFACE_STEP = 4
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
 _BYTES_PER_SLOT = 3  # of a level's cost and aggregated volumes
+# Offsets that differ from the median around them by no more (pixels) are noise, others may be a thin thing.
+_MAX_NOISE = 2
+_BEYOND = np.float32(1e9)  # what no offset reaches
 
 
 @dataclass(frozen=True)
@@ -46,9 +49,9 @@ class MatchingOptions:
     """Disparities searched per pixel at the levels between the coarsest and the finest; a multiple of 32."""
     max_coarsest_disparities: int = 128
     """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
-    range_radius: int = 3
+    range_radius: int = 4
     """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches."""
-    max_slant: int = 2
+    max_slant: int = 3
     """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
@@ -151,6 +154,9 @@ def match_pair(
             depth = min(depth, options.disparities if level == 0 else options.coarse_disparities)
             base = _propagate(offset, shape, depth, low, high, options)
         offset = _match_level(lefts[level], rights[level], base, depth, options, scratch, refine=level == 0)
+        if level > 0:
+            # Not at full resolution: how rough a disparity map is tells the vote how far to trust it.
+            _smooth(offset)
         _remove_small_segments(offset, max(options.min_segment >> level, 4))
     assert offset is not None
     disparity = offset.astype(np.float32)
@@ -243,6 +249,21 @@ def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:
     contrast = np.arange(256)
     p2 = options.p2_min + (options.p2 - options.p2_min) / (1 + contrast / options.p2_contrast)
     return np.round(p2).astype(np.uint8)
+
+
+def _smooth(offset: NDArray[np.int32]) -> None:
+    """Replace offsets, in place, by the median of 5 x 5 pixels where that is near.
+
+    Neighbours without an offset count by turns as least and as most, so that they do not shift it.
+    """
+    values, invalid = offset.astype(np.float32), offset == _OFFSET_INVALID
+    turns = np.where(np.arange(offset.shape[1]) % 2, _BEYOND, -_BEYOND)
+    np.copyto(values[::2], turns, where=invalid[::2])
+    np.copyto(values[1::2], -turns, where=invalid[1::2])
+    median = np.asarray(cv2.medianBlur(values, 5), dtype=np.float32)
+    values -= median
+    near = np.abs(values, out=values) <= _MAX_NOISE * _SUBPIXEL
+    np.copyto(offset, median, where=near & ~invalid, casting="unsafe")
 
 
 def _remove_small_segments(offset: NDArray[np.int32], min_segment: int) -> None:

@@ -8,7 +8,7 @@ import pytest
 from rendered import exact_disparity, grey, scene_of_pair
 from scipy import ndimage
 
-from colmap_sph import _native
+from colmap_sph import _native, matching
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
 from colmap_sph.kernels import backend
@@ -174,6 +174,45 @@ def test_images_of_unlike_widths_are_matched():
     assert (disparity[5:-5, 5:-5] == -20).mean() > 0.95
     back = match_pair(right, left, -10, 60, OPTIONS)
     assert (back[5:-5, 25:115] == 20).mean() > 0.95
+
+
+# ---- the median that coarser levels pass through ----------------------------------------------------------
+
+
+def smoothed(offset):
+    """The matcher's median of offsets in whole pixels, NaN = none."""
+    smooth = np.where(np.isnan(offset), np.iinfo(np.int32).min, np.nan_to_num(offset) * 256).astype(np.int32)
+    matching._smooth(smooth)
+    return np.where(smooth == np.iinfo(np.int32).min, np.nan, smooth / 256)
+
+
+def test_the_median_is_the_neighbourhoods():
+    offset = np.random.default_rng(0).integers(-200, 200, (41, 56)) / 256 + 4
+    expected = ndimage.median_filter(offset, 5, mode="nearest")
+    np.testing.assert_array_equal(smoothed(offset), expected)
+
+
+def test_the_median_keeps_slopes_edges_and_thin_things_and_fills_nothing():
+    offset = np.broadcast_to(np.arange(60) / 8, (40, 60)).copy()
+    offset[:, 40:] += 9
+    offset[10] += 30
+    offset[25:, 12:18] = np.nan
+    # Where one side of the window is missing or far away, the median is that of the others.
+    tolerance = np.zeros(offset.shape)
+    tolerance[:, [*range(3), *range(57, 60), *range(9, 21), *range(37, 43)]] = 2 / 8
+    tolerance[[*range(8, 13), *range(23, 27)]] = 2 / 8
+    tolerance[10] = 0
+    smooth = smoothed(offset)
+    np.testing.assert_array_equal(np.isnan(smooth), np.isnan(offset))
+    assert (np.nan_to_num(np.abs(smooth - offset)) <= tolerance).all()
+
+
+def test_the_median_drops_what_strays_on_a_surface():
+    offset = np.full((20, 30), 5.0)
+    offset[8, 10], offset[8, 20], offset[14, 15] = 6.5, 3.25, 12
+    smooth = smoothed(offset)
+    assert smooth[8, 10] == smooth[8, 20] == 5
+    assert smooth[14, 15] == 12
 
 
 # ---- masks, ranges, sizes ----------------------------------------------------------------------------------
