@@ -215,6 +215,23 @@ def test_depths_off_their_plane_are_dropped():
     assert (fit_normals(VIEW, uncertain, OPTIONS)[1] > 0).all()
 
 
+def test_what_may_be_missing_to_a_plane_grows_with_its_slope():
+    """On a plane at 72 degrees depth changes by about three pixel sizes from one pixel to the next."""
+    exact = inverse_depth(plane_normal(72, 90))
+    plane = DepthEstimate((1 / exact).astype(np.float32), np.zeros_like(exact), np.full(exact.shape, 9, np.uint8))
+    size, change = plane.depth / VIEW.K[0, 0], np.abs(np.gradient(plane.depth, axis=0))
+    depth = plane.depth.copy()
+    for row in (30, 45, 60):
+        assert 2.5 < change[row, 30] / size[row, 30] < 4
+        depth[row, 30] += 0.6 * change[row, 30]
+        depth[row, 60] += 1.6 * change[row, 60]
+    # Both are off by more than two standard deviations.
+    sigma = (0.25 * change).astype(np.float32)
+    _, fitted = fit_normals(VIEW, DepthEstimate(depth, sigma, plane.support), OPTIONS)
+    assert (fitted[30:61:15, 30] > 0).all()
+    assert not fitted[30:61:15, 60].any()
+
+
 def test_glancing_surfaces_need_support():
     """A plane under angles of 66 to 84 degrees: the part beyond 75 needs three others that see it."""
     normal = plane_normal(75, 0)

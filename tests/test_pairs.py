@@ -110,15 +110,15 @@ def test_worth_of_a_candidate() -> None:
     away = view_at([-2, 0, 0], "c")  # its image ends at x = 3
     np.testing.assert_allclose(worth_of(view, away, points, 0.5)[[0, 2]], [0.75, 0], rtol=1e-6)
     wide = view_at([10 * np.tan(np.radians(60)), 0, 0], "d")  # out of its image, but what is observed is in sight
-    np.testing.assert_allclose(worth_of(view, wide, points, both)[:2], [0.5, 0], rtol=1e-6)
+    np.testing.assert_allclose(worth_of(view, wide, points, both)[:2], [1 / 3, 0], rtol=1e-6)
 
 
 def test_what_few_see_is_served_before_what_many_see() -> None:
     left, right = np.repeat([1.0, 0], [90, 10]), np.repeat([0, 1.0], [90, 10])
     worths = [w.astype(np.float32) for w in (left, 0.99 * left, right, 0.98 * left, np.zeros(100), 0.5 * right)]
-    # 90, then 0.4 * 89.1; 14.3 > 10 > 5.6; then what is left of the left side against half of the right one's.
-    assert choose(worths, 6) == [0, 1, 3, 2, 5, 4]
-    assert choose(worths, 4) == [0, 1, 3, 2]
+    # Seen once, the left side is worth 0.2 * 90 = 18, more than the right one; seen twice, less than that.
+    assert choose(worths, 6) == [0, 1, 2, 3, 5, 4]
+    assert choose(worths, 3) == [0, 1, 2]
     assert choose([], 3) == []
 
 
