@@ -1,8 +1,8 @@
 """Scene → for every image the partners it is matched with, best first.
 
-The best partners share the most sparse points (3D points both images observe), seen under some parallax.
-Without tracks the verified matches of COLMAP's database stand in for the shared points, and without these the
-overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
+Candidates share sparse points (3D points both images observe), seen under some parallax; the best of them together
+see all of the image. Without tracks the verified matches of COLMAP's database stand in for the shared points, and
+without these the overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
 """
 
 import logging
@@ -305,7 +305,7 @@ def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]
     wide: list[Pair] = []
     worths: list[NDArray[np.float32]] = []
     for j, weight in zip(*graph.candidates(i), strict=True):
-        if len(near) == _MAX_CANDIDATES:
+        if len(near) + len(wide) == _MAX_CANDIDATES:
             break
         angle = graph.angle(i, int(j))
         if np.isnan(angle) and np.array_equal(graph.centers[i], graph.centers[j]):

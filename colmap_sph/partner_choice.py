@@ -74,7 +74,8 @@ def choose(worths: Sequence[NDArray[np.float32]], count: int) -> list[int]:
     table, need = np.array(worths), np.ones(len(worths[0]) if worths else 0)
     left = np.ones(len(worths), dtype=bool)
     while left.any() and len(chosen) < count:
-        gains = np.where(left, np.einsum("ij,j->i", table, need), -1.0)
+        # Rounded: of candidates that serve alike the first must win, however their points' places are rounded.
+        gains = np.where(left, np.round(np.einsum("ij,j->i", table, need), 3), -1.0)
         best = int(np.argmax(gains))
         chosen.append(best)
         left[best] = False
