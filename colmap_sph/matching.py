@@ -26,7 +26,8 @@ _MAX_DEPTH = 1024
 _MAX_SURFACE_STEP = 4
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
 _BYTES_PER_SLOT = 3  # of a level's cost and aggregated volumes
-# Offsets that differ from the median around them by no more (pixels) are noise, others may be a thin thing.
+# Offsets that differ from the median around them by no more (pixels) are noise; what differs by more may be
+# another surface, and is left to the filter of small segments.
 _MAX_NOISE = 2
 _BEYOND = np.float32(1e9)  # what no offset reaches
 

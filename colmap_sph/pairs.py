@@ -28,7 +28,7 @@ PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
 
 # COLMAP numbers a pair `image_id1 * 2147483647 + image_id2`.
 _MAX_NUM_IMAGES = 2147483647
-# Candidates of a view that are looked at, and the points that tell a pair's angle and its worth.
+# Candidates that a view chooses from, unless it is to have more; points that tell a pair's angle and its worth.
 _MAX_CANDIDATES = 100
 _MAX_ANGLE_POINTS = 512
 _MAX_WORTH_POINTS = 512
@@ -304,8 +304,9 @@ def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]
     near: list[Pair] = []
     wide: list[Pair] = []
     worths: list[NDArray[np.float32]] = []
+    most = max(_MAX_CANDIDATES, options.num_pairs)
     for j, weight in zip(*graph.candidates(i), strict=True):
-        if len(near) + len(wide) == _MAX_CANDIDATES:
+        if len(near) == most or len(near) + len(wide) == 2 * most:
             break
         angle = graph.angle(i, int(j))
         if np.isnan(angle) and np.array_equal(graph.centers[i], graph.centers[j]):
@@ -360,9 +361,11 @@ def _report(selection: PairSelection, options: PairOptions) -> None:
         "patch-match.cfg": "patch-match.cfg",
     }
     num_unique = len(selection.unique_pairs())
-    if num_unique == 0 and selection.source == "patch-match.cfg":
-        raise NoResultError("No pair of the model's usable images comes of patch-match.cfg; mend or delete it.")
     if num_unique == 0:
+        if selection.source == "patch-match.cfg":
+            raise NoResultError(
+                "No pair of the model's usable images comes of patch-match.cfg; mend or delete it."
+            )
         raise NoResultError(
             f"No pair of images overlaps, going by {words[selection.source]}: at least "
             f"{options.min_shared_points} shared points and a triangulation angle of "

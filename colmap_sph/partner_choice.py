@@ -51,7 +51,9 @@ def worth_of(
         0 to 1.
     """
     angles = triangulation_angles(points, view.center, candidate.center)
-    in_sight = sees(candidate, points) | (np.asarray(observed) == 1)
+    in_sight = sees(candidate, points)
+    if isinstance(observed, np.ndarray):
+        in_sight |= observed  # whatever the rounding at the image's rim
     parallax = np.interp(angles, _ANGLES, (0.0, 1.0, 1.0, 0.0))
     return np.asarray(in_sight * parallax * (1 - _OBSERVED + _OBSERVED * observed), dtype=np.float32)
 

@@ -268,7 +268,11 @@ def model_files(sparse_dir: Path) -> list[Path]:
         if all((sparse_dir / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
             files = [sparse_dir / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
             return [path for path in files if path.is_file()]
-    inside = sorted(path.parent for depth in ("*", "*/*") for path in sparse_dir.glob(f"{depth}/cameras.bin"))
+    # A workspace's own model, `dense/sparse`, last: it is what undistortion made of the one that is meant.
+    inside = sorted(
+        (path.parent for depth in ("*", "*/*") for path in sparse_dir.glob(f"{depth}/cameras.bin")),
+        key=lambda path: (path.name == "sparse" and path.parent != sparse_dir, path),
+    )
     hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
     raise InputError(
         f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"

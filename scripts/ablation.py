@@ -35,7 +35,7 @@ _VARIANTS: dict[str, list[str]] = {
     "depths off their plane or glanced at stay": ["--normals.max-shift", "1e9", "--normals.max-incidence", "90"],
     "penalties 16, 120, softer edges": [
         *("--matching.p1", "16", "--matching.p2", "120"),
-        *("--matching.p2-contrast", "24", "--matching.max-slant", "3"),
+        *("--matching.p2-contrast", "24"),
     ],
     "ranges do not follow slopes": ["--matching.max-slant", "0"],
     "64 disparities": ["--matching.disparities", "64"],

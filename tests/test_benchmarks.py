@@ -112,9 +112,9 @@ def test_limits_are_measured(register, version):
     limits = importlib.import_module("machine_limits")
     assert 1e8 < limits.copy_bandwidth(runs=1) < 1e13
     instructions = limits.vector_throughput(register, runs=1)
-    if version in _native.backends():
-        assert isinstance(instructions, str) or 1e8 < instructions < 1e11
-    elif register == 32:
+    # Text where there is no compiler, or no such register.
+    assert isinstance(instructions, str) or 1e8 < instructions < 1e11
+    if version not in _native.backends() and register == 32:
         assert isinstance(instructions, str)
 
 

@@ -5,6 +5,7 @@ import json
 import logging
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -305,6 +306,16 @@ BAD = {
     "demo in a file": (["demo", "--output", "sparse/0/cameras.bin"], 3, "cameras.bin"),
     "demo unwritable": (["demo", "--output", "/proc/demo"], 3, "/proc/demo"),
 }
+
+
+def test_the_model_that_is_meant_is_not_the_workspaces_own(
+    small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(small / "sparse" / "0", small / "dense" / "sparse")
+    code, output = command(capsys, "run", "--model", ".")
+    assert code == 2 and "did you mean sparse/0" in output
+    shutil.rmtree(small / "sparse")
+    assert "did you mean dense/sparse" in command(capsys, "run", "--model", ".")[1]
 
 
 @pytest.mark.parametrize("case", BAD)

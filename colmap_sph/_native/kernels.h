@@ -95,7 +95,8 @@ typedef void depth_candidates_fn(const float *disparity, ptrdiff_t map_height, p
 typedef struct {
     int radius;
     float tolerance;   /* standard deviations from the plane within which a neighbour counts */
-    float max_shift;   /* most that a depth may differ from its plane's: pixel sizes, and ... */
+    float max_shift;   /* most that a depth may differ from its plane's: pixel sizes, or its changes per pixel
+                          where these are more, and ... */
     float shift_sigma; /* ... standard deviations; both must be exceeded to drop it */
     float min_cosine;  /* of the angle between ray and normal, where ... */
     int supported;     /* ... less than this support the depth */

@@ -13,7 +13,7 @@ uint64_t *cost_row_buffer(match_size size) {
 }
 
 int selection_begin(selection_buffers *buffers, match_size size) {
-    const ptrdiff_t keys = (size.target_width + 2 * size.depth + 1) / 2 * 2;
+    const ptrdiff_t keys = 2 * keys_per_parity(size);
     buffers->keys = malloc((size_t)(keys + size.width) * sizeof *buffers->keys);
     buffers->winner = buffers->keys ? (int32_t *)(buffers->keys + keys) : NULL;
     return buffers->keys ? 0 : -1;

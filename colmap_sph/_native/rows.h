@@ -45,6 +45,9 @@ typedef struct {
     int32_t *winner; /* and for a number per pixel */
 } selection_buffers;
 
+/* Half of the room for keys: the vectorised versions keep those of even and odd places apart. */
+static inline ptrdiff_t keys_per_parity(match_size size) { return (size.target_width + 2 * size.depth + 1) / 2; }
+
 #define NO_KEY UINT32_C(0xffff0000) /* which a sum of 65535 never beats */
 
 /* 0, or -1 without memory; ended by free(buffers->keys). */

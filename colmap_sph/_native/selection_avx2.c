@@ -86,7 +86,7 @@ static inline void check_eight(const uint16_t *sums, const int32_t *base, const 
     found = _mm256_andnot_si256(_mm256_cmpgt_epi32(zero, content), found);
 
     const __m256i key_place = _mm256_add_epi32(r, depth);
-    const int half = (int)((size.target_width + 2 * size.depth + 1) / 2);
+    const int half = (int)keys_per_parity(size);
     const __m256i odd = _mm256_and_si256(_mm256_sub_epi32(zero, _mm256_and_si256(key_place, _mm256_set1_epi32(1))),
                                          _mm256_set1_epi32(half));
     const __m256i keys = _mm256_mask_i32gather_epi32(
