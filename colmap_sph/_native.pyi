@@ -163,8 +163,8 @@ def fit_planes(
 def add_patch_equations(
     backend: str,
     image: Array,
-    source: Array,
-    source_from_reference: Array,
+    sources: tuple[Array, ...],
+    sources_from_reference: Array,
     planes: Array,
     first_row: int,
     contrast: float,

@@ -121,12 +121,21 @@ typedef struct {
  * inverse depth; right side (3) and upper triangle (6) of the normal equations. */
 enum { PATCH_EQUATIONS = 12 };
 
-/* Adds the normal equations of matching a reference's pixels in a source. `planes` (3 arrays of inverse depth, 0 =
- * none, and its change along x and y) and `equations` belong to rows [first_row, first_row + rows) of the
- * reference. A pixel (x, y, 1) of inverse depth w lies at matrix (x, y, 1) + w translation in the source. */
-typedef void add_patch_equations_fn(const grey_image *reference, const grey_image *source, const double *matrix,
-                                    const double *translation, const float *planes, ptrdiff_t first_row,
-                                    ptrdiff_t rows, patch_options options, float *equations);
+/* An image to match in: a pixel (x, y, 1) of the reference with inverse depth w lies at
+ * matrix (x, y, 1) + w translation. */
+typedef struct {
+    grey_image image;
+    double matrix[9], translation[3];
+} patch_source;
+
+enum { MAX_PATCH_SOURCES = 32 }; /* in one call */
+
+/* Adds the normal equations of matching a reference's pixels in each of the sources. `planes` (3 arrays of inverse
+ * depth, 0 = none, and its change along x and y) and `equations` belong to rows [first_row, first_row + rows) of
+ * the reference. */
+typedef void add_patch_equations_fn(const grey_image *reference, const patch_source *sources, ptrdiff_t count,
+                                    const float *planes, ptrdiff_t first_row, ptrdiff_t rows,
+                                    patch_options options, float *equations);
 
 typedef struct {
     const char *name;
