@@ -67,6 +67,7 @@ def vote_depth(
     depths: Array, sigmas: Array, tolerance: float, depth: Array, sigma: Array, support: Array, /
 ) -> None: ...
 def check_consistency(
+    backend: str,
     depth: Array,
     sigma: Array,
     partner_depth: Array,

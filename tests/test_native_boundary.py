@@ -96,6 +96,7 @@ def arguments(function):
             "out support": np.zeros((H, W), u8),
         },
         "check_consistency": {
+            "backend": "scalar",
             "depth": np.ones((H, W), f32),
             "sigma": np.ones((H, W), f32),
             "partner_depth": np.ones((5, 6), f32),
@@ -569,8 +570,10 @@ def test_empty_maps_are_no_work(shape):
     )
     for reference, other in ((empty, partner), (partner, empty)):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
-        _native.check_consistency(reference, reference, other, other, matrix, matrix, 1.0, 4.0, *counts)
-        assert not any(count.any() for count in counts)
+        for backend in BACKENDS:
+            maps = reference, reference, other, other
+            _native.check_consistency(backend, *maps, matrix, matrix, 1.0, 4.0, *counts)
+            assert not any(count.any() for count in counts)
         fuse_empty(reference, other, matrix)
     _native.fit_planes(
         "scalar",

@@ -362,33 +362,51 @@ static int get_maps(array_set *arrays, PyObject *const *objects, view_maps *maps
     return inverse != NULL;
 }
 
+/* A depth map and its standard deviations; `map->sigma` is NULL, with an error set, where they are not accepted.
+ */
+static void get_depth_map(array_set *arrays, PyObject *depth, const char *depth_name, PyObject *sigma,
+                          const char *sigma_name, depth_map *map) {
+    Py_ssize_t shape[2] = {-1, -1};
+    map->depth = array_get(arrays, depth, depth_name, F32, 2, READ, shape);
+    map->sigma = map->depth && check(shape[0] <= INT32_MAX && shape[1] <= INT32_MAX,
+                                     "maps are limited to 2^31 - 1 rows and columns")
+                     ? array_get(arrays, sigma, sigma_name, F32, 2, READ, shape)
+                     : NULL;
+    map->height = shape[0];
+    map->width = shape[1];
+}
+
 static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     (void)self;
+    const char *backend;
     PyObject *o[11];
-    float max_error, tolerance;
-    if (!PyArg_ParseTuple(args, "OOOOOOffOOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &max_error, &tolerance,
-                          &o[6], &o[7], &o[8], &o[9], &o[10])) {
+    consistency_gates gates;
+    if (!PyArg_ParseTuple(args, "sOOOOOOffOOOOO", &backend, &o[0], &o[1], &o[2], &o[3], &o[4], &o[5],
+                          &gates.max_reprojection_error, &gates.tolerance, &o[6], &o[7], &o[8], &o[9], &o[10])) {
         return NULL;
     }
+    const kernel_table *table = table_or_error(backend);
     array_set arrays = {.count = 0};
+    depth_map reference = {.sigma = NULL}, partner = {.sigma = NULL};
     view_transfer transfer;
-    Py_ssize_t shape[2] = {-1, -1}, partner_shape[2] = {-1, -1};
-    const float *depth = array_get(&arrays, o[0], "depth", F32, 2, READ, shape);
-    const float *sigma = depth ? array_get(&arrays, o[1], "sigma", F32, 2, READ, shape) : NULL;
-    const float *partner = sigma ? array_get(&arrays, o[2], "partner_depth", F32, 2, READ, partner_shape) : NULL;
-    const float *partner_sigma =
-        partner ? array_get(&arrays, o[3], "partner_sigma", F32, 2, READ, partner_shape) : NULL;
-    const int ready = partner_sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
-    uint8_t *observing = ready ? array_get(&arrays, o[6], "observing", U8, 2, WRITE, shape) : NULL;
-    uint8_t *agreeing = observing ? array_get(&arrays, o[7], "agreeing", U8, 2, WRITE, shape) : NULL;
-    uint8_t *contradicting = agreeing ? array_get(&arrays, o[8], "contradicting", U8, 2, WRITE, shape) : NULL;
-    float *weighted = contradicting ? array_get(&arrays, o[9], "weighted_depth", F32, 2, WRITE, shape) : NULL;
-    float *weight = weighted ? array_get(&arrays, o[10], "weight", F32, 2, WRITE, shape) : NULL;
-    if (weight && arrays_disjoint(&arrays)) {
+    consistency_sums sums;
+    if (table) {
+        get_depth_map(&arrays, o[0], "depth", o[1], "sigma", &reference);
+    }
+    if (reference.sigma) {
+        get_depth_map(&arrays, o[2], "partner_depth", o[3], "partner_sigma", &partner);
+    }
+    const int ready = partner.sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
+    Py_ssize_t shape[2] = {reference.height, reference.width};
+    sums.observing = ready ? array_get(&arrays, o[6], "observing", U8, 2, WRITE, shape) : NULL;
+    sums.agreeing = sums.observing ? array_get(&arrays, o[7], "agreeing", U8, 2, WRITE, shape) : NULL;
+    sums.contradicting = sums.agreeing ? array_get(&arrays, o[8], "contradicting", U8, 2, WRITE, shape) : NULL;
+    sums.weighted_depth =
+        sums.contradicting ? array_get(&arrays, o[9], "weighted_depth", F32, 2, WRITE, shape) : NULL;
+    sums.weight = sums.weighted_depth ? array_get(&arrays, o[10], "weight", F32, 2, WRITE, shape) : NULL;
+    if (sums.weight && arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
-        check_consistency(depth, sigma, shape[0], shape[1], partner, partner_sigma, partner_shape[0],
-                          partner_shape[1], &transfer, max_error, tolerance, observing, agreeing, contradicting,
-                          weighted, weight);
+        table->check_consistency(&reference, &partner, &transfer, gates, &sums);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -657,7 +675,7 @@ static PyMethodDef methods[] = {
      "is_left, first_row, depth, sigma)"},
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
     {"check_consistency", py_check_consistency, METH_VARARGS,
-     "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
+     "check_consistency(backend, depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
      "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
      "weighted_depth, weight)"},
     {"confirm_depth", py_confirm_depth, METH_VARARGS,
