@@ -67,6 +67,7 @@ def vote_depth(
     depths: Array, sigmas: Array, tolerance: float, depth: Array, sigma: Array, support: Array, /
 ) -> None: ...
 def check_consistency(
+    backend: str,
     depth: Array,
     sigma: Array,
     partner_depth: Array,
@@ -163,8 +164,8 @@ def fit_planes(
 def add_patch_equations(
     backend: str,
     image: Array,
-    source: Array,
-    source_from_reference: Array,
+    sources: tuple[Array, ...],
+    sources_from_reference: Array,
     planes: Array,
     first_row: int,
     contrast: float,

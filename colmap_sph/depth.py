@@ -246,6 +246,7 @@ def check_depth(
     weighted, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     for partner, partner_estimate in partners:
         _native.check_consistency(
+            backend(),
             estimate.depth,
             estimate.sigma,
             partner_estimate.depth,

@@ -25,8 +25,8 @@ _BAND_ROWS = 32
 _SURVEY_ROWS = 16
 # Partners that bring the planes near in the rounds before the last.
 _FIRST_PARTNERS = 3
-# Arrays of equations, see `kernels.h`.
-_EQUATIONS = 12
+# Arrays of equations, and sources of one call; see `kernels.h`.
+_EQUATIONS, _SOURCES = 12, 32
 
 # A partner's image, and where the pixels of the view lie in it.
 _Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
@@ -114,10 +114,9 @@ def refine_maps(
         for first in range(0, view.height, _BAND_ROWS):
             rows = slice(first, min(first + _BAND_ROWS, view.height))
             planes = _planes_of_maps(view, normals[rows], depth[rows], first)
-            equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
             last = done == options.rounds - 1
-            for partner in partners if last else partners[:_FIRST_PARTNERS]:
-                _add_equations(image, partner, planes, first, options, equations)
+            used = partners if last else partners[:_FIRST_PARTNERS]
+            equations = _equations(image, used, planes, first, options)
             sigma = _freedom(estimate.sigma[rows], planes, options)
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma, slope_sigma, planes)
@@ -141,8 +140,7 @@ def _most_telling(
         planes = _planes_of_maps(view, normals[rows], depth[rows], row)
         sigma = _freedom(estimate.sigma[rows], planes, options)
         for index, partner in enumerate(partners):
-            equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
-            _add_equations(image, partner, planes, row, options, equations)
+            equations = _equations(image, [partner], planes, row, options)
             matched = equations[0] > 0
             weight, difference, curvature = (equations[k][matched] for k in (0, 1, 6))
             # What a pixel gains, in nats: a long baseline that few pixels match must not outdo all others.
@@ -159,17 +157,22 @@ def _freedom(
     return np.asarray(options.depth_freedom * sigma * planes[0] ** 2, np.float32)
 
 
-def _add_equations(
+def _equations(
     image: NDArray[np.uint8],
-    partner: _Partner,
+    partners: Sequence[_Partner],
     planes: NDArray[np.float32],
     first: int,
     options: RefinementOptions,
-    equations: NDArray[np.float32],
-) -> None:
-    _native.add_patch_equations(
-        backend(), image, *partner, planes, first, options.contrast, options.min_score, equations
-    )
+) -> NDArray[np.float32]:
+    """(12, h, W) sums of the normal equations of all partners."""
+    equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
+    for start in range(0, len(partners), _SOURCES):
+        sources, transfers = zip(*partners[start : start + _SOURCES], strict=True)
+        limits = options.contrast, options.min_score
+        _native.add_patch_equations(
+            backend(), image, sources, np.stack(transfers), planes, first, *limits, equations
+        )
+    return equations
 
 
 def _planes_of_maps(

@@ -32,6 +32,7 @@ from colmap_sph.matching import MatchingOptions
 from colmap_sph.normals import NormalOptions
 
 LEVELS = (32, 64)  # disparities at the matcher's levels below the coarsest
+SOURCES = 8  # images that the refinement matches in at once; each counts as so many pixels
 OPTIONS = MatchingOptions()
 P2 = np.round(OPTIONS.p2_min + (OPTIONS.p2 - OPTIONS.p2_min) / (1 + np.arange(256) / OPTIONS.p2_contrast)).astype(
     np.uint8
@@ -252,6 +253,36 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     ]
 
 
+def partner_kernels(scene: Scene) -> list[Kernel]:
+    """The kernels that compare a view with its partners: the right camera stands one unit beside the left one."""
+    focal, shape, pixels = float(scene.shape[1]), scene.shape, scene.base.size
+    beside = np.hstack([np.eye(3), [[-focal], [0], [0]]])
+    from_right, back = np.empty(shape, np.float32), beside * np.where(np.arange(4) == 3, -1, 1)
+    _native.transfer_disparity(scene.disparity, 2.0, from_right)
+    maps = []
+    for disparity in (scene.disparity, from_right):
+        known = np.where(disparity > 0, disparity, np.inf)  # no depth: 0
+        maps += [(focal / known).astype(np.float32), (0.3 * focal / known**2).astype(np.float32)]
+    counts, sums = np.empty((3, *shape), np.uint8), np.empty((2, *shape), np.float32)
+
+    def check_consistency(backend: str) -> None:
+        counts.fill(0)
+        sums.fill(0)
+        _native.check_consistency(backend, *maps, beside, back, 2.0, 4.5, *counts, *sums)
+
+    inverse = scene.disparity / focal
+    planes = np.stack([inverse, *np.gradient(inverse)[::-1]]).astype(np.float32)
+    sources, transfers = (scene.right,) * SOURCES, np.stack([beside] * SOURCES)
+    equations = np.empty((12, *shape), np.float32)
+
+    def add_patch_equations(backend: str) -> None:
+        equations.fill(0)
+        _native.add_patch_equations(backend, scene.left, sources, transfers, planes, 0, 20.0, 0.5, equations)
+
+    steps = [(check_consistency, [counts, sums], pixels), (add_patch_equations, [equations], SOURCES * pixels)]
+    return [Kernel(call.__name__, call, outputs, work) for call, outputs, work in steps]
+
+
 def check_equality(kernel: Kernel, backends: Sequence[str]) -> None:
     """End the program where two versions of a kernel differ in a bit."""
     digests = {}
@@ -394,7 +425,8 @@ def bench(width: int, height: int, disparities: int, runs: int) -> None:
     for depth in dict.fromkeys((disparities, *LEVELS)):
         coarsest = depth == disparities
         scene = make_scene(width, height, depth, same_range=coarsest)
-        kernels = [*(image_kernels(scene) if coarsest else []), *matching_kernels(scene)]
+        others = [*image_kernels(scene), *partner_kernels(scene)] if coarsest else []
+        kernels = [*others, *matching_kernels(scene)]
         for kernel in kernels:
             check_equality(kernel, backends)
         timings += [time_kernel(kernel, backends, runs) for kernel in kernels]

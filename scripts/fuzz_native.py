@@ -125,7 +125,9 @@ def check_consistency(rng: Random) -> Arguments:
     matrices = [filled(rng, (3, 4), np.float64) for _ in range(2)]
     counts = [filled(rng, sizes[0], np.uint8) for _ in range(3)]
     sums = [filled(rng, sizes[0], np.float32) for _ in range(2)]
-    return [*inputs, *matrices, number(rng), number(rng), *counts, *sums]
+    if rng.random() < 0.5:  # a few pixels aside
+        matrices = [np.hstack([np.eye(3), rng.uniform(-3, 3, (3, 1))]) for _ in range(2)]
+    return [backend(rng), *inputs, *matrices, number(rng), number(rng), *counts, *sums]
 
 
 def fuse_partner(rng: Random) -> Arguments:
@@ -184,12 +186,15 @@ def confirm_depth(rng: Random) -> Arguments:
 def add_patch_equations(rng: Random) -> Arguments:
     h, w = size(rng)
     rows = int(rng.integers(0, h + 1))
-    image, source = filled(rng, (h, w), np.uint8), filled(rng, size(rng), np.uint8)
-    # Half of them look at the same place, so that windows do meet.
-    matrix = np.hstack([np.eye(3), np.zeros((3, 1))]) if rng.random() < 0.5 else filled(rng, (3, 4), np.float64)
+    image, count = filled(rng, (h, w), np.uint8), int(rng.integers(1, 5))
+    sources, matrices = tuple(filled(rng, size(rng), np.uint8) for _ in range(count)), np.zeros((count, 3, 4))
+    for matrix in matrices:
+        # Half of them look at the same place, so that windows do meet.
+        same = np.hstack([np.eye(3), np.zeros((3, 1))])
+        matrix[:] = same if rng.random() < 0.5 else filled(rng, (3, 4), np.float64)
     planes, equations = filled(rng, (3, rows, w), np.float32), np.zeros((12, rows, w), np.float32)
     first = int(rng.integers(0, h - rows + 1))
-    return [backend(rng), image, source, matrix, planes, first, number(rng), number(rng) / 10, equations]
+    return [backend(rng), image, sources, matrices, planes, first, number(rng), number(rng) / 10, equations]
 
 
 def refine_planes(rng: Random) -> Arguments:
@@ -245,6 +250,9 @@ def spoiled(value: Any, others: Arguments, rng: Random) -> Any:
         return INTEGERS[int(rng.integers(len(INTEGERS)))]
     if isinstance(value, float):
         return FLOATS[int(rng.integers(len(FLOATS)))]
+    if isinstance(value, tuple) and value and isinstance(value[0], np.ndarray) and rng.random() < 0.7:
+        place = int(rng.integers(len(value)))
+        return (*value[:place], spoiled_array(value[place], others, rng), *value[place + 1 :])
     if isinstance(value, tuple):
         return [value[:1], (*value, 1.0), (None, None), list(value), (np.nan, np.inf)][int(rng.integers(5))]
     return ["", "avx1024", "scalar\0", "é" * 1000][int(rng.integers(4))]

@@ -49,6 +49,16 @@ def test_the_pair_has_its_disparities(kernels, same_range):
     assert (slot > 1).all() and (slot < scene.depth - 2).all()
 
 
+def test_partners_agree_with_the_scene(kernels):
+    scene = kernels.make_scene(200, 60, 64, same_range=True)
+    check, refine = kernels.partner_kernels(scene)
+    check.call("scalar")
+    refine.call("scalar")
+    observing, agreeing, contradicting = check.outputs[0]
+    assert agreeing.mean() > 0.5 and agreeing.sum() > 0.9 * observing.sum() and contradicting.mean() < 0.01
+    assert (refine.outputs[0][0] > 0).mean() > 0.3
+
+
 def test_the_whole_benchmark_of_kernels(kernels, monkeypatch, capsys):
     monkeypatch.setattr(kernels, "copy_bandwidth", lambda: 6e9)
     monkeypatch.setattr(kernels, "vector_throughput", lambda register: "there is no compiler")
@@ -56,7 +66,8 @@ def test_the_whole_benchmark_of_kernels(kernels, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", arguments)
     kernels.main()
     printed = capsys.readouterr().out
-    for name in ("census", "refine_offsets", "depth_candidates", "fit_planes"):
+    of_images = ("census", "refine_offsets", "depth_candidates", "fit_planes")
+    for name in (*of_images, "check_consistency", "add_patch_equations"):
         assert re.search(rf"^\| {name} \| - \| Mpixel/s \|", printed, re.MULTILINE)
     for depth in (96, 32, 64):
         for name in ("matching_cost", "aggregation", "selection", "match"):

@@ -340,10 +340,11 @@ def check(views, maps, options=OPTIONS):
     return check_depth(views[0], estimate(maps[0]), [(v, estimate(m)) for v, m in partners], options)
 
 
+@pytest.mark.parametrize("kernels", _native.backends())
 @pytest.mark.parametrize("max_error", [1.0, 0.1])
 @pytest.mark.parametrize("counted", [3, 255])
 @pytest.mark.parametrize("seed", range(2))
-def test_consistency_is_the_oracles(seed, counted, max_error):
+def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
     """Verdicts and weighted sums on noisy, holed depth maps of views that turn and differ."""
     rng = np.random.default_rng(seed)
     views, maps = wall_views(3)
@@ -363,6 +364,7 @@ def test_consistency_is_the_oracles(seed, counted, max_error):
     back = np.hstack([reference.R @ partner.R.T @ np.linalg.inv(partner.K), np.zeros((3, 1))])
     back[:, 3] = reference.t - reference.R @ partner.R.T @ partner.t
     _native.check_consistency(
+        kernels,
         maps[0],
         sigmas[0],
         maps[1],
@@ -392,6 +394,42 @@ def test_consistency_is_the_oracles(seed, counted, max_error):
     sums = (carried - maps[0])[agreed] / spread[agreed] ** 2
     np.testing.assert_allclose(weighted[agreed] - 0.5, sums, rtol=1e-3, atol=2e-3)
     assert (weight[verdict <= 0] == 2).all() and (weighted[verdict <= 0] == 0.5).all()
+
+
+@pytest.mark.parametrize("odd", [0, np.nan, np.inf, -1, 1e-40])
+@pytest.mark.parametrize("shift", [0.0, 0.3, -2.5])
+@pytest.mark.parametrize("size", [(1, 1), (3, 1), (1, 2), (5, 127), (4, 128), (3, 129), (2, 300)])
+def test_consistency_does_not_depend_on_the_backend(size, shift, odd):
+    """Rows that fill blocks and do not, points on the rim of the partner's map, and depths that are none."""
+    rng = np.random.default_rng(0)
+    maps = [rng.uniform(*bounds, size).astype(np.float32) for bounds in ((9.9, 10.1), (0.01, 0.1)) * 2]
+    for values in maps:
+        values[rng.random(size) < 0.1] = odd
+    forward, back = (np.hstack([np.eye(3), [[sign * 10 * shift], [0], [0]]]) for sign in (1, -1))
+    results = []
+    for kernels in _native.backends():
+        sums = [np.full(size, counted, np.uint8) for counted in (0, 254, 255)]
+        sums += [np.full(size, -0.0, np.float32), np.full(size, 2, np.float32)]
+        _native.check_consistency(kernels, *maps, forward, back, 2.0, 4.0, *sums)
+        results.append(sums)
+    assert results[0][0].any() or size[1] <= abs(shift) + 1
+    for other in results[1:]:
+        for one, same in zip(results[0], other, strict=True):
+            np.testing.assert_array_equal(one.view(np.uint8), same.view(np.uint8))
+
+
+def test_at_the_rim_the_nearest_depth_is_taken():
+    """The last column has no neighbours to interpolate with, though points half a pixel before it have."""
+    maps = [np.full((2, 3), 10, np.float32), np.full((2, 3), 0.05, np.float32)]
+    partner = np.array([[10, 10, 10.1], [10, 10, 10.1]], np.float32)
+    for shift, carried in ((0.0, 10.1), (-0.5, 1 / (0.5 / 10 + 0.5 / 10.1))):
+        forward, back = (np.hstack([np.eye(3), [[sign * 10 * shift], [0], [0]]]) for sign in (1, -1))
+        for kernels in _native.backends():
+            sums = [np.zeros((2, 3), np.uint8) for _ in range(3)] + [
+                np.zeros((2, 3), np.float32) for _ in range(2)
+            ]
+            _native.check_consistency(kernels, *maps, partner, maps[1], forward, back, 2.0, 4.0, *sums)
+            assert sums[3][0, 2] / sums[4][0, 2] == pytest.approx(carried - 10, rel=1e-4)
 
 
 def test_exact_maps_confirm_each_other_and_stay_as_they_are():

@@ -96,6 +96,7 @@ def arguments(function):
             "out support": np.zeros((H, W), u8),
         },
         "check_consistency": {
+            "backend": "scalar",
             "depth": np.ones((H, W), f32),
             "sigma": np.ones((H, W), f32),
             "partner_depth": np.ones((5, 6), f32),
@@ -173,8 +174,8 @@ def arguments(function):
         "add_patch_equations": {
             "backend": "scalar",
             "image": np.zeros((H, W), u8),
-            "source": np.zeros((9, 20), u8),
-            "source_from_reference": matrix,
+            "sources": (np.zeros((9, 20), u8), np.zeros((8, 7), u8)),
+            "sources_from_reference": np.stack([matrix, matrix]),
             "planes": np.ones((3, H, W), f32),
             "first_row": 0,
             "contrast": 20.0,
@@ -245,7 +246,6 @@ FREE = {
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
     ("add_patch_equations", "image"): {0},
-    ("add_patch_equations", "source"): {0, 1},
 }
 
 
@@ -449,6 +449,48 @@ def test_window_radius_out_of_bounds_is_refused(radius):
         call("fit_planes", {**arguments("fit_planes"), "radius": radius})
 
 
+@pytest.mark.parametrize("count", [0, 33])
+def test_number_of_sources_out_of_bounds_is_refused(count):
+    values = arguments("add_patch_equations")
+    values["sources"] = (np.zeros((9, 20), np.uint8),) * count
+    values["sources_from_reference"] = np.zeros((count, 3, 4))
+    with pytest.raises(ValueError, match=r"sources must lie in 1\.\.32"):
+        call("add_patch_equations", values)
+
+
+def test_as_many_sources_as_are_allowed_are_accepted():
+    values = arguments("add_patch_equations")
+    values["sources"] = tuple(np.zeros((9 + k, 20), np.uint8) for k in range(32))
+    values["sources_from_reference"] = np.zeros((32, 3, 4))
+    call("add_patch_equations", values)
+
+
+@pytest.mark.parametrize("place", [0, 1])
+def test_every_source_is_checked(place):
+    right, values = np.zeros((9, 20), np.uint8), arguments("add_patch_equations")
+    memory = np.zeros(values["out equations"].nbytes, np.uint8)
+    for wrong, error, message in [
+        (right.astype(np.float32), TypeError, "items of type"),
+        (None, TypeError, "contiguous"),
+        (right[:, ::2], TypeError, "contiguous"),
+        (right[None], ValueError, "dimensions"),
+        (np.zeros((0, 65536), np.uint8), ValueError, "65535"),
+        (np.broadcast_to(right, (2, 9, 20))[0].T, TypeError, "contiguous"),
+        (memory[-12:].reshape(3, 4), ValueError, "overlaps"),
+    ]:
+        sources = list(values["sources"])
+        sources[place] = wrong
+        equations = memory.view(np.float32).reshape(values["out equations"].shape)
+        with pytest.raises(error, match=message):
+            call("add_patch_equations", {**values, "sources": tuple(sources), "out equations": equations})
+
+
+@pytest.mark.parametrize("sources", [None, np.zeros((2, 9, 20), np.uint8), [np.zeros((9, 20), np.uint8)] * 2])
+def test_sources_must_be_a_tuple(sources):
+    with pytest.raises(TypeError, match="tuple"):
+        call("add_patch_equations", {**arguments("add_patch_equations"), "sources": sources})
+
+
 @pytest.mark.parametrize("first_row", [-1, 1, 2**62])
 def test_rows_beyond_the_image_are_refused(first_row):
     with pytest.raises(ValueError, match="rows"):
@@ -528,8 +570,10 @@ def test_empty_maps_are_no_work(shape):
     )
     for reference, other in ((empty, partner), (partner, empty)):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
-        _native.check_consistency(reference, reference, other, other, matrix, matrix, 1.0, 4.0, *counts)
-        assert not any(count.any() for count in counts)
+        for backend in BACKENDS:
+            maps = reference, reference, other, other
+            _native.check_consistency(backend, *maps, matrix, matrix, 1.0, 4.0, *counts)
+            assert not any(count.any() for count in counts)
         fuse_empty(reference, other, matrix)
     _native.fit_planes(
         "scalar",

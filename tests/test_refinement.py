@@ -32,11 +32,20 @@ def texture(shape, seed):
 
 
 def equations_of(backend, image, source, matrix, planes, options=OPTIONS):
+    return equations_of_all(backend, image, [(source, matrix)], planes, options)
+
+
+def equations_of_all(backend, image, partners, planes, options=OPTIONS):
     equations = np.zeros((12, *image.shape), np.float32)
-    _native.add_patch_equations(
-        backend, image, source, matrix, planes, 0, options.contrast, options.min_score, equations
-    )
+    add_equations(backend, image, partners, planes, options, equations)
     return equations
+
+
+def add_equations(backend, image, partners, planes, options, equations):
+    sources, matrices = tuple(source for source, _ in partners), np.stack([matrix for _, matrix in partners])
+    _native.add_patch_equations(
+        backend, image, sources, matrices, planes, 0, options.contrast, options.min_score, equations
+    )
 
 
 def slanted_planes(shape, seed, slope=0.002):
@@ -78,6 +87,46 @@ def test_equations_do_not_depend_on_the_backend(size, matrix):
     assert results[0].any()
     for other in results[1:]:
         np.testing.assert_array_equal(results[0], other)
+
+
+@pytest.mark.parametrize("backend", _native.backends())
+@pytest.mark.parametrize("size", [(6, 6), (9, 7), (17, 40), (11, 29)])
+def test_sources_of_one_call_add_up_in_their_order(backend, size):
+    """As by a call for each, to the bit: those of other sizes, and one too small for any window, included."""
+    image, planes, options = texture(size, 3), slanted_planes(size, 5), replace(OPTIONS, min_score=-0.5)
+    sources = [texture((30, 31), 4), texture((26, 50), 7), texture((6, 4), 8), texture((40, 28), 9)]
+    partners = list(zip(sources, (AFFINE, TURNED, AFFINE, PROJECTIVE), strict=True))
+    together, in_turn = (
+        equations_of_all(backend, image, partners, planes, options),
+        np.zeros((12, *size), np.float32),
+    )
+    alone = [equations_of_all(backend, image, [partner], planes, options) for partner in partners]
+    for partner in partners:
+        add_equations(backend, image, [partner], planes, options, in_turn)
+    assert sum(equations.any() for equations in alone) >= 2 and not alone[2].any()
+    np.testing.assert_array_equal(together.view(np.uint32), in_turn.view(np.uint32))
+    np.testing.assert_allclose(together, np.sum(alone, axis=0), rtol=1e-4, atol=1e-4 * np.abs(together).max())
+
+
+def test_there_may_be_more_partners_than_one_call_takes(monkeypatch):
+    """What fits into one call, and in parts: the same bits."""
+    block = syn.slanted_plane_pair(30.0, focal_length=300.0, size=(160, 120))
+    view, other = (
+        View(k, str(k), c.width, c.height, c.K, c.R, c.t, np.zeros(0, np.int64))
+        for k, c in enumerate((block.left, block.right))
+    )
+    truth, normals, _ = syn.exact_geometry(block.surfaces, block.left, origin=0.0)
+    depth = (truth * 1.002).astype(np.float32)
+    estimate = DepthEstimate(depth, (0.01 * depth).astype(np.float32), np.ones(truth.shape, np.uint8))
+    sources = [(other, texture((other.height, other.width), seed)) for seed in range(35)]
+    options, results = replace(OPTIONS, max_partners=35, min_score=-0.9), []
+    for most in (32, 3):
+        monkeypatch.setattr("colmap_sph.refinement._SOURCES", most)
+        maps = normals.astype(np.float32), depth.copy()
+        results.append(refine_maps(view, texture(truth.shape, 99), estimate, *maps, sources, options))
+    assert (results[0][1] != depth).any()
+    for one, part in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, part)
 
 
 @pytest.mark.parametrize("backend", _native.backends())

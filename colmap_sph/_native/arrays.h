@@ -6,7 +6,7 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
-enum { MAX_ARRAYS = 16 };
+enum { MAX_ARRAYS = 40 };
 
 typedef struct {
     Py_buffer views[MAX_ARRAYS];

@@ -122,12 +122,51 @@ typedef struct {
  * inverse depth; right side (3) and upper triangle (6) of the normal equations. */
 enum { PATCH_EQUATIONS = 12 };
 
-/* Adds the normal equations of matching a reference's pixels in a source. `planes` (3 arrays of inverse depth, 0 =
- * none, and its change along x and y) and `equations` belong to rows [first_row, first_row + rows) of the
- * reference. A pixel (x, y, 1) of inverse depth w lies at matrix (x, y, 1) + w translation in the source. */
-typedef void add_patch_equations_fn(const grey_image *reference, const grey_image *source, const double *matrix,
-                                    const double *translation, const float *planes, ptrdiff_t first_row,
-                                    ptrdiff_t rows, patch_options options, float *equations);
+/* An image to match in: a pixel (x, y, 1) of the reference with inverse depth w lies at
+ * matrix (x, y, 1) + w translation. */
+typedef struct {
+    grey_image image;
+    double matrix[9], translation[3];
+} patch_source;
+
+enum { MAX_PATCH_SOURCES = 32 }; /* in one call */
+
+/* Adds the normal equations of matching a reference's pixels in each of the sources. `planes` (3 arrays of inverse
+ * depth, 0 = none, and its change along x and y) and `equations` belong to rows [first_row, first_row + rows) of
+ * the reference. */
+typedef void add_patch_equations_fn(const grey_image *reference, const patch_source *sources, ptrdiff_t count,
+                                    const float *planes, ptrdiff_t first_row, ptrdiff_t rows,
+                                    patch_options options, float *equations);
+
+/* A view's depth (0 = none) and its standard deviation; fewer than 2^31 rows and columns. */
+typedef struct {
+    const float *depth, *sigma;
+    ptrdiff_t height, width;
+} depth_map;
+
+typedef struct {
+    double pixel_from_reference[9]; /* partner's K R K_ref^-1 */
+    double translation[3];          /* partner's K t */
+    double reference_from_pixel[9]; /* and back */
+    double back_translation[3];
+} view_transfer;
+
+typedef struct {
+    float max_reprojection_error; /* pixels */
+    float tolerance;              /* standard deviations that depths may differ by */
+} consistency_gates;
+
+/* Of the partners so far, per pixel: how many have the point in view and see nothing in front of it, agree, and
+ * contradict; and the running weighted sums of their depths, carried to the pixel's ray, less its own. */
+typedef struct {
+    uint8_t *observing, *agreeing, *contradicting;
+    float *weighted_depth, *weight;
+} consistency_sums;
+
+/* Adds the partner's verdict on every pixel of the reference. */
+typedef void check_consistency_fn(const depth_map *reference, const depth_map *partner,
+                                  const view_transfer *transfer, consistency_gates gates,
+                                  const consistency_sums *sums);
 
 typedef struct {
     const char *name;
@@ -138,6 +177,7 @@ typedef struct {
     match_fn *match;
     refine_offsets_fn *refine_offsets;
     depth_candidates_fn *depth_candidates;
+    check_consistency_fn *check_consistency;
     fit_planes_fn *fit_planes;
     add_patch_equations_fn *add_patch_equations;
 } kernel_table;
@@ -145,6 +185,7 @@ typedef struct {
 census_fn census_scalar, census_avx2;
 refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2, refine_offsets_avx512;
 depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
+check_consistency_fn check_consistency_scalar, check_consistency_avx2;
 fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512;
 add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512;
 
@@ -162,22 +203,6 @@ void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_widt
 /* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. */
 void vote_depth(const float *depths, const float *sigmas, ptrdiff_t count, ptrdiff_t pixels, float tolerance,
                 float *depth, float *sigma, uint8_t *support);
-
-typedef struct {
-    double pixel_from_reference[9]; /* partner's K R K_ref^-1 */
-    double translation[3];          /* partner's K t */
-    double reference_from_pixel[9]; /* and back */
-    double back_translation[3];
-} view_transfer;
-
-/* Adds the partner's verdict on every pixel of a depth map: to `observing` if it has the point in view and sees
- * nothing in front of it, to `agreeing` or `contradicting`; and the partner's depth, carried to the reference ray,
- * to the running weighted sums. */
-void check_consistency(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
-                       const float *partner_depth, const float *partner_sigma, ptrdiff_t partner_height,
-                       ptrdiff_t partner_width, const view_transfer *transfer, float max_reprojection_error,
-                       float tolerance, uint8_t *observing, uint8_t *agreeing, uint8_t *contradicting,
-                       float *weighted_depth, float *weight);
 
 enum { SURFACE_RADIUS = 3 };
 

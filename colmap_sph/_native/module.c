@@ -362,33 +362,51 @@ static int get_maps(array_set *arrays, PyObject *const *objects, view_maps *maps
     return inverse != NULL;
 }
 
+/* A depth map and its standard deviations; `map->sigma` is NULL, with an error set, where they are not accepted.
+ */
+static void get_depth_map(array_set *arrays, PyObject *depth, const char *depth_name, PyObject *sigma,
+                          const char *sigma_name, depth_map *map) {
+    Py_ssize_t shape[2] = {-1, -1};
+    map->depth = array_get(arrays, depth, depth_name, F32, 2, READ, shape);
+    map->sigma = map->depth && check(shape[0] <= INT32_MAX && shape[1] <= INT32_MAX,
+                                     "maps are limited to 2^31 - 1 rows and columns")
+                     ? array_get(arrays, sigma, sigma_name, F32, 2, READ, shape)
+                     : NULL;
+    map->height = shape[0];
+    map->width = shape[1];
+}
+
 static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     (void)self;
+    const char *backend;
     PyObject *o[11];
-    float max_error, tolerance;
-    if (!PyArg_ParseTuple(args, "OOOOOOffOOOOO", &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &max_error, &tolerance,
-                          &o[6], &o[7], &o[8], &o[9], &o[10])) {
+    consistency_gates gates;
+    if (!PyArg_ParseTuple(args, "sOOOOOOffOOOOO", &backend, &o[0], &o[1], &o[2], &o[3], &o[4], &o[5],
+                          &gates.max_reprojection_error, &gates.tolerance, &o[6], &o[7], &o[8], &o[9], &o[10])) {
         return NULL;
     }
+    const kernel_table *table = table_or_error(backend);
     array_set arrays = {.count = 0};
+    depth_map reference = {.sigma = NULL}, partner = {.sigma = NULL};
     view_transfer transfer;
-    Py_ssize_t shape[2] = {-1, -1}, partner_shape[2] = {-1, -1};
-    const float *depth = array_get(&arrays, o[0], "depth", F32, 2, READ, shape);
-    const float *sigma = depth ? array_get(&arrays, o[1], "sigma", F32, 2, READ, shape) : NULL;
-    const float *partner = sigma ? array_get(&arrays, o[2], "partner_depth", F32, 2, READ, partner_shape) : NULL;
-    const float *partner_sigma =
-        partner ? array_get(&arrays, o[3], "partner_sigma", F32, 2, READ, partner_shape) : NULL;
-    const int ready = partner_sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
-    uint8_t *observing = ready ? array_get(&arrays, o[6], "observing", U8, 2, WRITE, shape) : NULL;
-    uint8_t *agreeing = observing ? array_get(&arrays, o[7], "agreeing", U8, 2, WRITE, shape) : NULL;
-    uint8_t *contradicting = agreeing ? array_get(&arrays, o[8], "contradicting", U8, 2, WRITE, shape) : NULL;
-    float *weighted = contradicting ? array_get(&arrays, o[9], "weighted_depth", F32, 2, WRITE, shape) : NULL;
-    float *weight = weighted ? array_get(&arrays, o[10], "weight", F32, 2, WRITE, shape) : NULL;
-    if (weight && arrays_disjoint(&arrays)) {
+    consistency_sums sums;
+    if (table) {
+        get_depth_map(&arrays, o[0], "depth", o[1], "sigma", &reference);
+    }
+    if (reference.sigma) {
+        get_depth_map(&arrays, o[2], "partner_depth", o[3], "partner_sigma", &partner);
+    }
+    const int ready = partner.sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
+    Py_ssize_t shape[2] = {reference.height, reference.width};
+    sums.observing = ready ? array_get(&arrays, o[6], "observing", U8, 2, WRITE, shape) : NULL;
+    sums.agreeing = sums.observing ? array_get(&arrays, o[7], "agreeing", U8, 2, WRITE, shape) : NULL;
+    sums.contradicting = sums.agreeing ? array_get(&arrays, o[8], "contradicting", U8, 2, WRITE, shape) : NULL;
+    sums.weighted_depth =
+        sums.contradicting ? array_get(&arrays, o[9], "weighted_depth", F32, 2, WRITE, shape) : NULL;
+    sums.weight = sums.weighted_depth ? array_get(&arrays, o[10], "weight", F32, 2, WRITE, shape) : NULL;
+    if (sums.weight && arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
-        check_consistency(depth, sigma, shape[0], shape[1], partner, partner_sigma, partner_shape[0],
-                          partner_shape[1], &transfer, max_error, tolerance, observing, agreeing, contradicting,
-                          weighted, weight);
+        table->check_consistency(&reference, &partner, &transfer, gates, &sums);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -560,44 +578,58 @@ static PyObject *py_fit_planes(PyObject *self, PyObject *args) {
     return finish(&arrays, status);
 }
 
+/* Fills in `sources`, one for each image of a tuple; false with an error set. */
+static int get_sources(array_set *arrays, PyObject *images, PyObject *transfers, patch_source *sources) {
+    const Py_ssize_t count = PyTuple_Size(images);
+    if (!check(count >= 1 && count <= MAX_PATCH_SOURCES, "the number of sources must lie in 1..32")) {
+        return 0;
+    }
+    Py_ssize_t shape[3] = {count, 3, 4};
+    const double *matrix = array_get(arrays, transfers, "sources_from_reference", F64, 3, READ, shape);
+    for (Py_ssize_t k = 0; matrix && k < count; k++) {
+        Py_ssize_t size[2] = {-1, -1};
+        grey_image *image = &sources[k].image;
+        image->values = array_get(arrays, PyTuple_GetItem(images, k), "source", U8, 2, READ, size);
+        if (!image->values || !check_width(size[1]) ||
+            !check(size[0] < 16384 || size[0] * size[1] < 1 << 30, "a source is limited to 2^30 pixels")) {
+            return 0;
+        }
+        image->height = size[0];
+        image->width = size[1];
+        split_transfer(matrix + 12 * k, sources[k].matrix, sources[k].translation);
+    }
+    return matrix != NULL;
+}
+
 static PyObject *py_add_patch_equations(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
     PyObject *o[5];
     Py_ssize_t first_row;
     patch_options options;
-    if (!PyArg_ParseTuple(args, "sOOOOnffO", &backend, &o[0], &o[1], &o[2], &o[3], &first_row, &options.contrast,
-                          &options.min_score, &o[4])) {
+    if (!PyArg_ParseTuple(args, "sOO!OOnffO", &backend, &o[0], &PyTuple_Type, &o[1], &o[2], &o[3], &first_row,
+                          &options.contrast, &options.min_score, &o[4])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
     array_set arrays = {.count = 0};
-    Py_ssize_t shape[2] = {-1, -1}, source_shape[2] = {-1, -1}, matrix_shape[2] = {3, 4};
-    grey_image reference, source;
-    reference.values = table ? array_get(&arrays, o[0], "image", U8, 2, READ, shape) : NULL;
-    source.values = reference.values ? array_get(&arrays, o[1], "source", U8, 2, READ, source_shape) : NULL;
-    const double *transfer =
-        source.values ? array_get(&arrays, o[2], "source_from_reference", F64, 2, READ, matrix_shape) : NULL;
+    Py_ssize_t shape[2] = {-1, -1};
+    patch_source sources[MAX_PATCH_SOURCES];
+    const uint8_t *image = table ? array_get(&arrays, o[0], "image", U8, 2, READ, shape) : NULL;
+    const int ready = image && get_sources(&arrays, o[1], o[2], sources);
     Py_ssize_t planes_shape[3] = {3, -1, shape[1]};
-    const float *planes = transfer ? array_get(&arrays, o[3], "planes", F32, 3, READ, planes_shape) : NULL;
+    const float *planes = ready ? array_get(&arrays, o[3], "planes", F32, 3, READ, planes_shape) : NULL;
     Py_ssize_t equations_shape[3] = {PATCH_EQUATIONS, planes_shape[1], shape[1]};
     float *equations = planes ? array_get(&arrays, o[4], "equations", F32, 3, WRITE, equations_shape) : NULL;
     if (equations &&
         check(first_row >= 0 && planes_shape[1] <= shape[0] && first_row <= shape[0] - planes_shape[1],
               "the rows must lie in the image") &&
-        check_width(source_shape[1]) &&
-        check(source_shape[0] < 16384 || source_shape[0] * source_shape[1] < 1 << 30,
-              "a source is limited to 2^30 pixels") &&
         arrays_disjoint(&arrays)) {
-        double matrix[9], translation[3];
-        split_transfer(transfer, matrix, translation);
-        reference.height = shape[0];
-        reference.width = shape[1];
-        source.height = source_shape[0];
-        source.width = source_shape[1];
+        const grey_image reference = {image, shape[0], shape[1]};
+        const Py_ssize_t count = PyTuple_Size(o[1]);
         Py_BEGIN_ALLOW_THREADS;
-        table->add_patch_equations(&reference, &source, matrix, translation, planes, first_row, planes_shape[1],
-                                   options, equations);
+        table->add_patch_equations(&reference, sources, count, planes, first_row, planes_shape[1], options,
+                                   equations);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -643,7 +675,7 @@ static PyMethodDef methods[] = {
      "is_left, first_row, depth, sigma)"},
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
     {"check_consistency", py_check_consistency, METH_VARARGS,
-     "check_consistency(depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
+     "check_consistency(backend, depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
      "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
      "weighted_depth, weight)"},
     {"confirm_depth", py_confirm_depth, METH_VARARGS,
@@ -662,8 +694,8 @@ static PyMethodDef methods[] = {
      "fit_planes(backend, inverse_depth, inverse_sigma, support, K, radius, tolerance, max_shift, shift_sigma, "
      "min_cosine, supported, normals, fitted_depth)"},
     {"add_patch_equations", py_add_patch_equations, METH_VARARGS,
-     "add_patch_equations(backend, image, source, source_from_reference, planes, first_row, contrast, min_score, "
-     "equations)"},
+     "add_patch_equations(backend, image, sources, sources_from_reference, planes, first_row, contrast, "
+     "min_score, equations)"},
     {"refine_planes", py_refine_planes, METH_VARARGS, "refine_planes(equations, sigma, slope_sigma, planes)"},
     {NULL, NULL, 0, NULL}};
 

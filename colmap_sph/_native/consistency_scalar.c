@@ -1,0 +1,2 @@
+#define CHECK_CONSISTENCY check_consistency_scalar
+#include "consistency.inc"
