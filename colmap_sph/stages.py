@@ -44,6 +44,8 @@ _SCRATCH_BYTES = 256 << 20
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
 # of a view while its depth is voted, without its pairs' maps, or checked.
 _MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 48.0, 45.0, 40.0
+# Rectified pixels of a large pair per pixel of its images, with a margin for what arrays do not count.
+_RECTIFIED_SHARE = 1.4
 # … and refined, beside the grey images.
 _REFINE_BYTES = 55.0
 
@@ -77,8 +79,11 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
     make_dir(context.pairs_dir)
     thread, threads = threading.local(), context.options.num_threads
     gate = MemoryGate(context.options.memory_budget)
-    scratch_bytes = min(_SCRATCH_BYTES, gate.free // (3 * threads))
-    cache_bytes = min(_CACHE_BYTES, gate.free // 12)
+    # Scratch memory and caches take of what the largest pair leaves, but never starve.
+    largest = max(view.width * view.height for view in context.scene.views)
+    spare = int(max(gate.spare(_RECTIFIED_SHARE * _MATCH_BYTES * largest), gate.free / 8))
+    scratch_bytes = min(_SCRATCH_BYTES, spare // (3 * threads))
+    cache_bytes = min(_CACHE_BYTES, spare // 6)
     gate.keep(threads * scratch_bytes + 2 * cache_bytes)
     images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
     masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, cache_bytes)

@@ -28,7 +28,7 @@ from colmap_sph.pairs import PairOptions, select_pairs
 from colmap_sph.pipeline import find_database, workspace_root
 from colmap_sph.rectification import RectificationOptions
 from colmap_sph.scene import read_scene
-from colmap_sph.stages import check_views, estimate_views, match_pairs
+from colmap_sph.stages import _MATCH_BYTES, check_views, estimate_views, match_pairs
 from colmap_sph.synthetic import DemoBlock
 from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.workspace import (
@@ -455,3 +455,12 @@ def test_find_database(project: Path) -> None:
     assert find_database(project / "sparse/0") == project.resolve() / "database.db"
     shutil.copy(project / "database.db", project / "sparse/0/database.db")
     assert find_database(project / "sparse/0") == project / "sparse/0/database.db"
+
+
+def test_a_pair_may_take_most_of_the_budget(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Caches and scratch memory take of what the largest pair leaves: two images do with twice a pair's bytes."""
+    keep_images(project, NADIR[:2])
+    monkeypatch.setattr("colmap_sph.memory.resident", lambda: 0)
+    memory = f"{int(1.8 * _MATCH_BYTES * 320 * 240)}"
+    report = colmap_sph.run(project / "sparse" / "0", options=replace(FEW_PAIRS, memory=memory))
+    assert report.pairs == 1 and not report.skipped_pairs
