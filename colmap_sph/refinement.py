@@ -36,7 +36,7 @@ _Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
 class RefinementOptions:
     """How depth and normals are refined on the images."""
 
-    rounds: int = 1
+    rounds: int = 2
     """Times that all planes are refined; 0 leaves them as the disparity maps gave them."""
     max_partners: int = 8
     """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""

@@ -26,7 +26,7 @@ from colmap_sph.cloud_files import POINT
 _VARIANTS: dict[str, list[str]] = {
     "default": ["--overwrite"],
     "not refined on the images": ["--refinement.rounds", "0"],
-    "refined twice": ["--refinement.rounds", "2"],
+    "refined once": ["--refinement.rounds", "1"],
     "fusion by COLMAP": ["--fusion.method", "colmap"],
     "three images must agree on a point": ["--fusion.min-num-pixels", "3"],
     "what one view confirms needs no surface around it": ["--depth.min-surface", "0"],
