@@ -39,7 +39,7 @@ _VARIANTS: dict[str, list[str]] = {
     ],
     "ranges do not follow slopes": ["--matching.max-slant", "0"],
     "64 disparities": ["--matching.disparities", "64"],
-    "five pairs": ["--pairs.num-pairs", "5"],
+    "five pairs": ["--num-pairs", "5"],
     "planar rectification": ["--rectification", "frame"],
 }
 _MIN_TRACK, _MAX_ERROR = 5, 0.7

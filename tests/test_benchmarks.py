@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from colmap_sph import _native
+from colmap_sph import _native, cli
 from colmap_sph.synthetic import DemoBlock
 
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
@@ -200,3 +200,13 @@ def test_a_run_that_fails_ends_the_benchmark_in_one_sentence(tmp_path: Path):
     assert done.returncode == 1
     assert done.stderr.startswith("error: `") and "ended with exit code 2: " in done.stderr
     assert "Traceback" not in done.stderr and str(tmp_path / "nothing") in done.stderr.partition("code 2")[2]
+
+
+# ---- ablation ----------------------------------------------------------------------------------------------
+
+
+def test_variants_of_the_ablation_are_options_of_the_program(capsys, tmp_path):
+    """Each gets as far as looking for the model."""
+    for options in importlib.import_module("ablation")._VARIANTS.values():
+        assert cli.main(["run", "--model", str(tmp_path / "none"), *options]) == 2
+        assert "none does not exist" in capsys.readouterr().err
