@@ -151,7 +151,7 @@ CHANGES = {
         expected_files(pairs=0, votes=0, photometric=4, geometric=4, cloud=True),
     ),
     "refinement": (
-        {"refinement": RefinementOptions(rounds=2)},
+        {"refinement": RefinementOptions(rounds=1)},
         expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
     ),
     "fusion": (
