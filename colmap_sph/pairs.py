@@ -212,19 +212,23 @@ class _Graph:
         """Return how well view `j` would serve the points of view `i`, or an even part of them."""
         rows = self._observed[i]
         rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
-        self._is_observed[self._observed[j]] = True
-        believed: NDArray[np.bool_] | float = self._is_observed[rows]
-        self._is_observed[self._observed[j]] = False
+        believed: NDArray[np.bool_] | float
         if self.source == "database":
-            most = self._weights.data[self._weights.indptr[i] : self._weights.indptr[i + 1]].max()
-            believed = float(self.weight(i, j) / most)
+            believed = float(self.weight(i, j) / self._weights[[i]].max())
+        else:
+            believed = self._observes(j, rows)
         views = self.scene.views
         return worth_of(views[i], views[j], self._points[rows], believed)
 
-    def _compute_angle(self, i: int, j: int) -> float:
+    def _observes(self, i: int, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which of the points view `i` observes."""
         self._is_observed[self._observed[i]] = True
-        shared = self._observed[j][self._is_observed[self._observed[j]]]
+        result = self._is_observed[rows]
         self._is_observed[self._observed[i]] = False
+        return result
+
+    def _compute_angle(self, i: int, j: int) -> float:
+        shared = self._observed[j][self._observes(i, self._observed[j])]
         if len(shared) == 0:
             return float("nan")
         # Spread evenly over the points, whose order says nothing about where they are.
