@@ -25,7 +25,7 @@ _MAX_DEPTH = 1024
 # Within 3 x 3 pixels of a coarser level, offsets on one surface differ by no more (in pixels of the finer one).
 _MAX_SURFACE_STEP = 4
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
-_BYTES_PER_SLOT = 3  # of a level's cost and aggregated volumes
+_BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
 # Offsets that differ from the median around them by no more (pixels) are noise; what differs by more may be
 # another surface, and is left to the filter of small segments.
 _MAX_NOISE = 2
@@ -61,9 +61,10 @@ class MatchingOptions:
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
-        if not 0 <= self.p1 <= self.p2_min <= self.p2 <= 193:
+        if not (0 <= self.p1 <= 63 and self.p1 <= self.p2_min <= self.p2 <= 127):
             raise OptionError(
-                f"penalties must keep 0 <= p1 <= p2_min <= p2 <= 193, not {self.p1}, {self.p2_min}, {self.p2}."
+                "penalties must keep 0 <= p1 <= 63 and p1 <= p2_min <= p2 <= 127, not "
+                f"{self.p1}, {self.p2_min}, {self.p2}."
             )
         if self.p2_contrast < 1:
             raise OptionError(f"p2_contrast must be at least 1, not {self.p2_contrast}.")
@@ -71,9 +72,10 @@ class MatchingOptions:
             value = getattr(self, name)
             if not _STEP <= value <= _MAX_DEPTH or value % _STEP:
                 raise OptionError(f"{name} must be a multiple of {_STEP} up to {_MAX_DEPTH}, not {value}.")
-        if not 0 <= self.range_radius <= 50:
-            raise OptionError(f"range_radius must lie in 0..50, not {self.range_radius}.")
-        for name in ("max_slant", "max_left_right_difference", "min_segment"):
+        for name, most in (("range_radius", 50), ("max_left_right_difference", 100)):
+            if not 0 <= getattr(self, name) <= most:
+                raise OptionError(f"{name} must lie in 0..{most}, not {getattr(self, name)}.")
+        for name in ("max_slant", "min_segment"):
             if getattr(self, name) < 0:
                 raise OptionError(f"{name} must not be negative, not {getattr(self, name)}.")
 

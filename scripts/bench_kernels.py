@@ -41,18 +41,18 @@ OFFSET_INVALID = np.iinfo(np.int32).min
 
 REGISTER_BYTES = {"avx2": 32, "avx512": 64}
 # Bytes of the volumes read and written per slot; that stored lines are first read into the cache is not counted.
-# Costs have 1 byte, sums 2. `aggregation` reads costs twice and sums once, and writes sums twice; `match` writes
-# costs and forward sums, and reads both, while the sums of all paths stay in the cache.
-TRAFFIC = {"matching_cost": 1, "aggregation": 2 * 1 + 3 * 2, "selection": 2, "match": 2 * (1 + 2)}
+# All volumes have 1 byte per slot. `aggregation` reads costs twice, writes and reads what the forward paths add to
+# them, and writes sums; `match` writes and reads costs and what the forward paths add, but sums stay in the cache.
+TRAFFIC = {"matching_cost": 1, "aggregation": 5, "selection": 1, "match": 4}
 """Kernel → bytes of memory traffic per slot."""
 
 
 def sweep_instructions(register: int, depth: int) -> float:
     """Vector instructions per register of both sweeps, in aggregation.inc and the files that include it."""
-    # `advance` has 6 (3 min, 2 add, subtract) for each of 4 paths, and from the second register on the running
-    # minimum; `one_up` and `one_down` have 2 each; `add_paths` has 4 unpacks, 4 maddubs, 2 adds and 2 permutes,
-    # and in the backward sweep 2 adds of the forward sums.
-    return 2 * (4 * (7 - register / depth) + 4 + 12) + 2
+    # Each of 4 paths has 6 (3 min, 2 add, subtract), and from the second register on the running minimum; `one_up`
+    # and `one_down` have 2 each; 3 adds sum what the paths add. The backward sweep's sums take 4 more (average, 3
+    # adds).
+    return 2 * (4 * (7 - register / depth) + 4 + 3) + 4
 
 
 def instructions(version: str, name: str, depth: int) -> dict[int, float]:
@@ -63,20 +63,18 @@ def instructions(version: str, name: str, depth: int) -> dict[int, float]:
     if name == "match":
         steps = [instructions(version, step, depth) for step in ("matching_cost", "aggregation", "selection")]
         return {register: sum(step.get(register, 0) for step in steps) for register in set().union(*steps)}
-    if version == "avx512" and name == "aggregation" and depth % 64:
+    if version == "avx512" and name in ("aggregation", "selection") and depth % 64:
         return instructions("avx2", name, depth)
     register = REGISTER_BYTES[version]
     counts = {
-        # hamming_4 has 10 (xor, 2 and, shift, 2 shuffles, add, sad, compare, blend), 8 times; shift and or, 7
-        # times; then shuffle, extract, 2 unpacks, insert.
-        ("avx2", "matching_cost"): 8 * 10 + 7 * 2 + 5,
-        # Four times xor and popcnt; 3 shifts; ternary logic, or, permute, blend.
-        ("avx512", "matching_cost"): 4 * 2 + 3 + 4,
-        # For 16 sums match_target_pixels has 5 (shift, or, blend, 2 min); for 32 first_minimum has 2 min, 2
-        # compares, pack, permute and movemask.
-        ("avx2", "selection"): 2 * 5 + 7,
-        # The same 5 for 32 sums; a min and a compare.
-        ("avx512", "selection"): 5 + 2,
+        # 16 times shuffle and add.
+        ("avx2", "matching_cost"): 16 * 2,
+        # hamming_32 has 4 times xor and popcnt, and 3 multiply-adds; for 64 slots a shuffle and a permute.
+        ("avx512", "matching_cost"): 4 * 2 + 3 + 1,
+        # 2 min, a compare and a movemask for 32 sums.
+        ("avx2", "selection"): 4,
+        # 2 min and a compare for 64 sums.
+        ("avx512", "selection"): 1.5,
         (version, "aggregation"): sweep_instructions(register, depth) * 32 / register,
     }
     return {register: counts[version, name]}
@@ -189,8 +187,9 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
     """The kernels whose work grows with the number of disparities; the last is `match`."""
     left, right = census_pair(scene)
     volume = (*scene.shape, scene.depth)
-    cost, sums = np.empty(volume, np.uint8), np.empty(volume, np.uint16)
-    scratch = np.empty((3, scene.base.size, scene.depth), np.uint8)
+    cost, sums = np.empty(volume, np.uint8), np.empty(volume, np.uint8)
+    scratch = np.empty((2, scene.base.size, scene.depth), np.uint8)
+    detours = scratch[0].reshape(volume)
     selected, matched = np.empty(scene.shape, np.int32), np.empty(scene.shape, np.int32)
     base, image = scene.base, scene.left
     p1, slant, difference = OPTIONS.p1, OPTIONS.max_slant, OPTIONS.max_left_right_difference
@@ -199,7 +198,7 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
         _native.matching_cost(backend, left, right, base, cost)
 
     def aggregation(backend: str) -> None:
-        _native.aggregation(backend, cost, base, image, p1, P2, slant, sums)
+        _native.aggregation(backend, cost, base, image, p1, P2, slant, detours, sums)
 
     def selection(backend: str) -> None:
         _native.selection(backend, sums, base, left, right, difference, selected)

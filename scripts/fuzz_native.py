@@ -70,13 +70,13 @@ def aggregation(rng: Random) -> Arguments:
     (h, w), depth, p1 = size(rng), 32 * int(rng.integers(1, 4)), int(rng.integers(0, 30))
     cost, image = filled(rng, (h, w, depth), np.uint8), filled(rng, (h, w), np.uint8)
     p2 = rng.integers(p1, 194, 256).astype(np.uint8)
-    base, sums = filled(rng, (h, w), np.int32), np.zeros((h, w, depth), np.uint16)
-    return [backend(rng), cost, base, image, p1, p2, int(rng.integers(0, 5)), sums]
+    base, sums = filled(rng, (h, w), np.int32), np.zeros((h, w, depth), np.uint8)
+    return [backend(rng), cost, base, image, p1, p2, int(rng.integers(0, 5)), np.zeros_like(cost), sums]
 
 
 def selection(rng: Random) -> Arguments:
     (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
-    sums, base = filled(rng, (h, w, depth), np.uint16), filled(rng, (h, w), np.int32)
+    sums, base = filled(rng, (h, w, depth), np.uint8), filled(rng, (h, w), np.int32)
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
     return [backend(rng), sums, base, *words, int(rng.integers(0, 5)), np.zeros((h, w), np.int32)]
 
@@ -86,7 +86,7 @@ def match(rng: Random) -> Arguments:
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
     base, image, p1 = filled(rng, (h, w), np.int32), filled(rng, (h, w), np.uint8), int(rng.integers(0, 30))
     p2, limits = rng.integers(p1, 194, 256).astype(np.uint8), (int(rng.integers(0, 5)), int(rng.integers(0, 5)))
-    scratch = np.zeros((3, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
+    scratch = np.zeros((2, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
     return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
 
 

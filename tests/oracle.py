@@ -54,19 +54,20 @@ def path_costs(cost, base, image, p1, p2, max_slant, direction):
             y0, x0 = y - direction[0], x - direction[1]
             if not (0 <= y0 < height and 0 <= x0 < width):
                 continue
-            before, least = path[y0, x0], path[y0, x0].min()
+            before = path[y0, x0] - path[y0, x0].min()
             difference = int(base[y, x]) - int(base[y0, x0])
             same = slot + (0 if abs(difference) <= max_slant else difference)
             one_step = np.minimum(_slots(before, same - 1), _slots(before, same + 1)) + p1
-            jump = least + int(p2[abs(int(image[y, x]) - int(image[y0, x0]))])
-            best = np.minimum(np.minimum(_slots(before, same), one_step), jump)
-            path[y, x] += best - least
+            jump = int(p2[abs(int(image[y, x]) - int(image[y0, x0]))])
+            path[y, x] += np.minimum(np.minimum(_slots(before, same), one_step), jump)
     return path
 
 
 def aggregation(cost, base, image, p1, p2, max_slant):
-    """Sum of the 8 paths, (H, W, D) int64."""
-    return sum(path_costs(cost, base, image, p1, p2, max_slant, direction) for direction in DIRECTIONS)
+    """Half of the sum of the 8 paths, rounded up, (H, W, D) int64; it and what four paths add end at 255."""
+    detours = [path_costs(cost, base, image, p1, p2, max_slant, direction) - cost for direction in DIRECTIONS]
+    forward, backward = (np.minimum(sum(half), 255) for half in (detours[:4], detours[4:]))
+    return np.minimum((forward + backward + 1) // 2 + 4 * cost.astype(np.int64), 255)
 
 
 def subpixel_offset(before, best, after):
@@ -81,19 +82,20 @@ def selection(aggregated, base, reference, target, max_difference):
     offsets = np.full((height, width), OFFSET_INVALID, dtype=np.int32)
     for y in range(height):
         content = [x for x in range(width) if int(reference[y, x]) < CENSUS_INVALID]
-        best_of_target = {}  # column in the target: (sum, column in the reference)
+        best_of_target = {}  # column in the target: (sum, columns in the reference)
         for x in content:
             for i in range(depth):
-                r, vote = x + int(base[y, x]) + i, (int(aggregated[y, x, i]), x)
-                if 0 <= r < target.shape[1] and vote[0] < 65535:
-                    best_of_target[r] = min(best_of_target.get(r, vote), vote)
+                r, vote = x + int(base[y, x]) + i, int(aggregated[y, x, i])
+                if 0 <= r < target.shape[1]:
+                    least, columns = best_of_target.get(r, (vote, []))
+                    best_of_target[r] = (vote, [x]) if vote < least else (least, columns + [x] * (vote == least))
         for x in content:
             sums = aggregated[y, x].astype(int)
             best = int(np.argmin(sums))
             r = x + int(base[y, x]) + best
             if best in (0, depth - 1) or r not in best_of_target or int(target[y, r]) >= CENSUS_INVALID:
                 continue
-            if abs(best_of_target[r][1] - x) <= max_difference:
+            if any(abs(column - x) <= max_difference for column in best_of_target[r][1]):
                 offsets[y, x] = (r - x) * 256 + subpixel_offset(*(int(s) for s in sums[best - 1 : best + 2]))
     return offsets
 

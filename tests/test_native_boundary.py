@@ -38,11 +38,12 @@ def arguments(function):
             "p1": 10,
             "p2": np.full(256, 60, u8),
             "max_slant": 2,
-            "out aggregated": np.zeros((H, W, DEPTH), np.uint16),
+            "out detours": np.zeros((H, W, DEPTH), u8),
+            "out aggregated": np.zeros((H, W, DEPTH), u8),
         },
         "selection": {
             "backend": "scalar",
-            "aggregated": np.zeros((H, W, DEPTH), np.uint16),
+            "aggregated": np.zeros((H, W, DEPTH), u8),
             "base": np.zeros((H, W), np.int32),
             **census_pair,
             "max_difference": 2,
@@ -57,7 +58,7 @@ def arguments(function):
             "p2": np.full(256, 60, u8),
             "max_slant": 2,
             "max_difference": 2,
-            "out scratch": np.zeros((3, H * W, DEPTH), u8),
+            "out scratch": np.zeros((2, H * W, DEPTH), u8),
             "out offset": np.zeros((H, W), np.int32),
         },
         "refine_offsets": {
@@ -384,7 +385,7 @@ def test_number_of_disparities_out_of_bounds_is_refused(depth):
     volumes = {
         "matching_cost": ["out cost"],
         "selection": ["aggregated"],
-        "aggregation": ["cost", "out aggregated"],
+        "aggregation": ["cost", "out detours", "out aggregated"],
         "match": ["out scratch"],
     }
     for function, names in volumes.items():
@@ -396,10 +397,10 @@ def test_number_of_disparities_out_of_bounds_is_refused(depth):
 
 
 @pytest.mark.parametrize(
-    ("p1", "p2"), [(-1, 60), (256, 60), (266, 60), (10, 194), (10, 255), (61, 60), (194, 194), (-246, 60)]
+    ("p1", "p2"), [(-1, 60), (256, 60), (266, 60), (10, 128), (10, 255), (64, 64), (61, 60), (194, 194), (-246, 60)]
 )
 def test_penalties_out_of_bounds_are_refused(p1, p2):
-    table = np.full(256, 60, np.uint8)
+    table = np.full(256, 100, np.uint8)
     table[255] = p2
     with pytest.raises(ValueError, match="penalties"):
         call("aggregation", {**arguments("aggregation"), "p1": p1, "p2": table})
@@ -517,10 +518,10 @@ def test_rows_beyond_16_bits_are_refused():
 def test_empty_images_are_no_work(backend, size, target_width):
     image, base, words = np.zeros(size, np.uint8), np.zeros(size, np.int32), np.zeros(size, np.uint64)
     target = np.zeros((size[0], target_width), np.uint64)
-    volume, sums = np.zeros((*size, 32), np.uint8), np.zeros((*size, 32), np.uint16)
+    volume, sums = np.zeros((*size, 32), np.uint8), np.zeros((*size, 32), np.uint8)
     _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.uint8), image, words)
     _native.matching_cost(backend, words, target, base, volume)
-    _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, sums)
+    _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, volume.copy(), sums)
     _native.selection(backend, sums, base, words, target, 2, np.zeros(size, np.int32))
 
 
@@ -531,7 +532,7 @@ def test_target_without_columns_is_never_matched(backend):
     cost, offset = np.zeros((H, W, DEPTH), np.uint8), np.zeros((H, W), np.int32)
     _native.matching_cost(backend, reference, target, base, cost)
     np.testing.assert_array_equal(cost, oracle.COST_UNSEEN)
-    _native.selection(backend, cost.astype(np.uint16), base, reference, target, 2, offset)
+    _native.selection(backend, cost, base, reference, target, 2, offset)
     np.testing.assert_array_equal(offset, oracle.OFFSET_INVALID)
 
 
@@ -543,9 +544,9 @@ def test_empty_images_of_absurd_width_are_refused_or_no_work(backend):
     volume, image = np.empty((0, width, 32), np.uint8), np.empty((0, width), np.uint8)
     words = np.empty((0, width), np.uint64)
     for function, values in {
-        "aggregation": (volume, base, image, 10, p2, 2, volume.astype(np.uint16)),
+        "aggregation": (volume, base, image, 10, p2, 2, volume.copy(), volume.copy()),
         "matching_cost": (words, words, base, volume),
-        "selection": (volume.astype(np.uint16), base, words, words, 2, np.empty((0, width), np.int32)),
+        "selection": (volume, base, words, words, 2, np.empty((0, width), np.int32)),
     }.items():
         with pytest.raises((ValueError, MemoryError)):
             getattr(_native, function)(backend, *values)

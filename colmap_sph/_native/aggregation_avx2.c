@@ -12,7 +12,6 @@ ALWAYS_INLINE vector load(const uint8_t *p) { return _mm256_loadu_si256((const v
 ALWAYS_INLINE void store(uint8_t *p, vector v) { _mm256_storeu_si256((vector *)(void *)p, v); }
 ALWAYS_INLINE vector repeat_byte(int byte) { return _mm256_set1_epi8((char)byte); }
 ALWAYS_INLINE vector repeat_word(uint32_t word) { return _mm256_set1_epi32((int)word); }
-ALWAYS_INLINE vector repeat_lowest(__m128i v) { return _mm256_broadcastb_epi8(v); }
 ALWAYS_INLINE vector lesser(vector a, vector b) { return _mm256_min_epu8(a, b); }
 ALWAYS_INLINE vector add(vector a, vector b) { return _mm256_add_epi8(a, b); }
 ALWAYS_INLINE vector add_saturated(vector a, vector b) { return _mm256_adds_epu8(a, b); }
@@ -28,30 +27,26 @@ ALWAYS_INLINE vector one_down(vector v, vector after) {
     return _mm256_alignr_epi8(_mm256_permute2x128_si256(v, after, 0x21), v, 1);
 }
 
-/* The least byte, in the lowest byte. */
-ALWAYS_INLINE __m128i horizontal_min(vector v) {
-    const __m128i m = _mm_min_epu8(_mm256_castsi256_si128(v), _mm256_extracti128_si256(v, 1));
-    /* The upper byte of each 16 bits becomes 0. */
-    return _mm_minpos_epu16(_mm_min_epu8(m, _mm_srli_epi16(m, 8)));
+/* The least byte of each of four vectors, in all of its bytes. */
+ALWAYS_INLINE void spread_minima(vector v[4]) {
+    /* Halves of two vectors each, then quarters of all four: one by one their least byte comes first. */
+    const vector a =
+        lesser(_mm256_permute2x128_si256(v[0], v[1], 0x20), _mm256_permute2x128_si256(v[0], v[1], 0x31));
+    const vector b =
+        lesser(_mm256_permute2x128_si256(v[2], v[3], 0x20), _mm256_permute2x128_si256(v[2], v[3], 0x31));
+    vector m = lesser(_mm256_unpacklo_epi64(a, b), _mm256_unpackhi_epi64(a, b));
+    m = lesser(m, _mm256_srli_epi64(m, 32));
+    m = lesser(m, _mm256_srli_epi32(m, 16));
+    m = lesser(m, _mm256_srli_epi16(m, 8));
+    const int64_t lower = 0, upper = 0x0808080808080808;
+    m = _mm256_shuffle_epi8(m, _mm256_setr_epi64x(lower, upper, lower, upper));
+    v[0] = _mm256_permute4x64_epi64(m, 0x00);
+    v[1] = _mm256_permute4x64_epi64(m, 0xaa);
+    v[2] = _mm256_permute4x64_epi64(m, 0x55);
+    v[3] = _mm256_permute4x64_epi64(m, 0xff);
 }
 
-/* out[0..31] = a + b + c + d (+ in[0..31]), 8 bits to 16. */
-ALWAYS_INLINE void add_paths(int add_in, const uint16_t *in, uint16_t *out, vector a, vector b, vector c,
-                             vector d) {
-    const vector ones = _mm256_set1_epi8(1);
-    const vector low = _mm256_add_epi16(_mm256_maddubs_epi16(_mm256_unpacklo_epi8(a, b), ones),
-                                        _mm256_maddubs_epi16(_mm256_unpacklo_epi8(c, d), ones));
-    const vector high = _mm256_add_epi16(_mm256_maddubs_epi16(_mm256_unpackhi_epi8(a, b), ones),
-                                         _mm256_maddubs_epi16(_mm256_unpackhi_epi8(c, d), ones));
-    vector first = _mm256_permute2x128_si256(low, high, 0x20);
-    vector second = _mm256_permute2x128_si256(low, high, 0x31);
-    if (add_in) {
-        first = _mm256_add_epi16(first, _mm256_loadu_si256((const vector *)(const void *)in));
-        second = _mm256_add_epi16(second, _mm256_loadu_si256((const vector *)(const void *)(in + 16)));
-    }
-    _mm256_storeu_si256((vector *)(void *)out, first);
-    _mm256_storeu_si256((vector *)(void *)(out + 16), second);
-}
+ALWAYS_INLINE vector average(vector a, vector b) { return _mm256_avg_epu8(a, b); }
 
 #define SWEEP_BEGIN sweep_begin_avx2
 #define SWEEP_ROWS sweep_rows_avx2

@@ -11,15 +11,16 @@
         return cost_of_rows(&rows_##version, reference, target, base, size, cost); \
     } \
     static int aggregation_##version(const uint8_t *cost, const int32_t *base, const uint8_t *image, \
-                                     match_size size, path_penalties penalties, uint16_t *aggregated) { \
-        return aggregate_rows(&rows_##version, cost, base, image, size, penalties, aggregated); \
+                                     match_size size, path_penalties penalties, uint8_t *detours, \
+                                     uint8_t *aggregated) { \
+        return aggregate_rows(&rows_##version, cost, base, image, size, penalties, detours, aggregated); \
     } \
-    static int selection_##version(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference, \
+    static int selection_##version(const uint8_t *aggregated, const int32_t *base, const uint64_t *reference, \
                                    const uint64_t *target, match_size size, int32_t max_difference, \
                                    int32_t *offset) { \
         return select_rows(&rows_##version, aggregated, base, reference, target, size, max_difference, offset); \
     } \
-    static int match_##version(const match_input *input, ptrdiff_t band_rows, uint16_t *scratch, \
+    static int match_##version(const match_input *input, ptrdiff_t band_rows, uint8_t *scratch, \
                                int32_t *offset) { \
         return match_rows(&rows_##version, input, band_rows, scratch, offset); \
     }
@@ -61,7 +62,8 @@ static int has_avx512(void) {
     __builtin_cpu_init();
     return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
            __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
-           __builtin_cpu_supports("avx512vbmi") && __builtin_cpu_supports("avx512vpopcntdq");
+           __builtin_cpu_supports("avx512vbmi") && __builtin_cpu_supports("avx512ifma") &&
+           __builtin_cpu_supports("avx512vpopcntdq");
 }
 #endif
 

@@ -15,7 +15,10 @@ enum {
     CENSUS_RADIUS_Y = 3,
     CENSUS_BITS = 62,
     COST_UNSEEN = 32, /* target pixel outside its image: as bad as a random match (62 / 2), no worse */
-    MAX_P2 = 255 - CENSUS_BITS,
+    /* A path cost is at most CENSUS_BITS + P2, which NO_SLOT exceeds. NO_SLOT + P1 and 2 P2 fit in 8 bits. */
+    MAX_P1 = 63,
+    MAX_P2 = 127,
+    NO_SLOT = 192,
     DEPTH_STEP = 32,
     MAX_DEPTH = 1024,
     MAX_FIT_RADIUS = 16,
@@ -42,18 +45,21 @@ typedef int cost_fn(const uint64_t *reference, const uint64_t *target, const int
 
 typedef struct {
     uint8_t p1;
-    const uint8_t *p2; /* by absolute intensity difference; p1 <= p2 <= MAX_P2 */
+    const uint8_t *p2; /* by absolute intensity difference; p1 <= p2 <= MAX_P2, p1 <= MAX_P1 */
     /* Bases of neighbours that differ by at most this are taken for the slope of one surface, which then costs
      * nothing to follow. */
     int32_t max_slant;
 } path_penalties;
 
-/* Sum over 8 paths. */
+/* Half of the sum over 8 paths, rounded up, and on the way what the first four add to the costs; see
+ * aggregation_scalar.c. */
 typedef int aggregation_fn(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
-                           path_penalties penalties, uint16_t *aggregated);
+                           path_penalties penalties, uint8_t *detours, uint8_t *aggregated);
 
-/* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. */
-typedef int selection_fn(const uint16_t *aggregated, const int32_t *base, const uint64_t *reference,
+/* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. A winner
+ * passes the check if, of all that point at its target pixel, one of the best is at most
+ * `max_left_right_difference` columns from it. */
+typedef int selection_fn(const uint8_t *aggregated, const int32_t *base, const uint64_t *reference,
                          const uint64_t *target, match_size size, int32_t max_left_right_difference,
                          int32_t *offset);
 
@@ -66,9 +72,9 @@ typedef struct {
     int32_t max_left_right_difference;
 } match_input;
 
-/* Cost, aggregation and selection in one. `scratch` has room for 3 bytes per slot of `band_rows` rows; the result
+/* Cost, aggregation and selection in one. `scratch` has room for 2 bytes per slot of `band_rows` rows; the result
  * does not depend on their number, but with fewer rows than the image has, half of the sweeps are done twice. */
-typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint16_t *scratch, int32_t *offset);
+typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint8_t *scratch, int32_t *offset);
 
 /* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
 typedef int refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,

@@ -115,7 +115,8 @@ static PyObject *py_matching_cost(PyObject *self, PyObject *args) {
 
 static int check_penalties(int p1, const uint8_t *p2) {
     for (int k = 0; k < 256; k++) {
-        if (!check(p1 >= 0 && p1 <= p2[k] && p2[k] <= MAX_P2, "penalties must keep 0 <= P1 <= P2 <= 193")) {
+        if (!check(p1 >= 0 && p1 <= MAX_P1 && p1 <= p2[k] && p2[k] <= MAX_P2,
+                   "penalties must keep 0 <= P1 <= 63, P1 <= P2 <= 127")) {
             return 0;
         }
     }
@@ -125,9 +126,10 @@ static int check_penalties(int p1, const uint8_t *p2) {
 static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
-    PyObject *o[5];
+    PyObject *o[6];
     int p1, max_slant;
-    if (!PyArg_ParseTuple(args, "sOOOiOiO", &backend, &o[0], &o[1], &o[2], &p1, &o[3], &max_slant, &o[4])) {
+    if (!PyArg_ParseTuple(args, "sOOOiOiOO", &backend, &o[0], &o[1], &o[2], &p1, &o[3], &max_slant, &o[4],
+                          &o[5])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
@@ -138,13 +140,14 @@ static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     const int32_t *base = cost ? array_get(&arrays, o[1], "base", I32, 2, READ, shape) : NULL;
     const uint8_t *image = base ? array_get(&arrays, o[2], "image", U8, 2, READ, shape) : NULL;
     const uint8_t *p2 = image ? array_get(&arrays, o[3], "p2", U8, 1, READ, lut_shape) : NULL;
-    uint16_t *aggregated = p2 ? array_get(&arrays, o[4], "aggregated", U16, 3, WRITE, shape) : NULL;
+    uint8_t *detours = p2 ? array_get(&arrays, o[4], "detours", U8, 3, WRITE, shape) : NULL;
+    uint8_t *aggregated = detours ? array_get(&arrays, o[5], "aggregated", U8, 3, WRITE, shape) : NULL;
     if (aggregated && check_depth(shape[2]) && check_width(shape[1]) && check_penalties(p1, p2) &&
         check(max_slant >= 0, "the slant must not be negative") && arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], 0, shape[2]};
         const path_penalties penalties = {(uint8_t)p1, p2, max_slant};
         Py_BEGIN_ALLOW_THREADS;
-        status = table->aggregation(cost, base, image, size, penalties, aggregated);
+        status = table->aggregation(cost, base, image, size, penalties, detours, aggregated);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
@@ -162,7 +165,7 @@ static PyObject *py_selection(PyObject *self, PyObject *args) {
     array_set arrays = {.count = 0};
     int status = 0;
     Py_ssize_t shape[3] = {-1, -1, -1};
-    const uint16_t *aggregated = table ? array_get(&arrays, o[0], "aggregated", U16, 3, READ, shape) : NULL;
+    const uint8_t *aggregated = table ? array_get(&arrays, o[0], "aggregated", U8, 3, READ, shape) : NULL;
     const int32_t *base = aggregated ? array_get(&arrays, o[1], "base", I32, 2, READ, shape) : NULL;
     const uint64_t *reference = base ? array_get(&arrays, o[2], "reference", U64, 2, READ, shape) : NULL;
     Py_ssize_t target_shape[2] = {shape[0], -1};
@@ -190,7 +193,7 @@ static PyObject *py_match(PyObject *self, PyObject *args) {
     const kernel_table *table = table_or_error(backend);
     array_set arrays = {.count = 0};
     int status = 0;
-    Py_ssize_t shape[2] = {-1, -1}, lut_shape[1] = {256}, scratch_shape[3] = {3, -1, -1};
+    Py_ssize_t shape[2] = {-1, -1}, lut_shape[1] = {256}, scratch_shape[3] = {2, -1, -1};
     const uint64_t *reference = table ? array_get(&arrays, o[0], "reference", U64, 2, READ, shape) : NULL;
     Py_ssize_t target_shape[2] = {shape[0], -1};
     const uint64_t *target = reference ? array_get(&arrays, o[1], "target", U64, 2, READ, target_shape) : NULL;
@@ -201,10 +204,9 @@ static PyObject *py_match(PyObject *self, PyObject *args) {
     int32_t *offset = scratch ? array_get(&arrays, o[6], "offset", I32, 2, WRITE, shape) : NULL;
     if (offset && check_depth(scratch_shape[2]) && check_width(shape[1]) && check_width(target_shape[1]) &&
         check(scratch_shape[1] > 0 && (shape[1] == 0 || scratch_shape[1] % shape[1] == 0),
-              "scratch must have the size (3, pixels of one row or more, disparities)") &&
+              "scratch must have the size (2, pixels of one row or more, disparities)") &&
         check_penalties(p1, p2) && check(max_slant >= 0, "the slant must not be negative") &&
-        check(max_difference >= 0, "the left-right difference must not be negative") && arrays_disjoint(&arrays) &&
-        check((uintptr_t)scratch % sizeof(uint16_t) == 0, "scratch must be aligned to 16 bits")) {
+        check(max_difference >= 0, "the left-right difference must not be negative") && arrays_disjoint(&arrays)) {
         const match_input input = {reference,
                                    target,
                                    base,
@@ -214,7 +216,7 @@ static PyObject *py_match(PyObject *self, PyObject *args) {
                                    max_difference};
         const Py_ssize_t band_rows = shape[1] > 0 ? scratch_shape[1] / shape[1] : shape[0] + 1;
         Py_BEGIN_ALLOW_THREADS;
-        status = table->match(&input, band_rows, (uint16_t *)(void *)scratch, offset);
+        status = table->match(&input, band_rows, scratch, offset);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
@@ -661,7 +663,7 @@ static PyMethodDef methods[] = {
     {"census", py_census, METH_VARARGS, "census(backend, padded, valid, census)"},
     {"matching_cost", py_matching_cost, METH_VARARGS, "matching_cost(backend, reference, target, base, cost)"},
     {"aggregation", py_aggregation, METH_VARARGS,
-     "aggregation(backend, cost, base, image, p1, p2, max_slant, aggregated)"},
+     "aggregation(backend, cost, base, image, p1, p2, max_slant, detours, aggregated)"},
     {"selection", py_selection, METH_VARARGS,
      "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
     {"match", py_match, METH_VARARGS,

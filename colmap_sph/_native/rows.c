@@ -4,19 +4,17 @@
 #include <string.h>
 
 uint64_t *cost_row_buffer(match_size size) {
-    const ptrdiff_t padded_width = size.target_width + 2 * size.depth, bits = padded_width / 64 + 2;
-    uint64_t *buffer = malloc((size_t)(padded_width + bits) * sizeof *buffer);
-    for (ptrdiff_t i = 0; buffer && i < padded_width + bits; i++) {
-        buffer[i] = i < padded_width ? CENSUS_INVALID : 0;
-    }
-    return buffer;
+    /* Three words per pixel: room for 17 planes of bytes, whose lines are filled up. */
+    const size_t padded_width = (size_t)(size.target_width + 2 * size.depth) + 128;
+    return malloc(3 * padded_width * sizeof(uint64_t));
 }
 
 int selection_begin(selection_buffers *buffers, match_size size) {
-    const ptrdiff_t keys = 2 * keys_per_parity(size);
-    buffers->keys = malloc((size_t)(keys + size.width) * sizeof *buffers->keys);
-    buffers->winner = buffers->keys ? (int32_t *)(buffers->keys + keys) : NULL;
-    return buffers->keys ? 0 : -1;
+    /* Three more, as vectorised versions read four at once. */
+    const ptrdiff_t best_sums = size.target_width + 2 * size.depth + 3;
+    buffers->winner = malloc((size_t)size.width * sizeof(int32_t) + (size_t)best_sums);
+    buffers->best_sum = buffers->winner ? (uint8_t *)(buffers->winner + size.width) : NULL;
+    return buffers->winner ? 0 : -1;
 }
 
 int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
@@ -32,7 +30,7 @@ int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const ui
 }
 
 int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_t *base, const uint8_t *image,
-                   match_size size, path_penalties penalties, uint16_t *aggregated) {
+                   match_size size, path_penalties penalties, uint8_t *detours, uint8_t *aggregated) {
     for (int backward = 0; backward < 2; backward++) {
         sweep_state state;
         if (kernels->sweep_begin(&state, base, image, size, penalties, backward)) {
@@ -40,15 +38,15 @@ int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_
         }
         const ptrdiff_t y = backward ? size.height - 1 : 0, row = y * size.width * size.depth;
         if (size.height > 0) {
-            kernels->sweep_rows(&state, y, size.height, cost + row, backward ? aggregated + row : NULL,
-                                aggregated + row);
+            kernels->sweep_rows(&state, y, size.height, cost + row, detours + row,
+                                backward ? aggregated + row : NULL);
         }
         free(state.memory);
     }
     return 0;
 }
 
-int select_rows(const row_kernels *kernels, const uint16_t *aggregated, const int32_t *base,
+int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
                 const uint64_t *reference, const uint64_t *target, match_size size,
                 int32_t max_left_right_difference, int32_t *offset) {
     selection_buffers buffers;
@@ -61,7 +59,7 @@ int select_rows(const row_kernels *kernels, const uint16_t *aggregated, const in
                                target + y * size.target_width, size, max_left_right_difference, &buffers,
                                offset + row);
     }
-    free(buffers.keys);
+    free(buffers.winner);
     return 0;
 }
 
@@ -72,7 +70,7 @@ typedef struct {
     const match_input *input;
     ptrdiff_t row_size, band_rows;
     uint64_t *cost_buffer;
-    uint16_t *row_sums;
+    uint8_t *row_sums;
     selection_buffers selection;
     sweep_state forward, backward;
     uint8_t *checkpoints; /* what the forward sweep brings to each band but the first */
@@ -81,22 +79,22 @@ typedef struct {
 /* A group is as many rows as are swept at once and still are in the cache for the next step. */
 enum { GROUP = 2 };
 
-static void forward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost, uint16_t *sums) {
+static void forward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost, uint8_t *detours) {
     const match_input *in = m->input;
     for (ptrdiff_t r = y; r < y + rows; r++) {
         m->kernels->cost_row(in->reference + r * in->size.width, in->target + r * in->size.target_width,
                              in->base + r * in->size.width, in->size, m->cost_buffer,
                              cost + (r - y) * m->row_size);
     }
-    m->kernels->sweep_rows(&m->forward, y, rows, cost, NULL, sums);
+    m->kernels->sweep_rows(&m->forward, y, rows, cost, detours, NULL);
 }
 
-/* Rows up to y, whose costs and sums are given. */
-static void backward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost, const uint16_t *sums,
+/* Rows up to y, whose costs and forward detours are given. */
+static void backward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost, uint8_t *detours,
                           int32_t *offset) {
     const match_input *in = m->input;
-    uint16_t *row_sums = m->row_sums + (rows - 1) * m->row_size;
-    m->kernels->sweep_rows(&m->backward, y, rows, cost, sums, row_sums);
+    uint8_t *row_sums = m->row_sums + (rows - 1) * m->row_size;
+    m->kernels->sweep_rows(&m->backward, y, rows, cost, detours, row_sums);
     for (ptrdiff_t r = 0; r < rows; r++) {
         const ptrdiff_t row = (y - r) * in->size.width;
         m->kernels->selection_row(row_sums - r * m->row_size, in->base + row, in->reference + row,
@@ -109,13 +107,13 @@ static ptrdiff_t lesser(ptrdiff_t a, ptrdiff_t b) { return a < b ? a : b; }
 
 /* The last band first. Its forward sweep starts from what was noted when the rows above it were swept for that
  * alone: the result is that of one piece, to the bit. */
-static void match_bands(matcher *m, ptrdiff_t bands, uint16_t *sums, int32_t *offset) {
+static void match_bands(matcher *m, ptrdiff_t bands, uint8_t *cost, int32_t *offset) {
     const ptrdiff_t height = m->input->size.height, row_size = m->row_size;
-    uint8_t *cost = (uint8_t *)(sums + m->band_rows * row_size);
+    uint8_t *detours = cost + m->band_rows * row_size;
     for (ptrdiff_t band = 0; band < bands - 1; band++) {
         const ptrdiff_t first = band * m->band_rows;
         for (ptrdiff_t n = 0; n < m->band_rows; n += GROUP) {
-            forward_rows(m, first + n, lesser(GROUP, m->band_rows - n), cost, sums);
+            forward_rows(m, first + n, lesser(GROUP, m->band_rows - n), cost, detours);
         }
         memcpy(m->checkpoints + (size_t)band * m->forward.memory_size, m->forward.memory, m->forward.memory_size);
     }
@@ -127,16 +125,16 @@ static void match_bands(matcher *m, ptrdiff_t bands, uint16_t *sums, int32_t *of
                    m->forward.memory_size);
         }
         for (ptrdiff_t n = 0; n < count; n += GROUP) {
-            forward_rows(m, first + n, lesser(GROUP, count - n), cost + n * row_size, sums + n * row_size);
+            forward_rows(m, first + n, lesser(GROUP, count - n), cost + n * row_size, detours + n * row_size);
         }
         for (ptrdiff_t n = count; n > 0; n -= lesser(GROUP, n)) {
-            backward_rows(m, first + n - 1, lesser(GROUP, n), cost + (n - 1) * row_size, sums + (n - 1) * row_size,
-                          offset);
+            backward_rows(m, first + n - 1, lesser(GROUP, n), cost + (n - 1) * row_size,
+                          detours + (n - 1) * row_size, offset);
         }
     }
 }
 
-int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band_rows, uint16_t *scratch,
+int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band_rows, uint8_t *scratch,
                int32_t *offset) {
     const ptrdiff_t bands = in->size.height > 0 ? (in->size.height + band_rows - 1) / band_rows : 0;
     matcher m = {.kernels = kernels, .input = in, .band_rows = band_rows};
@@ -156,7 +154,7 @@ int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band
     free(m.checkpoints);
     free(m.row_sums);
     free(m.cost_buffer);
-    free(m.selection.keys);
+    free(m.selection.winner);
     free(m.backward.memory);
     free(m.forward.memory);
     return status;

@@ -10,7 +10,7 @@
 /* Costs of one row, `size.width * size.depth` of them; `buffer` is one of cost_row_buffer. */
 typedef void cost_row_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
                          uint64_t *buffer, uint8_t *cost);
-/* One target row with `depth` unseen pixels on both sides, and a bit for each, which is 0; NULL without memory. */
+/* Room for one target row with `depth` unseen pixels on both sides, in three words each; NULL without memory. */
 uint64_t *cost_row_buffer(match_size size);
 
 /* ---- path aggregation -------------------------------------------------------------------------------------- */
@@ -31,33 +31,26 @@ typedef struct {
 /* 0, or -1 without memory; ended by free(state->memory). */
 typedef int sweep_begin_fn(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
                            path_penalties penalties, int backward);
-/* The next `rows` rows, from y on: sums_out = the four paths of a forward sweep, sums_in + those of a backward
- * one, whose rows lie before the one that the pointers are to. */
-typedef void sweep_rows_fn(sweep_state *state, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost,
-                           const uint16_t *sums_in, uint16_t *sums_out);
+/* The next `rows` rows, from y on. A forward sweep writes `detours`; a backward one, whose rows lie before the one
+ * that the pointers are to, reads them and writes `sums`. */
+typedef void sweep_rows_fn(sweep_state *state, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost, uint8_t *detours,
+                           uint8_t *sums);
 
 /* ---- selection --------------------------------------------------------------------------------------------- */
 
-/* Of every target pixel the least sum that points at it, and from which column, as one number: sum << 16 | column.
- * Of equal sums the leftmost wins, in whatever order they come. */
 typedef struct {
-    uint32_t *keys;  /* room for a target row with `depth` pixels on both sides, in any order, */
-    int32_t *winner; /* and for a number per pixel */
+    int32_t *winner;   /* of every pixel its best slot; -1 without content */
+    uint8_t *best_sum; /* of every target pixel, and `depth` more on both sides, the least sum that points at it */
 } selection_buffers;
 
-/* Half of the room for keys: the vectorised versions keep those of even and odd places apart. */
-static inline ptrdiff_t keys_per_parity(match_size size) { return (size.target_width + 2 * size.depth + 1) / 2; }
-
-#define NO_KEY UINT32_C(0xffff0000) /* which a sum of 65535 never beats */
-
-/* 0, or -1 without memory; ended by free(buffers->keys). */
+/* 0, or -1 without memory; ended by free(buffers->winner). */
 int selection_begin(selection_buffers *buffers, match_size size);
-typedef void selection_row_fn(const uint16_t *sums, const int32_t *base, const uint64_t *reference,
+typedef void selection_row_fn(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
                               const uint64_t *target, match_size size, int32_t max_left_right_difference,
                               selection_buffers *buffers, int32_t *offset);
 
 /* The second half of selection_row_avx2, which AVX-512 has, too: what is left of `buffers->winner`, refined. */
-void check_winners_avx2(const uint16_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+void check_winners_avx2(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
                         int32_t max_left_right_difference, const selection_buffers *buffers, int32_t *offset);
 
 /* ---- whole images from rows -------------------------------------------------------------------------------- */
@@ -77,11 +70,11 @@ selection_row_fn selection_row_scalar, selection_row_avx2, selection_row_avx512;
 int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
                  const int32_t *base, match_size size, uint8_t *cost);
 int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_t *base, const uint8_t *image,
-                   match_size size, path_penalties penalties, uint16_t *aggregated);
-int select_rows(const row_kernels *kernels, const uint16_t *aggregated, const int32_t *base,
+                   match_size size, path_penalties penalties, uint8_t *detours, uint8_t *aggregated);
+int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
                 const uint64_t *reference, const uint64_t *target, match_size size,
                 int32_t max_left_right_difference, int32_t *offset);
-int match_rows(const row_kernels *kernels, const match_input *input, ptrdiff_t band_rows, uint16_t *scratch,
+int match_rows(const row_kernels *kernels, const match_input *input, ptrdiff_t band_rows, uint8_t *scratch,
                int32_t *offset);
 
 #endif

@@ -1,59 +1,38 @@
-/* The AVX2 version of selection_scalar.c. A first pass over the sums finds each pixel's winner, and the keys of
- * the target pixels, those in even and in odd places apart: then one instruction makes eight keys of sixteen sums.
- * A second pass checks and refines eight winners at once. */
+/* The AVX2 version of selection_scalar.c. A first pass over the sums finds each pixel's winner and the target
+ * pixels' least sums; a second one checks and refines eight winners at once. */
 #include <immintrin.h>
 
 #include "rows.h"
 
 #define ALWAYS_INLINE static inline __attribute__((always_inline))
 
-/* Eight times the lesser key. */
-ALWAYS_INLINE void keep_lesser(uint32_t *keys, __m256i new_keys) {
-    __m256i *place = (__m256i *)(void *)keys;
-    _mm256_storeu_si256(place, _mm256_min_epu32(new_keys, _mm256_loadu_si256(place)));
-}
+ALWAYS_INLINE __m256i load(const uint8_t *p) { return _mm256_loadu_si256((const __m256i *)(const void *)p); }
 
-/* One pixel's sums against the best so far of the target pixels they point at: sums 0, 2, ... against `even` and
- * those between against `odd`. */
-ALWAYS_INLINE void match_target_pixels(const uint16_t *sums, ptrdiff_t x, ptrdiff_t depth, uint32_t *even,
-                                       uint32_t *odd) {
-    const __m256i column = _mm256_set1_epi32((int)x);
-    for (ptrdiff_t i = 0; i < depth; i += 16) {
-        const __m256i sum = _mm256_loadu_si256((const __m256i *)(sums + i));
-        keep_lesser(even + i / 2, _mm256_or_si256(_mm256_slli_epi32(sum, 16), column));
-        keep_lesser(odd + i / 2, _mm256_blend_epi16(sum, column, 0x55));
+/* The first of a pixel's least sums; and all of them against the least so far of the target pixels they point at.
+ * Without branches: where the minimum lies is hard to predict. */
+ALWAYS_INLINE int32_t first_minimum(const uint8_t *sums, ptrdiff_t depth, uint8_t *best_sum) {
+    __m256i minimum = _mm256_set1_epi8(-1);
+    for (ptrdiff_t i = 0; i < depth; i += 32) {
+        const __m256i sum = load(sums + i);
+        _mm256_storeu_si256((__m256i *)(void *)(best_sum + i), _mm256_min_epu8(sum, load(best_sum + i)));
+        minimum = _mm256_min_epu8(minimum, sum);
     }
-}
-
-/* A bit for each of 32 sums that equals `least`. */
-ALWAYS_INLINE uint32_t equal_32(const uint16_t *sums, __m256i least) {
-    const __m256i first = _mm256_cmpeq_epi16(least, _mm256_loadu_si256((const __m256i *)sums));
-    const __m256i second = _mm256_cmpeq_epi16(least, _mm256_loadu_si256((const __m256i *)(sums + 16)));
-    /* packs works on halves: their middle quarters must change places. */
-    const __m256i bytes = _mm256_permute4x64_epi64(_mm256_packs_epi16(first, second), 0xd8);
-    return (uint32_t)_mm256_movemask_epi8(bytes);
-}
-
-/* Without branches: where the minimum lies is hard to predict. */
-ALWAYS_INLINE int32_t first_minimum(const uint16_t *sums, ptrdiff_t depth) {
-    __m256i minimum = _mm256_loadu_si256((const __m256i *)sums);
-    for (ptrdiff_t i = 16; i < depth; i += 16) {
-        minimum = _mm256_min_epu16(minimum, _mm256_loadu_si256((const __m256i *)(sums + i)));
-    }
-    const __m128i half = _mm_min_epu16(_mm256_castsi256_si128(minimum), _mm256_extracti128_si256(minimum, 1));
-    const __m256i least = _mm256_broadcastw_epi16(_mm_minpos_epu16(half));
+    const __m128i half = _mm_min_epu8(_mm256_castsi256_si128(minimum), _mm256_extracti128_si256(minimum, 1));
+    /* The upper byte of each 16 bits becomes 0. */
+    const __m128i words = _mm_min_epu8(half, _mm_srli_epi16(half, 8));
+    const __m256i least = _mm256_broadcastb_epi8(_mm_minpos_epu16(words));
     int32_t first = 0;
     for (ptrdiff_t i = depth; i > 0;) {
-        uint64_t equal = equal_32(sums + (i -= 32), least);
+        uint64_t equal = (uint32_t)_mm256_movemask_epi8(_mm256_cmpeq_epi8(least, load(sums + (i -= 32))));
         if (depth % 64 == 0) {
-            equal = equal << 32 | equal_32(sums + (i -= 32), least);
+            equal = equal << 32 | (uint32_t)_mm256_movemask_epi8(_mm256_cmpeq_epi8(least, load(sums + (i -= 32))));
         }
         first = equal ? (int32_t)(i + __builtin_ctzll(equal)) : first;
     }
     return first;
 }
 
-/* subpixel_offset of eight pixels. Quotients are at most 128, with divisors of 16 bits: 32-bit floats round none
+/* subpixel_offset of eight pixels. Quotients are at most 128, with divisors of 8 bits: 32-bit floats round none
  * of them up to the next whole number. */
 ALWAYS_INLINE __m256i subpixel_offsets(__m256i before, __m256i best, __m256i after) {
     const __m256i rise = _mm256_sub_epi32(_mm256_max_epi32(before, after), best);
@@ -65,8 +44,40 @@ ALWAYS_INLINE __m256i subpixel_offsets(__m256i before, __m256i best, __m256i aft
                             _mm256_and_si256(_mm256_cmpgt_epi32(rise, zero), _mm256_cmpgt_epi32(best, zero)));
 }
 
+/* Bytes from memory, where bit mask `there` is set. Four are read at once. */
+ALWAYS_INLINE __m256i gather_bytes(const uint8_t *bytes, __m256i place, __m256i there) {
+    const int *fours = (const int *)(const void *)bytes;
+    const __m256i four =
+        _mm256_mask_i32gather_epi32(_mm256_setzero_si256(), fours, _mm256_srli_epi32(place, 2), there, 4);
+    const __m256i bits = _mm256_slli_epi32(_mm256_and_si256(place, _mm256_set1_epi32(3)), 3);
+    return _mm256_and_si256(_mm256_srlv_epi32(four, bits), _mm256_set1_epi32(UINT8_MAX));
+}
+
+/* Row entries from `first` on, which may lie before or behind the row where bit mask `there` is not set. */
+ALWAYS_INLINE __m256i load_there(const int32_t *row, ptrdiff_t first, __m256i there) {
+    return _mm256_maskload_epi32((const int *)((uintptr_t)row + (uintptr_t)first * sizeof *row), there);
+}
+
+/* Of the pixels `asked`, which lie from `column` on in the row: those of which the pixel `step` beside them has
+ * target pixel r for `best_sum`. */
+static inline __m256i agrees(const uint8_t *sums, const int32_t *base, match_size size, const int32_t *winner,
+                             __m256i column, int32_t step, __m256i r, __m256i best_sum, __m256i asked) {
+    const __m256i minus_one = _mm256_set1_epi32(-1), depth = _mm256_set1_epi32((int)size.depth);
+    const __m256i width = _mm256_set1_epi32((int)size.width);
+    const __m256i near = _mm256_add_epi32(column, _mm256_set1_epi32(step));
+    const __m256i inside = _mm256_and_si256(_mm256_cmpgt_epi32(near, minus_one), _mm256_cmpgt_epi32(width, near));
+    const ptrdiff_t first = _mm256_cvtsi256_si32(near);
+    const __m256i content = _mm256_cmpgt_epi32(load_there(winner, first, inside), minus_one);
+    /* Beyond 32 bits this wraps round, to what is no slot, too. */
+    const __m256i slot = _mm256_sub_epi32(_mm256_sub_epi32(r, near), load_there(base, first, inside));
+    const __m256i is_slot = _mm256_and_si256(_mm256_cmpgt_epi32(slot, minus_one), _mm256_cmpgt_epi32(depth, slot));
+    const __m256i there = _mm256_and_si256(_mm256_and_si256(asked, inside), _mm256_and_si256(content, is_slot));
+    const __m256i sum = gather_bytes(sums, _mm256_add_epi32(_mm256_mullo_epi32(near, depth), slot), there);
+    return _mm256_and_si256(there, _mm256_cmpeq_epi32(sum, best_sum));
+}
+
 /* Pixels x to x + 7 of the row, those that `there` says. */
-static inline void check_eight(const uint16_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+static inline void check_eight(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
                                int32_t max_difference, const selection_buffers *buffers, int32_t x, __m256i there,
                                int32_t *offset) {
     const __m256i zero = _mm256_setzero_si256(), minus_one = _mm256_set1_epi32(-1);
@@ -85,31 +96,30 @@ static inline void check_eight(const uint16_t *sums, const int32_t *base, const 
         _mm256_mask_i32gather_epi32(minus_one, (const int *)(const void *)target + 1, r, found, 8);
     found = _mm256_andnot_si256(_mm256_cmpgt_epi32(zero, content), found);
 
-    const __m256i key_place = _mm256_add_epi32(r, depth);
-    const int half = (int)keys_per_parity(size);
-    const __m256i odd = _mm256_and_si256(_mm256_sub_epi32(zero, _mm256_and_si256(key_place, _mm256_set1_epi32(1))),
-                                         _mm256_set1_epi32(half));
-    const __m256i keys = _mm256_mask_i32gather_epi32(
-        zero, (const int *)buffers->keys, _mm256_add_epi32(_mm256_srli_epi32(key_place, 1), odd), found, 4);
-    const __m256i apart =
-        _mm256_abs_epi32(_mm256_sub_epi32(_mm256_and_si256(keys, _mm256_set1_epi32(UINT16_MAX)), column));
-    const __m256i unmatched = _mm256_cmpeq_epi32(_mm256_max_epu32(keys, _mm256_set1_epi32((int)NO_KEY)), keys);
-    const __m256i rejected =
-        _mm256_or_si256(unmatched, _mm256_cmpgt_epi32(apart, _mm256_set1_epi32(max_difference)));
-    found = _mm256_andnot_si256(rejected, found);
+    const __m256i best_sum = gather_bytes(buffers->best_sum, _mm256_add_epi32(r, depth), found);
+    __m256i mutual = agrees(sums, base, size, buffers->winner, column, 0, r, best_sum, found);
+    for (int32_t step = 1; step <= max_difference && step < (int32_t)size.width; step++) {
+        const __m256i left = _mm256_andnot_si256(mutual, found);
+        if (_mm256_testz_si256(left, left)) {
+            break;
+        }
+        mutual =
+            _mm256_or_si256(mutual, agrees(sums, base, size, buffers->winner, column, -step, r, best_sum, left));
+        mutual =
+            _mm256_or_si256(mutual, agrees(sums, base, size, buffers->winner, column, step, r, best_sum, left));
+    }
+    found = mutual;
 
     const __m256i slot = _mm256_add_epi32(_mm256_mullo_epi32(column, depth), best);
-    const int *pairs = (const int *)(const void *)sums;
-    const __m256i upto = _mm256_mask_i32gather_epi32(zero, pairs, _mm256_add_epi32(slot, minus_one), found, 2);
-    const __m256i from = _mm256_mask_i32gather_epi32(zero, pairs, slot, found, 2);
-    const __m256i subpixel = subpixel_offsets(_mm256_and_si256(upto, _mm256_set1_epi32(UINT16_MAX)),
-                                              _mm256_srli_epi32(upto, 16), _mm256_srli_epi32(from, 16));
+    const __m256i subpixel = subpixel_offsets(gather_bytes(sums, _mm256_add_epi32(slot, minus_one), found),
+                                              gather_bytes(sums, slot, found),
+                                              gather_bytes(sums, _mm256_sub_epi32(slot, minus_one), found));
     const __m256i result = _mm256_blendv_epi8(_mm256_set1_epi32(OFFSET_INVALID),
                                               _mm256_add_epi32(_mm256_slli_epi32(position, 8), subpixel), found);
     _mm256_maskstore_epi32(offset + x, there, result);
 }
 
-void check_winners_avx2(const uint16_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+void check_winners_avx2(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
                         int32_t max_left_right_difference, const selection_buffers *buffers, int32_t *offset) {
     for (int32_t x = 0; x < (int32_t)size.width; x += 8) {
         const __m256i left = _mm256_set1_epi32((int)size.width - x);
