@@ -27,19 +27,21 @@ ALWAYS_INLINE vector one_down(vector v, vector after) {
     return _mm256_alignr_epi8(_mm256_permute2x128_si256(v, after, 0x21), v, 1);
 }
 
+#define SWAP_WORDS _mm_setr_epi8(2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13)
+#define SWAP_BYTES _mm_setr_epi8(1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14)
+
 /* The least byte of each of four vectors, in all of its bytes. */
 ALWAYS_INLINE void spread_minima(vector v[4]) {
-    /* Halves of two vectors each, then quarters of all four: one by one their least byte comes first. */
+    /* Halves of two vectors each, then quarters of all four; these swap what they have found until all have it.
+     * Shuffles, since the units for shifts are busy with minima. */
     const vector a =
         lesser(_mm256_permute2x128_si256(v[0], v[1], 0x20), _mm256_permute2x128_si256(v[0], v[1], 0x31));
     const vector b =
         lesser(_mm256_permute2x128_si256(v[2], v[3], 0x20), _mm256_permute2x128_si256(v[2], v[3], 0x31));
     vector m = lesser(_mm256_unpacklo_epi64(a, b), _mm256_unpackhi_epi64(a, b));
-    m = lesser(m, _mm256_srli_epi64(m, 32));
-    m = lesser(m, _mm256_srli_epi32(m, 16));
-    m = lesser(m, _mm256_srli_epi16(m, 8));
-    const int64_t lower = 0, upper = 0x0808080808080808;
-    m = _mm256_shuffle_epi8(m, _mm256_setr_epi64x(lower, upper, lower, upper));
+    m = lesser(m, _mm256_shuffle_epi32(m, 0xb1));
+    m = lesser(m, _mm256_shuffle_epi8(m, _mm256_broadcastsi128_si256(SWAP_WORDS)));
+    m = lesser(m, _mm256_shuffle_epi8(m, _mm256_broadcastsi128_si256(SWAP_BYTES)));
     v[0] = _mm256_permute4x64_epi64(m, 0x00);
     v[1] = _mm256_permute4x64_epi64(m, 0xaa);
     v[2] = _mm256_permute4x64_epi64(m, 0x55);

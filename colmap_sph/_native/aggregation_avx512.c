@@ -27,17 +27,20 @@ ALWAYS_INLINE vector one_down(vector v, vector after) {
     return _mm512_alignr_epi8(_mm512_alignr_epi32(after, v, 4), v, 1);
 }
 
+#define SWAP_WORDS _mm_setr_epi8(2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13)
+#define SWAP_BYTES _mm_setr_epi8(1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14)
+
 /* The least byte of each of four vectors, in all of its bytes. */
 ALWAYS_INLINE void spread_minima(vector v[4]) {
-    /* Halves of two vectors each, then quarters of all four: one by one their least byte comes first. */
+    /* Halves of two vectors each, then quarters of all four; these swap what they have found until all have it.
+     * Shuffles, since the units for shifts are busy with minima. */
     const vector a = lesser(_mm512_shuffle_i64x2(v[0], v[1], 0x44), _mm512_shuffle_i64x2(v[0], v[1], 0xee));
     const vector b = lesser(_mm512_shuffle_i64x2(v[2], v[3], 0x44), _mm512_shuffle_i64x2(v[2], v[3], 0xee));
     vector m = lesser(_mm512_shuffle_i64x2(a, b, 0x88), _mm512_shuffle_i64x2(a, b, 0xdd));
     m = lesser(m, _mm512_shuffle_epi32(m, 0x4e));
-    m = lesser(m, _mm512_srli_epi64(m, 32));
-    m = lesser(m, _mm512_srli_epi32(m, 16));
-    m = lesser(m, _mm512_srli_epi16(m, 8));
-    m = _mm512_shuffle_epi8(m, _mm512_setzero_si512());
+    m = lesser(m, _mm512_shuffle_epi32(m, 0xb1));
+    m = lesser(m, _mm512_shuffle_epi8(m, _mm512_broadcast_i32x4(SWAP_WORDS)));
+    m = lesser(m, _mm512_shuffle_epi8(m, _mm512_broadcast_i32x4(SWAP_BYTES)));
     v[0] = _mm512_shuffle_i64x2(m, m, 0x00);
     v[1] = _mm512_shuffle_i64x2(m, m, 0x55);
     v[2] = _mm512_shuffle_i64x2(m, m, 0xaa);

@@ -96,8 +96,18 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
         _mm256_mask_i32gather_epi32(minus_one, (const int *)(const void *)target + 1, r, found, 8);
     found = _mm256_andnot_si256(_mm256_cmpgt_epi32(zero, content), found);
 
+    /* The winner's sum between those beside it, with one byte more behind them or, at the row's end, before them.
+     */
+    const __m256i from = _mm256_add_epi32(_mm256_mullo_epi32(column, depth), _mm256_add_epi32(best, minus_one));
+    const __m256i place = _mm256_min_epi32(from, _mm256_set1_epi32((int)(size.width * size.depth) - 4));
+    const __m256i four = _mm256_mask_i32gather_epi32(zero, (const int *)(const void *)sums, place, found, 1);
+    const __m256i three = _mm256_srlv_epi32(four, _mm256_slli_epi32(_mm256_sub_epi32(from, place), 3));
+    const __m256i byte = _mm256_set1_epi32(UINT8_MAX), before = _mm256_and_si256(three, byte);
+    const __m256i sum = _mm256_and_si256(_mm256_srli_epi32(three, 8), byte);
+    const __m256i after = _mm256_and_si256(_mm256_srli_epi32(three, 16), byte);
+
     const __m256i best_sum = gather_bytes(buffers->best_sum, _mm256_add_epi32(r, depth), found);
-    __m256i mutual = agrees(sums, base, size, buffers->winner, column, 0, r, best_sum, found);
+    __m256i mutual = _mm256_and_si256(found, _mm256_cmpeq_epi32(sum, best_sum));
     for (int32_t step = 1; step <= max_difference && step < (int32_t)size.width; step++) {
         const __m256i left = _mm256_andnot_si256(mutual, found);
         if (_mm256_testz_si256(left, left)) {
@@ -110,10 +120,7 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
     }
     found = mutual;
 
-    const __m256i slot = _mm256_add_epi32(_mm256_mullo_epi32(column, depth), best);
-    const __m256i subpixel = subpixel_offsets(gather_bytes(sums, _mm256_add_epi32(slot, minus_one), found),
-                                              gather_bytes(sums, slot, found),
-                                              gather_bytes(sums, _mm256_sub_epi32(slot, minus_one), found));
+    const __m256i subpixel = subpixel_offsets(before, sum, after);
     const __m256i result = _mm256_blendv_epi8(_mm256_set1_epi32(OFFSET_INVALID),
                                               _mm256_add_epi32(_mm256_slli_epi32(position, 8), subpixel), found);
     _mm256_maskstore_epi32(offset + x, there, result);
