@@ -31,10 +31,10 @@ class NormalOptions:
     """Radius of the window, pixels."""
     tolerance: float = 3.0
     """Neighbours further from the plane than this many standard deviations hardly count."""
-    max_shift: float = 1.0
+    max_shift: float = 2.0
     """A depth that differs from its plane's by more than this many times the size of its pixel, or the plane's
     change of depth to the next pixel where that is more, and by more than two standard deviations, is dropped."""
-    max_incidence: float = 75.0
+    max_incidence: float = 80.0
     """Largest angle, degrees, between the ray and the normal of a pixel whose depth fewer than three others
     support: what few see at a glance is rarely right."""
 

@@ -411,7 +411,8 @@ def print_limits(version: str, timings: Sequence[Timing]) -> None:
     print(table(["kernel", "disparities", "per 32 slots", "MDE/s", "bound, MDE/s", "share"], rows))
     print(
         "\nThe rest: loads and stores, what is done per pixel (penalties, horizontal minima, shifted ranges, "
-        "sub-pixel fit), shuffles that fewer units can do, and each pixel's wait for the one before it on its row."
+        "sub-pixel fit), minima and shuffles that fewer units can do, and each pixel's wait for the one before "
+        "it on its row."
     )
 
 
