@@ -252,7 +252,7 @@ def spoiled(value: Any, others: Arguments, rng: Random) -> Any:
         return FLOATS[int(rng.integers(len(FLOATS)))]
     if isinstance(value, tuple) and value and isinstance(value[0], np.ndarray) and rng.random() < 0.7:
         place = int(rng.integers(len(value)))
-        return (*value[:place], spoiled_array(value[place], others, rng), *value[place + 1 :])
+        return (*value[:place], spoiled(value[place], others, rng), *value[place + 1 :])
     if isinstance(value, tuple):
         return [value[:1], (*value, 1.0), (None, None), list(value), (np.nan, np.inf)][int(rng.integers(5))]
     return ["", "avx1024", "scalar\0", "é" * 1000][int(rng.integers(4))]
