@@ -94,7 +94,7 @@ class Scratch:
         self._memory = np.empty(0, dtype=np.uint8)
 
     def volume(self, shape: tuple[int, ...], depth: int) -> NDArray[np.uint8]:
-        """(3, pixels, depth) uint8 array for an image or for as many of its rows as `max_bytes` allow."""
+        """(2, pixels, depth) uint8 array for an image or for as many of its rows as `max_bytes` allow."""
         height, width = shape
         rows = min(max(self.max_bytes // (_BYTES_PER_SLOT * width * depth), 1), height)
         size = _BYTES_PER_SLOT * rows * width * depth

@@ -67,9 +67,9 @@ def matching_cost(rng: Random) -> Arguments:
 
 
 def aggregation(rng: Random) -> Arguments:
-    (h, w), depth, p1 = size(rng), 32 * int(rng.integers(1, 4)), int(rng.integers(0, 30))
+    (h, w), depth, p1 = size(rng), 32 * int(rng.integers(1, 4)), int(rng.integers(0, 64))
     cost, image = filled(rng, (h, w, depth), np.uint8), filled(rng, (h, w), np.uint8)
-    p2 = rng.integers(p1, 194, 256).astype(np.uint8)
+    p2 = rng.integers(p1, 128, 256).astype(np.uint8)
     base, sums = filled(rng, (h, w), np.int32), np.zeros((h, w, depth), np.uint8)
     return [backend(rng), cost, base, image, p1, p2, int(rng.integers(0, 5)), np.zeros_like(cost), sums]
 
@@ -84,8 +84,8 @@ def selection(rng: Random) -> Arguments:
 def match(rng: Random) -> Arguments:
     (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
-    base, image, p1 = filled(rng, (h, w), np.int32), filled(rng, (h, w), np.uint8), int(rng.integers(0, 30))
-    p2, limits = rng.integers(p1, 194, 256).astype(np.uint8), (int(rng.integers(0, 5)), int(rng.integers(0, 5)))
+    base, image, p1 = filled(rng, (h, w), np.int32), filled(rng, (h, w), np.uint8), int(rng.integers(0, 64))
+    p2, limits = rng.integers(p1, 128, 256).astype(np.uint8), (int(rng.integers(0, 5)), int(rng.integers(0, 5)))
     scratch = np.zeros((2, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
     return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
 

@@ -10,7 +10,7 @@ from colmap_sph import _native
 
 INT32 = np.iinfo(np.int32)
 BACKENDS = _native.backends()
-DEPTHS = [32, 64, 96, 160]
+DEPTHS = [32, 64, 96, 128, 160, 192]
 SIZES = [(1, 1), (1, 31), (3, 33), (5, 7), (2, 65), (7, 32), (4, 50)]
 PENALTIES = {
     "default": (10, 30, 120),
