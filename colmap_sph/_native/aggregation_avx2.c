@@ -15,6 +15,7 @@ ALWAYS_INLINE vector repeat_word(uint32_t word) { return _mm256_set1_epi32((int)
 ALWAYS_INLINE vector lesser(vector a, vector b) { return _mm256_min_epu8(a, b); }
 ALWAYS_INLINE vector add(vector a, vector b) { return _mm256_add_epi8(a, b); }
 ALWAYS_INLINE vector add_saturated(vector a, vector b) { return _mm256_adds_epu8(a, b); }
+ALWAYS_INLINE vector average(vector a, vector b) { return _mm256_avg_epu8(a, b); }
 ALWAYS_INLINE vector subtract(vector a, vector b) { return _mm256_sub_epi8(a, b); }
 
 /* The last byte of `before` and all but the last of `v`. */
@@ -47,8 +48,6 @@ ALWAYS_INLINE void spread_minima(vector v[4]) {
     v[2] = _mm256_permute4x64_epi64(m, 0x55);
     v[3] = _mm256_permute4x64_epi64(m, 0xff);
 }
-
-ALWAYS_INLINE vector average(vector a, vector b) { return _mm256_avg_epu8(a, b); }
 
 #define SWEEP_BEGIN sweep_begin_avx2
 #define SWEEP_ROWS sweep_rows_avx2

@@ -15,6 +15,7 @@ ALWAYS_INLINE vector repeat_word(uint32_t word) { return _mm512_set1_epi32((int)
 ALWAYS_INLINE vector lesser(vector a, vector b) { return _mm512_min_epu8(a, b); }
 ALWAYS_INLINE vector add(vector a, vector b) { return _mm512_add_epi8(a, b); }
 ALWAYS_INLINE vector add_saturated(vector a, vector b) { return _mm512_adds_epu8(a, b); }
+ALWAYS_INLINE vector average(vector a, vector b) { return _mm512_avg_epu8(a, b); }
 ALWAYS_INLINE vector subtract(vector a, vector b) { return _mm512_sub_epi8(a, b); }
 
 /* The last byte of `before` and all but the last of `v`. */
@@ -46,8 +47,6 @@ ALWAYS_INLINE void spread_minima(vector v[4]) {
     v[2] = _mm512_shuffle_i64x2(m, m, 0xaa);
     v[3] = _mm512_shuffle_i64x2(m, m, 0xff);
 }
-
-ALWAYS_INLINE vector average(vector a, vector b) { return _mm512_avg_epu8(a, b); }
 
 #define SWEEP_BEGIN sweep_begin_512
 #define SWEEP_ROWS sweep_rows_512

@@ -81,7 +81,8 @@ ALWAYS_INLINE void look_up(uint64_t reference, const uint8_t *planes, ptrdiff_t 
 #pragma GCC unroll 4
     for (int k = 0; k < PLANES; k++, planes += stride, reference >>= 4) {
         const uint8_t *distances = DISTANCES[reference & 15];
-        const __m256i table = _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)(const void *)distances));
+        const __m256i table =
+            _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)(const void *)distances));
         for (ptrdiff_t v = 0; v < vectors; v++) {
             const __m256i bits = _mm256_loadu_si256((const __m256i *)(const void *)(planes + 32 * v));
             sums[v] = _mm256_add_epi8(sums[v], _mm256_shuffle_epi8(table, bits));

@@ -72,7 +72,7 @@ static inline __attribute__((always_inline)) void costs_of_row(const uint64_t *r
         const uint8_t *seen = all_seen + first / 8;
         const unsigned shift = first % 8;
         for (ptrdiff_t i = 0; i + 64 <= depth; i += 64) {
-            _mm_prefetch((const char *)((uintptr_t)(slots + i) + AHEAD), _MM_HINT_T0);
+            prefetch(slots, i + AHEAD);
             _mm512_storeu_si512(slots + i, costs_of(word, target + i, bits_from(seen + i / 8, shift), 1));
         }
         if (depth % 64) {

@@ -5,6 +5,11 @@
 
 #include "kernels.h"
 
+/* The line of the cache `offset` bytes from `row`, which may lie outside of it. */
+static inline __attribute__((always_inline)) void prefetch(const void *row, ptrdiff_t offset) {
+    __builtin_prefetch((const void *)((uintptr_t)row + (uintptr_t)offset));
+}
+
 /* ---- matching cost ----------------------------------------------------------------------------------------- */
 
 /* Costs of one row, `size.width * size.depth` of them; `buffer` is one of cost_row_buffer. */
