@@ -552,6 +552,12 @@ def test_empty_images_of_absurd_width_are_refused_or_no_work(backend):
             getattr(_native, function)(backend, *values)
 
 
+def test_endless_rows_of_nothing_are_refused():
+    nothing = np.empty((2**40, 0), np.float32)
+    with pytest.raises(ValueError, match="left is empty, yet has size 1099511627776 along axis 0"):
+        _native.transfer_disparity(nothing, 1.0, nothing.copy())
+
+
 @pytest.mark.parametrize("shape", [(0, 0), (0, 7), (7, 0)])
 def test_empty_maps_are_no_work(shape):
     empty, bytes_ = np.zeros(shape, np.float32), np.zeros(shape, np.uint8)

@@ -3,6 +3,9 @@
 #include <stdint.h>
 #include <string.h>
 
+/* An empty array can have any number of rows, over which loops would run for hours. */
+enum { LONGEST_OF_NOTHING = 1 << 24 };
+
 static char format_kind(const char *format) {
     if (!format) {
         return 'u';
@@ -42,6 +45,12 @@ void *array_get(array_set *set, PyObject *object, const char *name, char kind, P
     if (view->len > 0 && (uintptr_t)view->buf % (size_t)itemsize) {
         PyErr_Format(PyExc_ValueError, "%s must be aligned to its items", name);
         return NULL;
+    }
+    for (int k = 0; view->len == 0 && k < ndim; k++) {
+        if (view->shape[k] > LONGEST_OF_NOTHING) {
+            PyErr_Format(PyExc_ValueError, "%s is empty, yet has size %zd along axis %d", name, view->shape[k], k);
+            return NULL;
+        }
     }
     for (int k = 0; shape && k < ndim; k++) {
         if (shape[k] >= 0 && shape[k] != view->shape[k]) {
