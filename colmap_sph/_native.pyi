@@ -168,6 +168,7 @@ def add_patch_equations(
     sources_from_reference: Array,
     planes: Array,
     first_row: int,
+    row_step: int,
     contrast: float,
     min_score: float,
     equations: Array,

@@ -247,6 +247,9 @@ class _Display:
             rich.progress.TextColumn("left"),
             rich.progress.TimeRemainingColumn(),
             console=console,
+            # Drawing holds up the workers; into a file only what the end is like is written.
+            refresh_per_second=2,
+            auto_refresh=console.is_terminal,
         )
         self._task: rich.progress.TaskID | None = None
 

@@ -112,15 +112,15 @@ def refine_maps(
             fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
             normals[fitted], depth[fitted] = smooth_normals[fitted], smooth_depth[fitted]
         for first in range(0, view.height, _BAND_ROWS):
-            rows = slice(first, min(first + _BAND_ROWS, view.height))
-            planes = _planes_of_maps(view, normals[rows], depth[rows], first)
+            rows = slice(first, min(first + _BAND_ROWS, view.height), 1)
+            planes = _planes_of_maps(view, normals, depth, rows)
             last = done == options.rounds - 1
             used = partners if last else partners[:_FIRST_PARTNERS]
-            equations = _equations(image, used, planes, first, options)
+            equations = _equations(image, used, planes, rows, options)
             sigma = _freedom(estimate.sigma[rows], planes, options)
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma, slope_sigma, planes)
-            normals[rows], depth[rows] = _maps_of_planes(view, planes, first)
+            normals[rows], depth[rows] = _maps_of_planes(view, planes, rows)
     return normals, depth
 
 
@@ -134,18 +134,17 @@ def _most_telling(
     options: RefinementOptions,
 ) -> list[_Partner]:
     """The partners whose images tell most about the depth on some of the rows, those which tell most first."""
+    rows = slice(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS)
+    planes = _planes_of_maps(view, normals, depth, rows)
+    sigma = _freedom(estimate.sigma[rows], planes, options)
     information = np.zeros(len(partners))
-    for row in range(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS):
-        rows = slice(row, row + 1)
-        planes = _planes_of_maps(view, normals[rows], depth[rows], row)
-        sigma = _freedom(estimate.sigma[rows], planes, options)
-        for index, partner in enumerate(partners):
-            equations = _equations(image, [partner], planes, row, options)
-            matched = equations[0] > 0
-            weight, difference, curvature = (equations[k][matched] for k in (0, 1, 6))
-            # What a pixel gains, in nats: a long baseline that few pixels match must not outdo all others.
-            gain = np.log1p(np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma[matched] ** 2)
-            information[index] += gain.sum(dtype=float)
+    for index, partner in enumerate(partners):
+        equations = _equations(image, [partner], planes, rows, options)
+        matched = equations[0] > 0
+        weight, difference, curvature = (equations[k][matched] for k in (0, 1, 6))
+        # What a pixel gains, in nats: a long baseline that few pixels match must not outdo all others.
+        gain = np.log1p(np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma[matched] ** 2)
+        information[index] = gain.sum(dtype=float)
     best = np.argsort(-information, kind="stable")[: options.max_partners]
     return [partners[index] for index in best]
 
@@ -161,29 +160,30 @@ def _equations(
     image: NDArray[np.uint8],
     partners: Sequence[_Partner],
     planes: NDArray[np.float32],
-    first: int,
+    rows: slice,
     options: RefinementOptions,
 ) -> NDArray[np.float32]:
-    """(12, h, W) sums of the normal equations of all partners."""
+    """(12, h, W) sums of the normal equations of all partners for planes of the image's `rows`."""
     equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
     for start in range(0, len(partners), _SOURCES):
         sources, transfers = zip(*partners[start : start + _SOURCES], strict=True)
         limits = options.contrast, options.min_score
         _native.add_patch_equations(
-            backend(), image, sources, np.stack(transfers), planes, first, *limits, equations
+            backend(), image, sources, np.stack(transfers), planes, rows.start, rows.step, *limits, equations
         )
     return equations
 
 
 def _planes_of_maps(
-    view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], first: int
+    view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], rows: slice
 ) -> NDArray[np.float32]:
-    """(3, h, W) inverse depth and its change per column and row; 0 where there is none."""
+    """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
+    normals, depth = normals[rows], depth[rows]
     # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d. No matrix product: it would wake BLAS's
     # threads for three columns.
     (a, b, c), (_, d, e), _ = np.linalg.inv(view.K).astype(np.float32)
     x, y, z = (normals[..., axis] for axis in range(3))
-    column, row = _pixels(view, len(depth), first)
+    column, row = _pixels(view, rows)
     planes = np.empty((3, *depth.shape), np.float32)
     inverse, along_x, along_y = planes
     np.multiply(x, a, out=along_x)
@@ -197,12 +197,12 @@ def _planes_of_maps(
 
 
 def _maps_of_planes(
-    view: View, planes: NDArray[np.float32], first: int
+    view: View, planes: NDArray[np.float32], rows: slice
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Inverse of `_planes_of_maps`: normals (h, W, 3) and depth (h, W)."""
     inverse, along_x, along_y = planes
     (a, b, c), (_, d, e), _ = view.K.astype(np.float32)
-    column, row = _pixels(view, len(inverse), first)
+    column, row = _pixels(view, rows)
     normals = np.empty((*inverse.shape, 3), np.float32)
     x, y, z = (normals[..., axis] for axis in range(3))
     np.multiply(along_x, -a, out=x)
@@ -216,8 +216,8 @@ def _maps_of_planes(
     return normals, depth
 
 
-def _pixels(view: View, rows: int, first: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _pixels(view: View, rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     return (
         np.arange(view.width, dtype=np.float32)[None],
-        np.arange(first, first + rows, dtype=np.float32)[:, None],
+        np.arange(rows.start, rows.stop, rows.step, dtype=np.float32)[:, None],
     )

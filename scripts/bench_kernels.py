@@ -276,7 +276,7 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
 
     def add_patch_equations(backend: str) -> None:
         equations.fill(0)
-        _native.add_patch_equations(backend, scene.left, sources, transfers, planes, 0, 20.0, 0.5, equations)
+        _native.add_patch_equations(backend, scene.left, sources, transfers, planes, 0, 1, 20.0, 0.5, equations)
 
     steps = [(check_consistency, [counts, sums], pixels), (add_patch_equations, [equations], SOURCES * pixels)]
     return [Kernel(call.__name__, call, outputs, work) for call, outputs, work in steps]

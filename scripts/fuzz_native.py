@@ -185,7 +185,9 @@ def confirm_depth(rng: Random) -> Arguments:
 
 def add_patch_equations(rng: Random) -> Arguments:
     h, w = size(rng)
-    rows = int(rng.integers(0, h + 1))
+    step = int(rng.integers(1, 4))
+    first = int(rng.integers(0, h + 1))
+    rows = int(rng.integers(0, (h - first + step - 1) // step + 1))
     image, count = filled(rng, (h, w), np.uint8), int(rng.integers(1, 5))
     sources, matrices = tuple(filled(rng, size(rng), np.uint8) for _ in range(count)), np.zeros((count, 3, 4))
     for matrix in matrices:
@@ -193,8 +195,7 @@ def add_patch_equations(rng: Random) -> Arguments:
         same = np.hstack([np.eye(3), np.zeros((3, 1))])
         matrix[:] = same if rng.random() < 0.5 else filled(rng, (3, 4), np.float64)
     planes, equations = filled(rng, (3, rows, w), np.float32), np.zeros((12, rows, w), np.float32)
-    first = int(rng.integers(0, h - rows + 1))
-    return [backend(rng), image, sources, matrices, planes, first, number(rng), number(rng) / 10, equations]
+    return [backend(rng), image, sources, matrices, planes, first, step, number(rng), number(rng) / 10, equations]
 
 
 def refine_planes(rng: Random) -> Arguments:

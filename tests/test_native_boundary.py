@@ -179,6 +179,7 @@ def arguments(function):
             "sources_from_reference": np.stack([matrix, matrix]),
             "planes": np.ones((3, H, W), f32),
             "first_row": 0,
+            "row_step": 1,
             "contrast": 20.0,
             "min_score": 0.5,
             "out equations": np.zeros((12, H, W), f32),
@@ -496,6 +497,21 @@ def test_sources_must_be_a_tuple(sources):
 def test_rows_beyond_the_image_are_refused(first_row):
     with pytest.raises(ValueError, match="rows"):
         call("add_patch_equations", {**arguments("add_patch_equations"), "first_row": first_row})
+
+
+@pytest.mark.parametrize(("rows", "step"), [(H, 0), (H, -1), (H, 2), (2, H), (2, 2**63 - 1), (1, 0)])
+def test_steps_beyond_the_image_are_refused(rows, step):
+    planes, equations = np.ones((3, rows, W), np.float32), np.zeros((12, rows, W), np.float32)
+    changed = {"planes": planes, "row_step": step, "out equations": equations}
+    with pytest.raises(ValueError, match="rows must lie in the image"):
+        call("add_patch_equations", {**arguments("add_patch_equations"), **changed})
+
+
+@pytest.mark.parametrize(("rows", "step"), [(1, 2**63 - 1), (2, H - 1), (0, 5)])
+def test_steps_within_the_image_are_accepted(rows, step):
+    planes, equations = np.ones((3, rows, W), np.float32), np.zeros((12, rows, W), np.float32)
+    changed = {"planes": planes, "row_step": step, "out equations": equations}
+    call("add_patch_equations", {**arguments("add_patch_equations"), **changed})
 
 
 def test_rows_beyond_16_bits_are_refused():

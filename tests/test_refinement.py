@@ -44,8 +44,20 @@ def equations_of_all(backend, image, partners, planes, options=OPTIONS):
 def add_equations(backend, image, partners, planes, options, equations):
     sources, matrices = tuple(source for source, _ in partners), np.stack([matrix for _, matrix in partners])
     _native.add_patch_equations(
-        backend, image, sources, matrices, planes, 0, options.contrast, options.min_score, equations
+        backend, image, sources, matrices, planes, 0, 1, options.contrast, options.min_score, equations
     )
+
+
+@pytest.mark.parametrize("backend", _native.backends())
+@pytest.mark.parametrize(("first", "step"), [(0, 2), (3, 5), (39, 7), (45, 1)])
+def test_equations_of_some_rows_are_those_of_all(backend, first, step):
+    image, planes, rows = texture((40, 40), 1), slanted_planes((40, 40), 2), slice(first, None, step)
+    expected = equations_of(backend, image, image, AFFINE, planes)[:, rows]
+    found, some = np.zeros(expected.shape, np.float32), np.ascontiguousarray(planes[:, rows])
+    limits = OPTIONS.contrast, OPTIONS.min_score
+    _native.add_patch_equations(backend, image, (image,), AFFINE[None], some, first, step, *limits, found)
+    assert np.array_equal(found, expected)
+    assert np.any(found) or first >= 39
 
 
 def slanted_planes(shape, seed, slope=0.002):

@@ -137,12 +137,15 @@ typedef struct {
 
 enum { MAX_PATCH_SOURCES = 32 }; /* in one call */
 
+/* Every so many rows of an image, from the first. */
+typedef struct {
+    ptrdiff_t first, step, count;
+} patch_rows;
+
 /* Adds the normal equations of matching a reference's pixels in each of the sources. `planes` (3 arrays of inverse
- * depth, 0 = none, and its change along x and y) and `equations` belong to rows [first_row, first_row + rows) of
- * the reference. */
+ * depth, 0 = none, and its change along x and y) and `equations` belong to that many rows of the reference. */
 typedef void add_patch_equations_fn(const grey_image *reference, const patch_source *sources, ptrdiff_t count,
-                                    const float *planes, ptrdiff_t first_row, ptrdiff_t rows,
-                                    patch_options options, float *equations);
+                                    const float *planes, patch_rows rows, patch_options options, float *equations);
 
 /* A view's depth (0 = none) and its standard deviation; fewer than 2^31 rows and columns. */
 typedef struct {

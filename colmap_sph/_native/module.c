@@ -603,14 +603,19 @@ static int get_sources(array_set *arrays, PyObject *images, PyObject *transfers,
     return matrix != NULL;
 }
 
+/* Whether every `step`-th of so many rows are at least `count`. */
+static int rows_fit(Py_ssize_t rows, Py_ssize_t step, Py_ssize_t count) {
+    return count == 0 || (rows > 0 && count - 1 <= (rows - 1) / step);
+}
+
 static PyObject *py_add_patch_equations(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
     PyObject *o[5];
-    Py_ssize_t first_row;
+    Py_ssize_t first_row, row_step;
     patch_options options;
-    if (!PyArg_ParseTuple(args, "sOO!OOnffO", &backend, &o[0], &PyTuple_Type, &o[1], &o[2], &o[3], &first_row,
-                          &options.contrast, &options.min_score, &o[4])) {
+    if (!PyArg_ParseTuple(args, "sOO!OOnnffO", &backend, &o[0], &PyTuple_Type, &o[1], &o[2], &o[3], &first_row,
+                          &row_step, &options.contrast, &options.min_score, &o[4])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
@@ -624,14 +629,14 @@ static PyObject *py_add_patch_equations(PyObject *self, PyObject *args) {
     Py_ssize_t equations_shape[3] = {PATCH_EQUATIONS, planes_shape[1], shape[1]};
     float *equations = planes ? array_get(&arrays, o[4], "equations", F32, 3, WRITE, equations_shape) : NULL;
     if (equations &&
-        check(first_row >= 0 && planes_shape[1] <= shape[0] && first_row <= shape[0] - planes_shape[1],
+        check(first_row >= 0 && row_step >= 1 && rows_fit(shape[0] - first_row, row_step, planes_shape[1]),
               "the rows must lie in the image") &&
         arrays_disjoint(&arrays)) {
         const grey_image reference = {image, shape[0], shape[1]};
         const Py_ssize_t count = PyTuple_Size(o[1]);
         Py_BEGIN_ALLOW_THREADS;
-        table->add_patch_equations(&reference, sources, count, planes, first_row, planes_shape[1], options,
-                                   equations);
+        const patch_rows rows = {first_row, row_step, planes_shape[1]};
+        table->add_patch_equations(&reference, sources, count, planes, rows, options, equations);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, 0);
@@ -696,8 +701,8 @@ static PyMethodDef methods[] = {
      "fit_planes(backend, inverse_depth, inverse_sigma, support, K, radius, tolerance, max_shift, shift_sigma, "
      "min_cosine, supported, normals, fitted_depth)"},
     {"add_patch_equations", py_add_patch_equations, METH_VARARGS,
-     "add_patch_equations(backend, image, sources, sources_from_reference, planes, first_row, contrast, "
-     "min_score, equations)"},
+     "add_patch_equations(backend, image, sources, sources_from_reference, planes, first_row, row_step, "
+     "contrast, min_score, equations)"},
     {"refine_planes", py_refine_planes, METH_VARARGS, "refine_planes(equations, sigma, slope_sigma, planes)"},
     {NULL, NULL, 0, NULL}};
 
