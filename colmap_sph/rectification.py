@@ -161,7 +161,7 @@ def resample(
     side: Side,
     interpolation: int = cv2.INTER_LINEAR,
     mask: NDArray[np.uint8] | None = None,
-) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Resample an image to the rectified surface, once and straight from its pixels.
 
     Parameters
@@ -180,11 +180,13 @@ def resample(
 
     Returns
     -------
-    rectified : (H, W) uint8 ndarray
+    rectified : (H, W) float32 ndarray
+        Not rounded: on weak texture, fractions of a grey value are what there is to match.
     valid : (H, W) uint8 ndarray
         255 where the rectified pixel lies inside the image and no ignored pixel has a part in it, else 0.
     """
-    rectified, valid = (np.empty((pair.height, pair.width(side)), dtype=np.uint8) for _ in range(2))
+    shape, image = (pair.height, pair.width(side)), image.astype(np.float32)
+    rectified, valid = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.uint8)
     for first in range(0, pair.height, _BAND_ROWS):
         band = slice(first, first + _BAND_ROWS)
         columns, rows, inside = _pixel_maps(view, pair, side, band)

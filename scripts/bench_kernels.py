@@ -170,9 +170,9 @@ def disparity_of(offset: NDArray[np.int32]) -> NDArray[np.float32]:
 # ---- the kernels -------------------------------------------------------------------------------------------
 
 
-def with_border(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The image with the census window's border."""
-    return np.asarray(cv2.copyMakeBorder(image, 3, 3, 4, 4, cv2.BORDER_REPLICATE), dtype=np.uint8)
+def with_border(image: NDArray[np.uint8]) -> NDArray[np.int16]:
+    """The image in 1/64 grey value with the census window's border."""
+    return np.asarray(cv2.copyMakeBorder(image, 3, 3, 4, 4, cv2.BORDER_REPLICATE), dtype=np.int16) * np.int16(64)
 
 
 def census_pair(scene: Scene) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:

@@ -43,7 +43,9 @@ class Score:
 def ours(left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: int) -> NDArray[np.float32]:
     """Disparities by `colmap_sph.matching`; NaN = none."""
     images = [
-        RectifiedImage(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), np.full(image.shape[:2], 255, np.uint8))
+        RectifiedImage(
+            cv2.cvtColor(image.astype(np.float32), cv2.COLOR_BGR2GRAY), np.full(image.shape[:2], 255, np.uint8)
+        )
         for image in (left, right)
     ]
     return match_pair(*images, low, high, MatchingOptions())

@@ -56,7 +56,7 @@ def size(rng: Random) -> tuple[int, int]:
 
 def census(rng: Random) -> Arguments:
     h, w = size(rng)
-    padded = filled(rng, (h + 6, w + 8), np.uint8)
+    padded = filled(rng, (h + 6, w + 8), np.int16)
     return [backend(rng), padded, filled(rng, (h, w), np.uint8), np.zeros((h, w), np.uint64)]
 
 

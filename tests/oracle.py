@@ -15,12 +15,12 @@ DIRECTIONS = [(0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1), (-1, 0), (-1, 
 
 
 def census(padded, valid):
-    """Census words (H, W) uint64 of an image with a border of 3 rows and 4 columns."""
+    """Census words (H, W) uint64 of an image, in 1/64 grey value, with a border of 3 rows and 4 columns."""
     words = np.empty(valid.shape, dtype=np.uint64)
     for y, x in np.ndindex(valid.shape):
-        window = padded[y : y + 7, x : x + 9].ravel()
+        window = padded[y : y + 7, x : x + 9].ravel().astype(int)
         neighbours = np.delete(window, 31)  # the centre
-        bits = [int(neighbour < window[31]) << k for k, neighbour in enumerate(neighbours)]
+        bits = [int(neighbour < window[31] - 32) << k for k, neighbour in enumerate(neighbours)]
         words[y, x] = sum(bits) if valid[y, x] else CENSUS_INVALID
     return words
 

@@ -20,7 +20,7 @@ def arguments(function):
     table = {
         "census": {
             "backend": "scalar",
-            "padded": np.zeros((H + 6, W + 8), u8),
+            "padded": np.zeros((H + 6, W + 8), np.int16),
             "valid": np.ones((H, W), u8),
             "out census": np.zeros((H, W), np.uint64),
         },
@@ -535,7 +535,7 @@ def test_empty_images_are_no_work(backend, size, target_width):
     image, base, words = np.zeros(size, np.uint8), np.zeros(size, np.int32), np.zeros(size, np.uint64)
     target = np.zeros((size[0], target_width), np.uint64)
     volume, sums = np.zeros((*size, 32), np.uint8), np.zeros((*size, 32), np.uint8)
-    _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.uint8), image, words)
+    _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.int16), image, words)
     _native.matching_cost(backend, words, target, base, volume)
     _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, volume.copy(), sums)
     _native.selection(backend, sums, base, words, target, 2, np.zeros(size, np.int32))

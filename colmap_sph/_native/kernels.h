@@ -26,6 +26,9 @@ enum {
     MAX_REFINEMENT = 256   /* 1/256 pixel */
 };
 
+/* Neighbours count as darker that are so by more than half a grey value, of 64 steps: less is rounding. */
+enum { CENSUS_MARGIN = 32 };
+
 /* Bit 63 of a census word marks a pixel without image content. */
 #define CENSUS_INVALID (UINT64_C(1) << 63)
 #define OFFSET_INVALID INT32_MIN
@@ -36,8 +39,9 @@ typedef struct {
 
 /* ---- kernels with versions per instruction set, equal to the bit ------------------------------------------- */
 
-/* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}; bit set where the neighbour is darker. */
-typedef void census_fn(const uint8_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
+/* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}; bit set where the neighbour is darker by more than
+ * CENSUS_MARGIN. */
+typedef void census_fn(const int16_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
                        uint64_t *census);
 
 typedef int cost_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,

@@ -9,6 +9,7 @@
 #define F32 'f', (Py_ssize_t)sizeof(float)
 #define F64 'f', (Py_ssize_t)sizeof(double)
 #define U8 'u', (Py_ssize_t)1
+#define I16 'i', (Py_ssize_t)2
 #define U16 'u', (Py_ssize_t)2
 #define U32 'u', (Py_ssize_t)4
 #define U64 'u', (Py_ssize_t)8
@@ -77,7 +78,7 @@ static PyObject *py_census(PyObject *self, PyObject *args) {
     Py_ssize_t shape[2] = {-1, -1};
     const uint8_t *valid = table ? array_get(&arrays, o[1], "valid", U8, 2, READ, shape) : NULL;
     Py_ssize_t padded_shape[2] = {shape[0] + 2 * CENSUS_RADIUS_Y, shape[1] + 2 * CENSUS_RADIUS_X};
-    const uint8_t *padded = valid ? array_get(&arrays, o[0], "padded", U8, 2, READ, padded_shape) : NULL;
+    const int16_t *padded = valid ? array_get(&arrays, o[0], "padded", I16, 2, READ, padded_shape) : NULL;
     uint64_t *census = padded ? array_get(&arrays, o[2], "census", U64, 2, WRITE, shape) : NULL;
     if (census && arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
