@@ -4,6 +4,7 @@ A pair's disparity map comes with the geometry that gives it meaning. Disparitie
 apart or as fine as the pair's range allows; 0 = none.
 """
 
+import json
 import zipfile
 import zlib
 from collections.abc import Iterable, Mapping
@@ -40,20 +41,20 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "") -> None:
     most = float(pair.disparity[found].max()) if found.any() else 0.0
     step = max(_FINEST_STEP, (most - least) / (_CODES - 1))
     codes = np.where(found, np.rint((pair.disparity - least) / step) + 1, 0).astype(np.uint16)
-    content: dict[str, Any] = {name: getattr(pair.geometry, name) for name in RectifiedPair.__dataclass_fields__}
-    content |= {"left": pair.left, "right": pair.right, "codes": codes, "scale": np.array([least, step])}
-    write_arrays(path, content, key)
+    # In one: every array of an archive takes its time to open.
+    about = {"left": pair.left, "right": pair.right, "scale": [least, step], "geometry": vars(pair.geometry)}
+    write_arrays(path, {"codes": codes, "about": json.dumps(about, default=np.ndarray.tolist)}, key)
 
 
 def read_pair(path: Path) -> PairDisparity:
     """Read a pair's disparity map; `InputError` where the file is missing or damaged."""
-    names = tuple(RectifiedPair.__dataclass_fields__)
-    data = read_arrays(path, (*names, "left", "right", "codes", "scale"))
-    fields: dict[str, Any] = {name: data[name] if data[name].ndim else data[name].item() for name in names}
-    (least, step), codes = data["scale"], data["codes"]
+    data = read_arrays(path, ("codes", "about"))
+    about, codes = json.loads(str(data["about"])), data["codes"]
+    fields, (least, step) = about["geometry"], about["scale"]
+    fields["rectified_from_world"] = np.array(fields["rectified_from_world"])
     disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
     disparity[codes == 0] = np.nan
-    return PairDisparity(str(data["left"]), str(data["right"]), RectifiedPair(**fields), disparity)
+    return PairDisparity(about["left"], about["right"], RectifiedPair(**fields), disparity)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], key: str) -> None:

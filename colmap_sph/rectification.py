@@ -187,9 +187,10 @@ def resample(
     """
     shape, image = (pair.height, pair.width(side)), image.astype(np.float32)
     rectified, valid = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.uint8)
+    tables = _ray_tables(view, pair, side)
     for first in range(0, pair.height, _BAND_ROWS):
         band = slice(first, first + _BAND_ROWS)
-        columns, rows, inside = _pixel_maps(view, pair, side, band)
+        columns, rows, inside = _pixel_maps(view, tables, band)
         if mask is not None:
             inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
         valid[band] = inside
@@ -464,26 +465,39 @@ def _checked_size(pair: RectifiedPair, left: View, right: View, options: Rectifi
 # ---- resampling maps ----------------------------------------------------------------------------------------
 
 
-def _pixel_maps(
-    view: View, pair: RectifiedPair, side: Side, band: slice
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Source columns and rows (pixel centres at whole numbers) of a band of rectified rows, and the valid mask.
+@dataclass(frozen=True, eq=False)
+class _RayTables:
+    """Homogeneous source pixel of a rectified one: ``rows[:, row] * weights[column] + columns[:, column]``.
 
-    The ray is a sum of products of one row table and one column table: no trigonometry per pixel.
+    No trigonometry per pixel.
     """
+
+    rows: NDArray[np.float32]
+    columns: NDArray[np.float32]
+    weights: NDArray[np.float32]
+
+
+def _ray_tables(view: View, pair: RectifiedPair, side: Side) -> _RayTables:
     A = pixel_from_rectified_ray(view, pair)
     along = (np.arange(pair.width(side)) + pair.column_origin(side)) / pair.columns_per_radian
-    across = (np.arange(pair.height)[band] + pair.row_origin) / pair.rows_per_radian
+    across = (np.arange(pair.height) + pair.row_origin) / pair.rows_per_radian
     if pair.model == "spherical":
         column_table, column_weight = np.sin(along), np.cos(along)
         row_table = np.outer(A[:, 1], np.sin(across)) + np.outer(A[:, 2], np.cos(across))
     else:
         column_table, column_weight = along, np.ones_like(along)
         row_table = np.outer(A[:, 1], across) + A[:, 2:3]
+    tables = row_table, np.outer(A[:, 0], column_table), column_weight
+    return _RayTables(*(table.astype(np.float32) for table in tables))
+
+
+def _pixel_maps(
+    view: View, tables: _RayTables, band: slice
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Source columns and rows (pixel centres at whole numbers) of a band of rectified rows, and the valid mask."""
     x, y, z = (
-        np.multiply.outer(row_table[k].astype(np.float32), column_weight.astype(np.float32))
-        + (A[k, 0] * column_table).astype(np.float32)
-        for k in range(3)
+        np.multiply.outer(row[band], tables.weights) + column
+        for row, column in zip(tables.rows, tables.columns, strict=True)
     )
     in_front = z > 1e-6
     np.divide(1, z, out=z, where=in_front)
