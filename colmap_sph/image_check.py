@@ -19,6 +19,8 @@ _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 # Start-of-frame markers; 0xC4, 0xC8 and 0xCC among them have other meanings.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _PNG_START = b"\x89PNG\r\n\x1a\n"
+# Rows of colours that are floating-point numbers at a time.
+_BAND_ROWS = 256
 
 
 class _DamagedError(ValueError):
@@ -38,6 +40,33 @@ def read_undistorted(path: Path, colour: int) -> NDArray[np.uint8]:
     if image is None:
         raise InputError(f"{path} cannot be read as an image; undistort it again or remove it from the model.")
     return np.asarray(image, dtype=np.uint8)
+
+
+def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
+    """Read the grey values (0..255) of an undistorted image as exactly as its file holds them.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    (H, W) uint8 or float32 ndarray
+        What JPEG stores are whole grey values, in uint8; those of other formats' colours have fractions.
+
+    Raises
+    ------
+    InputError
+        It is missing or damaged.
+    """
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        return read_undistorted(path, cv2.IMREAD_GRAYSCALE)
+    colours = read_undistorted(path, cv2.IMREAD_COLOR)
+    grey = np.empty(colours.shape[:2], dtype=np.float32)
+    for first in range(0, len(grey), _BAND_ROWS):
+        rows = slice(first, first + _BAND_ROWS)
+        grey[rows] = cv2.cvtColor(colours[rows].astype(np.float32), cv2.COLOR_BGR2GRAY)
+    return grey
 
 
 def image_problem(path: Path, width: int, height: int) -> str | None:

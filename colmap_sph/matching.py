@@ -45,13 +45,13 @@ _BEYOND = np.float32(1e9)  # what no offset reaches
 class MatchingOptions:
     """How rectified images are matched."""
 
-    p1: int = 18
+    p1: int = 15
     """Penalty for a disparity change of one pixel between neighbours, in census bits."""
     p2: int = 80
     """Penalty for larger changes in smooth image regions, in census bits."""
     p2_min: int = 30
     """Penalty for larger changes across strong intensity edges."""
-    p2_contrast: int = 16
+    p2_contrast: int = 2
     """Intensity difference (grey values) at which the penalty has fallen halfway to `p2_min`."""
     disparities: int = 32
     """Disparities searched per pixel at full resolution; a multiple of 32."""

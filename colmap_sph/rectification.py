@@ -155,7 +155,7 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
 
 
 def resample(
-    image: NDArray[np.uint8],
+    image: NDArray[np.uint8] | NDArray[np.float32],
     view: View,
     pair: RectifiedPair,
     side: Side,
@@ -166,7 +166,7 @@ def resample(
 
     Parameters
     ----------
-    image : (view.height, view.width) uint8 ndarray
+    image : (view.height, view.width) uint8 or float32 ndarray
         Grey undistorted image.
     view : View
         Its camera and pose.
@@ -185,7 +185,7 @@ def resample(
     valid : (H, W) uint8 ndarray
         255 where the rectified pixel lies inside the image and no ignored pixel has a part in it, else 0.
     """
-    shape, image = (pair.height, pair.width(side)), image.astype(np.float32)
+    shape, image = (pair.height, pair.width(side)), image.astype(np.float32, copy=False)
     rectified, valid = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.uint8)
     tables = _ray_tables(view, pair, side)
     for first in range(0, pair.height, _BAND_ROWS):

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from colmap_sph.context import Context, Done, Pair
 from colmap_sph.depth import DepthEstimate, PairDisparity, check_depth, estimate_depth
 from colmap_sph.errors import NoResultError
-from colmap_sph.image_check import read_undistorted
+from colmap_sph.image_check import read_grey, read_undistorted
 from colmap_sph.load_cache import LoadCache
 from colmap_sph.masks import read_mask
 from colmap_sph.matching import RectifiedImage, Scratch, match_pair
@@ -30,7 +30,6 @@ from colmap_sph.scene import View
 from colmap_sph.state import forget, vouch, vouched_facts
 from colmap_sph.workspace import (
     MapKind,
-    Workspace,
     make_dir,
     write_depth_map,
     write_normal_map,
@@ -43,7 +42,7 @@ _CACHE_BYTES = 512 << 20
 _SCRATCH_BYTES = 256 << 20
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
 # of a view while its depth is voted, without its pairs' maps, or checked.
-_MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 48.0, 45.0, 40.0
+_MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 56.0, 45.0, 40.0
 # Rectified pixels of a large pair per pixel of its images, with a margin for what arrays do not count.
 _RECTIFIED_SHARE = 1.4
 # … and refined, beside the grey images.
@@ -85,7 +84,9 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
     scratch_bytes = min(_SCRATCH_BYTES, spare // (3 * threads))
     cache_bytes = min(_CACHE_BYTES, spare // 6)
     gate.keep(threads * scratch_bytes + 2 * cache_bytes)
-    images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
+    images = LoadCache(
+        lambda name: read_grey(context.workspace.image_path(name)), lambda image: image.nbytes, cache_bytes
+    )
     masks = LoadCache(lambda name: _read_mask(context, name), lambda m: 0 if m is None else m.nbytes, cache_bytes)
 
     def rectified(name: str, geometry: RectifiedPair, side: Side) -> RectifiedImage:
@@ -206,7 +207,11 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
     most = max(_checking_bytes(context, view, partners.get(view.name, [])) for view in context.scene.views)
     cache_bytes = int(min(_CACHE_BYTES, gate.spare(1.2 * most) / 2))
     gate.keep(2 * cache_bytes)
-    images = LoadCache(lambda name: _read_grey(context.workspace, name), lambda image: image.nbytes, cache_bytes)
+    images = LoadCache(
+        lambda name: read_undistorted(context.workspace.image_path(name), cv2.IMREAD_GRAYSCALE),
+        lambda image: image.nbytes,
+        cache_bytes,
+    )
     estimates = LoadCache(lambda name: _read_estimate(context, name), lambda e: 9 * e.depth.size, cache_bytes)
 
     def work(view: View) -> Done:
@@ -251,10 +256,6 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
 def _pairs_of(pairs: Iterable[Pair], name: str) -> list[Pair]:
     """Pairs of an image, by the name of its partner."""
     return sorted((pair for pair in pairs if name in pair), key=lambda pair: [n for n in pair if n != name])
-
-
-def _read_grey(workspace: Workspace, name: str) -> NDArray[np.uint8]:
-    return read_undistorted(workspace.image_path(name), cv2.IMREAD_GRAYSCALE)
 
 
 def _read_mask(context: Context, name: str) -> NDArray[np.uint8] | None:

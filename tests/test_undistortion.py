@@ -10,7 +10,7 @@ import pytest
 
 from colmap_sph import staging
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.image_check import image_problem
+from colmap_sph.image_check import image_problem, read_grey
 from colmap_sph.originals import find_images
 from colmap_sph.scene import read_scene
 from colmap_sph.undistortion import (
@@ -284,6 +284,28 @@ def test_image_check_by_format(tmp_path: Path, extension: str) -> None:
     for length in (1, 3, 12, len(data) // 2, len(data) - 20):
         path.write_bytes(data[:length])
         assert image_problem(path, 50, 40) == "is damaged or cut off"
+
+
+def test_grey_values_of_lossless_files_keep_their_fractions(tmp_path: Path) -> None:
+    blue, green, red = colours = np.random.default_rng(0).integers(0, 256, (3, 300, 50), dtype=np.uint8)
+    for extension in ("png", "tif"):
+        path = tmp_path / f"image.{extension}"
+        cv2.imwrite(str(path), np.moveaxis(colours, 0, -1))
+        # The luma of ITU-R BT.601.
+        np.testing.assert_allclose(read_grey(path), 0.299 * red + 0.587 * green + 0.114 * blue, atol=1e-3)
+    path.unlink()
+    with pytest.raises(InputError, match=r"image\.tif cannot be read"):
+        read_grey(path)
+
+
+def test_grey_values_of_jpeg_files_are_those_stored(tmp_path: Path) -> None:
+    """A grey file comes back as it was written: whole numbers, up to JPEG's own loss."""
+    path, (row, column) = tmp_path / "image.JPG", np.indices((40, 50))
+    grey = (row + 2 * column).astype(np.uint8)
+    cv2.imwrite(str(path), grey, [cv2.IMWRITE_JPEG_QUALITY, 100])
+    read = read_grey(path)
+    assert read.dtype == np.uint8
+    np.testing.assert_allclose(read.astype(int), grey, atol=1)
 
 
 def test_image_check_with_preview_and_trailer(tmp_path: Path) -> None:
