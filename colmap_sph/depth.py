@@ -48,7 +48,7 @@ class DepthOptions:
     point that no other has in view."""
     max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
-    min_surface: float = 0.8
+    min_surface: float = 0.6
     """Where one view alone confirms a depth, at least this share of the 7 x 7 pixels around it must be of the same
     surface: what a single pair found in passing is rarely right."""
 
