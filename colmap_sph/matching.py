@@ -156,16 +156,17 @@ def match_pair(
     least, most = int(np.floor(-max_disparity)) - 1, int(np.ceil(-min_disparity)) + 1
     levels = _num_levels(most - least, min(left.image.shape + right.image.shape), options)
     lefts, rights = _pyramid(left, levels), _pyramid(right, levels)
+    del left, right  # each level goes when it has been matched
     offset: NDArray[np.int32] | None = None
     for level in range(levels, -1, -1):
         low, high = least >> level, -(-most >> level)
-        shape, depth = lefts[level].image.shape, min(_round_up(high - low + 3), _MAX_DEPTH)
+        shape, depth = lefts[-1].image.shape, min(_round_up(high - low + 3), _MAX_DEPTH)
         if offset is None:
             base = np.full(shape, low - 1, dtype=np.int32)
         else:
             depth = min(depth, options.disparities if level == 0 else options.coarse_disparities)
             base = _propagate(offset, shape, depth, low, high, options)
-        offset = _match_level(lefts[level], rights[level], base, depth, options, scratch, refine=level == 0)
+        offset = _match_level(lefts.pop(), rights.pop(), base, depth, options, scratch, refine=level == 0)
         if level > 0:
             # Not at full resolution: how rough a disparity map is tells the vote how far to trust it.
             _smooth(offset)
@@ -216,8 +217,8 @@ def _with_border(image: NDArray[Any], border: tuple[int, int, int, int], kind: i
 
 
 def _census(image: RectifiedImage) -> NDArray[np.uint64]:
-    sharp = cv2.filter2D(image.image, cv2.CV_32F, _SHARPER, borderType=cv2.BORDER_REPLICATE)
-    padded = _with_border(sharp.astype(np.int16), _CENSUS_BORDER, cv2.BORDER_REPLICATE)
+    sharp = cv2.filter2D(image.image, cv2.CV_32F, _SHARPER, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
+    padded = _with_border(sharp, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
     census = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), census)
     return census
@@ -235,14 +236,17 @@ def _match_level(
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest are refined from the raw costs."""
     kernels = backend()
-    left_census, right_census = _census(left), _census(right)
+    left_census, image = _census(left), np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
+    del left
+    right_census = _census(right)
+    del right
     offset = np.empty(base.shape, dtype=np.int32)
     _native.match(
         kernels,
         left_census,
         right_census,
         base,
-        np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8),
+        image,
         options.p1,
         _p2_table(options),
         options.max_slant,

@@ -42,7 +42,7 @@ _CACHE_BYTES = 512 << 20
 _SCRATCH_BYTES = 256 << 20
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
 # of a view while its depth is voted, without its pairs' maps, or checked.
-_MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 56.0, 45.0, 40.0
+_MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 44.0, 45.0, 40.0
 # Rectified pixels of a large pair per pixel of its images, with a margin for what arrays do not count.
 _RECTIFIED_SHARE = 1.4
 # … and refined, beside the grey images.
