@@ -52,7 +52,7 @@ def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
     Returns
     -------
     (H, W) uint8 or float32 ndarray
-        What JPEG stores are whole grey values, in uint8; those of other formats' colours have fractions.
+        Files called .jpg or .jpeg store whole grey values (uint8); those of other formats' colours have fractions.
 
     Raises
     ------

@@ -27,13 +27,13 @@ _MAX_DEPTH = 1024
 # Within 3 x 3 pixels of a coarser level, offsets on one surface differ by no more (in pixels of the finer one).
 _MAX_SURFACE_STEP = 4
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
-_CENSUS_STEPS = (
-    64  # census compares grey values in steps of a fraction: on weak texture, whole ones are too coarse
-)
-# Of the difference from the surroundings so much is added: lenses and resampling took it away.
+# Census compares 1/64 grey values, see CENSUS_MARGIN in `kernels.h`: on weak texture, whole ones are too coarse.
+_CENSUS_STEPS = 64
+# Unsharp masking, which gives back some of what lenses and resampling took away: so much of the difference from
+# the binomial mean of 3 x 3 pixels is added.
 _SHARPENING = 0.6
-_AROUND = np.outer((1, 2, 1), (1, 2, 1)) / 16
-_SHARPER = _CENSUS_STEPS * ((1 + _SHARPENING) * np.outer((0, 1, 0), (0, 1, 0)) - _SHARPENING * _AROUND)
+_BINOMIAL = np.outer((1, 2, 1), (1, 2, 1)) / 16
+_UNSHARP = _CENSUS_STEPS * ((1 + _SHARPENING) * np.outer((0, 1, 0), (0, 1, 0)) - _SHARPENING * _BINOMIAL)
 _BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
 # Offsets that differ from the median around them by no more (pixels) are noise; what differs by more may be
 # another surface, and is left to the filter of small segments.
@@ -217,7 +217,7 @@ def _with_border(image: NDArray[Any], border: tuple[int, int, int, int], kind: i
 
 
 def _census(image: RectifiedImage) -> NDArray[np.uint64]:
-    sharp = cv2.filter2D(image.image, cv2.CV_32F, _SHARPER, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
+    sharp = cv2.filter2D(image.image, cv2.CV_32F, _UNSHARP, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
     padded = _with_border(sharp, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
     census = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), census)

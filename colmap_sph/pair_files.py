@@ -42,19 +42,25 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "") -> None:
     step = max(_FINEST_STEP, (most - least) / (_CODES - 1))
     codes = np.where(found, np.rint((pair.disparity - least) / step) + 1, 0).astype(np.uint16)
     # In one: every array of an archive takes its time to open.
-    about = {"left": pair.left, "right": pair.right, "scale": [least, step], "geometry": vars(pair.geometry)}
-    write_arrays(path, {"codes": codes, "about": json.dumps(about, default=np.ndarray.tolist)}, key)
+    metadata = {"left": pair.left, "right": pair.right, "scale": [least, step], "geometry": vars(pair.geometry)}
+    write_arrays(path, {"codes": codes, "metadata": json.dumps(metadata, default=np.ndarray.tolist)}, key)
 
 
 def read_pair(path: Path) -> PairDisparity:
     """Read a pair's disparity map; `InputError` where the file is missing or damaged."""
-    data = read_arrays(path, ("codes", "about"))
-    about, codes = json.loads(str(data["about"])), data["codes"]
-    fields, (least, step) = about["geometry"], about["scale"]
-    fields["rectified_from_world"] = np.array(fields["rectified_from_world"])
+    data = read_arrays(path, ("codes", "metadata"))
+    codes = data["codes"]
+    try:
+        metadata = json.loads(str(data["metadata"]))
+        left, right, (least, step) = metadata["left"], metadata["right"], map(float, metadata["scale"])
+        rotation = np.array(metadata["geometry"]["rectified_from_world"], dtype=np.float64)
+        geometry = RectifiedPair(**(metadata["geometry"] | {"rectified_from_world": rotation}))
+    except (ValueError, KeyError, TypeError, RuntimeError) as error:
+        path.unlink(missing_ok=True)
+        raise InputError(f"{path} does not describe a pair ({error}); it was removed, run again.") from error
     disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
     disparity[codes == 0] = np.nan
-    return PairDisparity(about["left"], about["right"], RectifiedPair(**fields), disparity)
+    return PairDisparity(left, right, geometry, disparity)
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], key: str) -> None:

@@ -159,7 +159,6 @@ def resample(
     view: View,
     pair: RectifiedPair,
     side: Side,
-    interpolation: int = cv2.INTER_LINEAR,
     mask: NDArray[np.uint8] | None = None,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Resample an image to the rectified surface, once and straight from its pixels.
@@ -173,8 +172,6 @@ def resample(
     pair : RectifiedPair
     side : {"left", "right"}
         Which of the pair's images `view` is.
-    interpolation : int
-        OpenCV's code.
     mask : (view.height, view.width) uint8 ndarray, optional
         255 where the image counts, 0 where it is to be ignored.
 
@@ -194,7 +191,7 @@ def resample(
         if mask is not None:
             inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
         valid[band] = inside
-        rectified[band] = cv2.remap(image, columns, rows, interpolation, borderMode=cv2.BORDER_REPLICATE)
+        rectified[band] = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return rectified, valid
 
 

@@ -43,6 +43,8 @@ _SCRATCH_BYTES = 256 << 20
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; per pixel
 # of a view while its depth is voted, without its pairs' maps, or checked.
 _MATCH_BYTES, _VOTE_BYTES, _CHECK_BYTES = 44.0, 45.0, 40.0
+# … while an image is read and rectified: per pixel of its own, and per left rectified pixel of both.
+_READ_BYTES, _RECTIFIED_BYTES = 9.0, 10.0
 # Rectified pixels of a large pair per pixel of its images, with a margin for what arrays do not count.
 _RECTIFIED_SHARE = 1.4
 # … and refined, beside the grey images.
@@ -100,7 +102,10 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
         geometry, (left, right) = state.geometry, pair
         if not hasattr(thread, "scratch"):
             thread.scratch = Scratch(scratch_bytes)
-        with gate.reserve(_MATCH_BYTES * geometry.height * geometry.left_width, f"the pair {left} - {right}"):
+        rectified_pixels = geometry.height * geometry.left_width
+        pixels = max(view.width * view.height for view in map(context.scene.view, pair))
+        needed = max(_MATCH_BYTES * rectified_pixels, _READ_BYTES * pixels + _RECTIFIED_BYTES * rectified_pixels)
+        with gate.reserve(needed, f"the pair {left} - {right}"):
             disparity = match_pair(
                 rectified(left, geometry, "left"),
                 rectified(right, geometry, "right"),

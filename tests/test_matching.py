@@ -76,7 +76,9 @@ PLANES = [(0, 0), (25, 120), (45, 0), (45, 90), (60, 0), (60, 30), (60, 90)]
 def test_planes_are_matched_to_a_fraction_of_a_pixel(slant, tilt, rectification):
     matched = Matched(syn.slanted_plane_pair(slant, tilt, focal_length=FOCAL, size=SIZE), rectification)
     assert matched.completeness > 0.98
-    assert np.median(np.abs(matched.error)) < (0.055 if slant < 60 else 0.08)
+    # Unsharp masking costs 2 % of the precision on these clean pictures, and gives more at edges and in real ones.
+    bound = 0.08 if slant == 60 else 0.055 if rectification == "frame" else 0.05
+    assert np.median(np.abs(matched.error)) < bound
     assert abs(np.median(matched.error)) < 0.03
     assert (np.abs(matched.error) > 1).mean() < 0.01
 
@@ -113,6 +115,30 @@ def test_scenes_with_occlusions_are_matched(name):
     assert abs(np.median(matched.error)) < 0.03
     assert (np.abs(matched.error) > 1).mean() < 0.04
     assert matched.found[matched.occluded].mean() < 0.2
+
+
+def test_sharpened_images_are_matched_wrong_less_often(monkeypatch):
+    wrong = [[(np.abs(matched_scene(name).error) > 1).sum() for name in SCENES]]
+    monkeypatch.setattr(
+        matching, "_UNSHARP", matching._CENSUS_STEPS * np.outer((0, 1, 0), (0, 1, 0)).astype(float)
+    )
+    wrong.append([(np.abs(Matched(scene).error) > 1).sum() for scene in SCENES.values()])
+    assert sum(wrong[0]) < sum(wrong[1])
+
+
+def test_fractions_of_a_grey_value_are_matched():
+    """Texture of a third of a grey value, which rounding would take away, and noise of a tenth."""
+    rng = np.random.default_rng(0)
+    texture = ndimage.gaussian_filter(rng.standard_normal((120, 320)), 1.0)
+    texture *= 0.3 / texture.std()
+    pictures = [128 + texture[:, shift : shift + 300] + 0.1 * rng.standard_normal((120, 300)) for shift in (0, 20)]
+    inner = np.s_[10:-10, 40:-10]
+    right = [
+        np.abs(match_pair(*map(whole, images), 0, 60, OPTIONS) - 20)[inner] < 1
+        for images in (pictures, np.round(pictures))
+    ]
+    assert right[0].mean() > 0.998
+    assert right[1].mean() < 0.99
 
 
 def test_what_a_step_hides_is_left_out():

@@ -1,8 +1,11 @@
 """Disparity maps on disk: what is read is what was written, and damage is said in one sentence."""
 
+import json
 import re
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -101,6 +104,31 @@ def test_damaged_file(tmp_path: Path, damage: str) -> None:
         )
     with pytest.raises(InputError, match=re.escape(str(path))):
         read_pair(path)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda metadata: "nonsense",
+        lambda metadata: "[]",
+        lambda metadata: "{}",
+        lambda metadata: "[" * 100_000,
+        lambda metadata: json.dumps(metadata | {"scale": [1.0]}),
+        lambda metadata: json.dumps(metadata | {"scale": [None, 1.0]}),
+        lambda metadata: json.dumps(metadata | {"geometry": []}),
+        lambda metadata: json.dumps(metadata | {"geometry": metadata["geometry"] | {"more": 1}}),
+        lambda metadata: json.dumps(metadata | {"geometry": metadata["geometry"] | {"rectified_from_world": "x"}}),
+    ],
+)
+def test_metadata_of_no_pair_is_refused_and_removed(tmp_path: Path, change: Callable[[Any], str]) -> None:
+    path = tmp_path / "pair.npz"
+    write_pair(path, make_pair(random_disparity(0, 50)))
+    with np.load(path) as data:
+        content = dict(data)
+    np.savez(path, **(content | {"metadata": change(json.loads(str(content["metadata"])))}))
+    with pytest.raises(InputError, match="does not describe a pair"):
+        read_pair(path)
+    assert not path.exists()
 
 
 def test_any_single_damaged_byte_is_harmless(tmp_path: Path) -> None:

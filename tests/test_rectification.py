@@ -214,7 +214,7 @@ def test_resampling_reads_the_right_place(name, model):
             inner &= place < 255
             error = rectified_picture[inner].astype(float) - (place[inner] - 0.5)
             assert inner.sum() > 1000
-            assert np.abs(error).max() < 0.6  # rounding to whole grey values, and to 1/32 pixel in old OpenCV
+            assert np.abs(error).max() < 0.04  # not rounded to grey values; old OpenCV rounds to 1/32 pixel
             assert abs(error.mean()) < 0.02
 
 
@@ -262,13 +262,6 @@ def test_rows_go_on_past_the_seam():
         expected = (1 - share) * image[below].astype(float) + share * image[below + 1]
         assert np.abs(image[row] - expected)[both].max(initial=0) < 2
     assert np.isfinite(x[depth > 0]).all() and np.isfinite(y[depth > 0]).all()
-
-
-def test_resampling_takes_nearest_neighbours_for_masks():
-    left, _, pair, _ = rectified("convergent", "spherical")
-    mask = np.random.default_rng(0).choice(np.array([0, 200], np.uint8), (left.height, left.width))
-    image, _ = resample(mask, left, pair, "left", cv2.INTER_NEAREST)
-    assert set(np.unique(image)) == {0, 200}
 
 
 # ---- what cannot be ----------------------------------------------------------------------------------------
@@ -397,7 +390,7 @@ def test_the_two_rectified_images_show_the_same(name):
     points = covisible_points(RENDERED[name], scene)
     disparity, columns, rows = disparities(pair, left, right, points)
     images = [
-        resample(grey(RENDERED[name].render(side)), view, pair, side)[0].astype(np.float32)
+        resample(grey(RENDERED[name].render(side)), view, pair, side)[0]
         for view, side in ((left, "left"), (right, "right"))
     ]
 

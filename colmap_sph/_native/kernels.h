@@ -26,7 +26,8 @@ enum {
     MAX_REFINEMENT = 256   /* 1/256 pixel */
 };
 
-/* Neighbours count as darker that are so by more than half a grey value, of 64 steps: less is rounding. */
+/* Census images come in 1/64 grey value (_CENSUS_STEPS in matching.py); a difference up to half a grey value, which
+ * may be rounding, counts as none. */
 enum { CENSUS_MARGIN = 32 };
 
 /* Bit 63 of a census word marks a pixel without image content. */
