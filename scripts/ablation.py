@@ -33,10 +33,8 @@ _VARIANTS: dict[str, list[str]] = {
     "one confirming view is enough": ["--depth.min-consistent", "1"],
     "three confirming views": ["--depth.min-consistent", "3"],
     "depths off their plane or glanced at stay": ["--normals.max-shift", "1e9", "--normals.max-incidence", "90"],
-    "penalties 16, 120, softer edges": [
-        *("--matching.p1", "16", "--matching.p2", "120"),
-        *("--matching.p2-contrast", "24"),
-    ],
+    "P1 is 18, P2 falls over 16 grey values": ["--matching.p1", "18", "--matching.p2-contrast", "16"],
+    "rectified 1.2 times as fine": ["--sampling", "1.2"],
     "ranges do not follow slopes": ["--matching.max-slant", "0"],
     "64 disparities": ["--matching.disparities", "64"],
     "five pairs": ["--num-pairs", "5"],

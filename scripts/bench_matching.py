@@ -5,8 +5,9 @@
 FOLDER holds a folder for each pair: ``left.png``, ``right.png``, and ``disparity.npz`` with the array
 ``disparity``, x_right = x_left - disparity, NaN where it is unknown. Without --pairs the shared test pairs are
 taken (COLMAP_SPH_DATA, or ../shared/data beside the repository). Both matchers get the same range, that of the
-truth, and run on one thread. Pixels count whose true match lies inside the right image. *Wrong* is further than
-one pixel from the truth, among what was matched. *Locked* says how uneven the fractions of the matched disparities
+truth, and run on one thread. Pixels count whose true match lies inside the right image; *seen* are those that it
+shows, since nothing nearer covers them. *Wrong* is further than one pixel from the truth, among what was matched.
+*Locked* says how uneven the fractions of the matched disparities
 are: the largest difference of a tenth of a pixel's share, relative to a tenth, from what the truth's have (of
 use only where the truth is not itself in steps of a fraction of a pixel).
 """
@@ -35,6 +36,8 @@ class Score:
 
     matched: float
     wrong: float
+    matched_seen: float
+    wrong_seen: float
     median: float
     locked: float
     seconds: float
@@ -73,17 +76,35 @@ def opencv(left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: in
     return np.where(disparity >= low, disparity, np.nan)
 
 
+def seen_by_both(truth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels whose true match lies inside the right image, and whose place no pixel a step nearer takes there."""
+    inside = np.isfinite(truth) & (np.arange(truth.shape[1]) >= np.nan_to_num(truth))
+    row, column = np.nonzero(inside)
+    disparity = truth[row, column]
+    place = row, np.rint(column - disparity).astype(int)
+    nearest = np.zeros_like(truth)
+    np.maximum.at(nearest, place, disparity)
+    seen = np.zeros_like(inside)
+    seen[row, column] = disparity > nearest[place] - 1
+    return seen
+
+
 def score(found: NDArray[np.float32], truth: NDArray[np.float32], seconds: float) -> Score:
     """Compare with the truth where that is known and inside the right image."""
     known = np.isfinite(truth) & (np.arange(truth.shape[1]) >= np.nan_to_num(truth))
-    matched = known & np.isfinite(found)
-    error = np.abs(found - truth)[matched]
+    matched, seen = known & np.isfinite(found), seen_by_both(truth)
+    error = np.abs(found - truth)
     shares = [
         np.histogram(values[matched] % 1, bins=_BINS, range=(0, 1))[0] / max(matched.sum(), 1)
         for values in (found, truth)
     ]
     locked = float(np.max(np.abs(shares[0] - shares[1]) * _BINS))
-    return Score(matched.sum() / known.sum(), float((error > 1).mean()), float(np.median(error)), locked, seconds)
+    counts = [
+        count
+        for chosen in (known, seen)
+        for count in ((matched & chosen).sum() / chosen.sum(), float((error[matched & chosen] > 1).mean()))
+    ]
+    return Score(*counts, float(np.median(error[matched])), locked, seconds)
 
 
 def measure(folder: Path) -> dict[str, Score]:
@@ -115,11 +136,12 @@ def main() -> None:
     rows = []
     for folder in folders:
         for name, s in measure(folder).items():
-            percent = [f"{100 * share:.2f} %" for share in (s.matched, s.wrong)]
+            percent = [f"{100 * share:.2f} %" for share in (s.matched, s.wrong, s.matched_seen, s.wrong_seen)]
             rows.append(
                 [folder.name, name, *percent, f"{s.median:.3f}", f"{100 * s.locked:.0f} %", f"{s.seconds:.2f}"]
             )
-    header = ["pair", "matcher", "matched", "wrong of it", "median error, px", "locked", "seconds"]
+    header = ["pair", "matcher", "matched", "wrong of it", "matched, seen", "wrong, seen", "median error, px"]
+    header += ["locked", "seconds"]
     text = f"{machine()}\n\n{table(header, rows)}\n"
     print(text)
     if arguments.output:
