@@ -66,8 +66,8 @@ def pair_files(run: Run) -> dict[tuple[str, str], Path]:
     """File of every pair that a run matched, by the names of its images."""
     found = {}
     for file in sorted((run.workspace.state_dir / "pairs").glob("*.npz")):
-        with np.load(file) as data:
-            found[str(data["left"]), str(data["right"])] = file
+        pair = read_pair(file)
+        found[pair.left, pair.right] = file
     return found
 
 
