@@ -82,7 +82,7 @@ class RunCommand:
     rectification: Annotated[RectificationOptions, tyro.conf.arg(name="")] = field(
         default_factory=RectificationOptions
     )
-    matching: MatchingOptions = field(default_factory=MatchingOptions)
+    matching: Annotated[MatchingOptions, tyro.conf.FlagConversionOff] = field(default_factory=MatchingOptions)
     depth: DepthOptions = field(default_factory=DepthOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)

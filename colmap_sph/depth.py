@@ -48,6 +48,8 @@ class DepthOptions:
     point that no other has in view."""
     max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
+    min_contradicting_support: int = 2
+    """Pairs that must agree on a view's photometric depth before it can look through another's."""
     min_surface: float = 0.6
     """Where one view alone confirms a depth, at least this share of the 7 x 7 pixels around it must be of the same
     surface: what a single pair found in passing is rarely right."""
@@ -63,8 +65,9 @@ class DepthOptions:
         ):
             if not getattr(self, name) > 0:
                 raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
-        if not 1 <= self.min_support <= 255:
-            raise OptionError(f"min_support must lie in 1..255, not {self.min_support}.")
+        for name in ("min_support", "min_contradicting_support"):
+            if not 1 <= getattr(self, name) <= 255:
+                raise OptionError(f"{name} must lie in 1..255, not {getattr(self, name)}.")
         if not 0 <= self.min_consistent <= 255:
             raise OptionError(f"min_consistent must lie in 0..255, not {self.min_consistent}.")
         if not self.max_contradiction >= 0:
@@ -80,6 +83,7 @@ CHECK_OPTIONS = (
     "consistency_tolerance",
     "min_consistent",
     "max_contradiction",
+    "min_contradicting_support",
     "min_surface",
 )
 
@@ -251,10 +255,12 @@ def check_depth(
             estimate.sigma,
             partner_estimate.depth,
             partner_estimate.sigma,
+            partner_estimate.support,
             pixel_transfer(view, partner),
             pixel_transfer(partner, view),
             options.max_reprojection_error,
             options.consistency_tolerance,
+            options.min_contradicting_support,
             observing,
             agreeing,
             contradicting,

@@ -65,8 +65,16 @@ class MatchingOptions:
     """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
+    max_left_right_excess: int = 4
+    """A match that fails this is kept when no other one claims its pixel of the right image at an aggregated cost
+    (half the sum over 8 paths, census bits) that is lower by more. Where the other one is right, it is by far."""
+    max_coarse_left_right_excess: int = 48
+    """The same above full resolution, where matches only say where to search."""
     min_segment: int = 200
     """Connected regions of fewer pixels than this are removed at full resolution."""
+    median_filter: bool = False
+    """Take the median of 5 x 5 disparities at full resolution, as is done above it. Depth from many pairs is
+    better without: how rough a disparity map is tells the vote how far to trust it."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
@@ -81,12 +89,22 @@ class MatchingOptions:
             value = getattr(self, name)
             if not _STEP <= value <= _MAX_DEPTH or value % _STEP:
                 raise OptionError(f"{name} must be a multiple of {_STEP} up to {_MAX_DEPTH}, not {value}.")
-        for name, most in (("range_radius", 50), ("max_left_right_difference", 100)):
+        limits = {
+            "range_radius": 50,
+            "max_left_right_difference": 100,
+            "max_left_right_excess": 255,
+            "max_coarse_left_right_excess": 255,
+        }
+        for name, most in limits.items():
             if not 0 <= getattr(self, name) <= most:
                 raise OptionError(f"{name} must lie in 0..{most}, not {getattr(self, name)}.")
         for name in ("max_slant", "min_segment"):
             if getattr(self, name) < 0:
                 raise OptionError(f"{name} must not be negative, not {getattr(self, name)}.")
+
+
+SINGLE_PAIR = MatchingOptions(max_left_right_excess=56, min_segment=150, median_filter=True)
+"""For a pair alone, whose gaps no other pair fills and whose noise no vote finds."""
 
 
 class Scratch:
@@ -166,9 +184,8 @@ def match_pair(
         else:
             depth = min(depth, options.disparities if level == 0 else options.coarse_disparities)
             base = _propagate(offset, shape, depth, low, high, options)
-        offset = _match_level(lefts.pop(), rights.pop(), base, depth, options, scratch, refine=level == 0)
-        if level > 0:
-            # Not at full resolution: how rough a disparity map is tells the vote how far to trust it.
+        offset = _match_level(lefts.pop(), rights.pop(), base, depth, options, scratch, finest=level == 0)
+        if level > 0 or options.median_filter:
             _smooth(offset)
         _remove_small_segments(offset, max(options.min_segment >> level, 4))
     assert offset is not None
@@ -232,7 +249,7 @@ def _match_level(
     options: MatchingOptions,
     scratch: Scratch,
     *,
-    refine: bool,
+    finest: bool,
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest are refined from the raw costs."""
     kernels = backend()
@@ -251,10 +268,11 @@ def _match_level(
         _p2_table(options),
         options.max_slant,
         options.max_left_right_difference,
+        options.max_left_right_excess if finest else options.max_coarse_left_right_excess,
         scratch.volume(base.shape, depth),
         offset,
     )
-    if not refine:
+    if not finest:
         return offset
     refined = np.empty_like(offset)
     _native.refine_offsets(kernels, offset, left_census, right_census, refined)

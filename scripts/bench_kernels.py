@@ -192,7 +192,8 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
     detours = scratch[0].reshape(volume)
     selected, matched = np.empty(scene.shape, np.int32), np.empty(scene.shape, np.int32)
     base, image = scene.base, scene.left
-    p1, slant, difference = OPTIONS.p1, OPTIONS.max_slant, OPTIONS.max_left_right_difference
+    p1, slant = OPTIONS.p1, OPTIONS.max_slant
+    limits = OPTIONS.max_left_right_difference, OPTIONS.max_left_right_excess
 
     def matching_cost(backend: str) -> None:
         _native.matching_cost(backend, left, right, base, cost)
@@ -201,10 +202,10 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
         _native.aggregation(backend, cost, base, image, p1, P2, slant, detours, sums)
 
     def selection(backend: str) -> None:
-        _native.selection(backend, sums, base, left, right, difference, selected)
+        _native.selection(backend, sums, base, left, right, *limits, selected)
 
     def match(backend: str) -> None:
-        _native.match(backend, left, right, base, image, p1, P2, slant, difference, scratch, matched)
+        _native.match(backend, left, right, base, image, p1, P2, slant, *limits, scratch, matched)
 
     steps = [(matching_cost, cost), (aggregation, sums), (selection, selected), (match, matched)]
     return [Kernel(call.__name__, call, [output], cost.size, scene.depth) for call, output in steps]
@@ -262,12 +263,13 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
     for disparity in (scene.disparity, from_right):
         known = np.where(disparity > 0, disparity, np.inf)  # no depth: 0
         maps += [(focal / known).astype(np.float32), (0.3 * focal / known**2).astype(np.float32)]
+    support = np.full(shape, 2, np.uint8)
     counts, sums = np.empty((3, *shape), np.uint8), np.empty((2, *shape), np.float32)
 
     def check_consistency(backend: str) -> None:
         counts.fill(0)
         sums.fill(0)
-        _native.check_consistency(backend, *maps, beside, back, 2.0, 4.5, *counts, *sums)
+        _native.check_consistency(backend, *maps, support, beside, back, 2.0, 4.5, 2, *counts, *sums)
 
     inverse = scene.disparity / focal
     planes = np.stack([inverse, *np.gradient(inverse)[::-1]]).astype(np.float32)

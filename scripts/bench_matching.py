@@ -2,9 +2,11 @@
 
     python scripts/bench_matching.py --pairs FOLDER [--output FILE]
 
+Ours twice: with the options for a pair alone (`SINGLE_PAIR`), and with the pipeline's, where many pairs vote.
+
 FOLDER holds a folder for each pair: ``left.png``, ``right.png``, and ``disparity.npz`` with the array
 ``disparity``, x_right = x_left - disparity, NaN where it is unknown. Without --pairs the shared test pairs are
-taken (COLMAP_SPH_DATA, or ../shared/data beside the repository). Both matchers get the same range, that of the
+taken (COLMAP_SPH_DATA, or ../shared/data beside the repository). All matchers get the same range, that of the
 truth, and run on one thread. Pixels count whose true match lies inside the right image; *seen* are those that it
 shows, since nothing nearer covers them. *Wrong* is further than one pixel from the truth, among what was matched.
 *Locked* says how uneven the fractions of the matched disparities
@@ -17,6 +19,7 @@ import os
 import sys
 import time
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -24,7 +27,7 @@ import numpy as np
 from benchmarking import machine, table
 from numpy.typing import NDArray
 
-from colmap_sph.matching import MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
 
 _BLOCK = 3
 _BINS = 10
@@ -43,7 +46,9 @@ class Score:
     seconds: float
 
 
-def ours(left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: int) -> NDArray[np.float32]:
+def ours(
+    left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: int, options: MatchingOptions
+) -> NDArray[np.float32]:
     """Disparities by `colmap_sph.matching`; NaN = none."""
     images = [
         RectifiedImage(
@@ -51,7 +56,7 @@ def ours(left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: int)
         )
         for image in (left, right)
     ]
-    return match_pair(*images, low, high, MatchingOptions())
+    return match_pair(*images, low, high, options)
 
 
 def opencv(left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: int) -> NDArray[np.float32]:
@@ -108,7 +113,7 @@ def score(found: NDArray[np.float32], truth: NDArray[np.float32], seconds: float
 
 
 def measure(folder: Path) -> dict[str, Score]:
-    """Scores of both matchers on the pair in `folder`."""
+    """Scores of the matchers on the pair in `folder`."""
     left, right = (cv2.imread(str(folder / f"{side}.png")) for side in ("left", "right"))
     with np.load(folder / "disparity.npz") as data:
         truth = data["disparity"]
@@ -116,7 +121,12 @@ def measure(folder: Path) -> dict[str, Score]:
         sys.exit(f"{folder}: left.png, right.png and the array in disparity.npz must be there and of one size.")
     low, high = int(np.floor(np.nanmin(truth))), int(np.ceil(np.nanmax(truth)))
     scores = {}
-    for name, matcher in (("ours", ours), ("OpenCV HH", opencv)):
+    matchers = {
+        "ours": partial(ours, options=SINGLE_PAIR),
+        "OpenCV HH": opencv,
+        "ours, to vote": partial(ours, options=MatchingOptions()),
+    }
+    for name, matcher in matchers.items():
         start = time.perf_counter()
         found = matcher(left, right, low, high)
         scores[name] = score(found, truth, time.perf_counter() - start)

@@ -78,14 +78,14 @@ def selection(rng: Random) -> Arguments:
     (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
     sums, base = filled(rng, (h, w, depth), np.uint8), filled(rng, (h, w), np.int32)
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
-    return [backend(rng), sums, base, *words, int(rng.integers(0, 5)), np.zeros((h, w), np.int32)]
+    return [backend(rng), sums, base, *words, *rng.integers(0, (5, 99)).tolist(), np.zeros((h, w), np.int32)]
 
 
 def match(rng: Random) -> Arguments:
     (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
     base, image, p1 = filled(rng, (h, w), np.int32), filled(rng, (h, w), np.uint8), int(rng.integers(0, 64))
-    p2, limits = rng.integers(p1, 128, 256).astype(np.uint8), (int(rng.integers(0, 5)), int(rng.integers(0, 5)))
+    p2, limits = rng.integers(p1, 128, 256).astype(np.uint8), rng.integers(0, (5, 5, 99)).tolist()
     scratch = np.zeros((2, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
     return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
 
@@ -121,13 +121,14 @@ def vote_depth(rng: Random) -> Arguments:
 
 def check_consistency(rng: Random) -> Arguments:
     sizes = [size(rng)] * 2 + [size(rng)] * 2
-    inputs = [filled(rng, shape, np.float32) for shape in (*sizes[:2], *sizes[2:])]
+    inputs = [filled(rng, shape, np.float32) for shape in sizes]
+    support, least = filled(rng, sizes[2], np.uint8), int(rng.integers(-1, 4))
     matrices = [filled(rng, (3, 4), np.float64) for _ in range(2)]
     counts = [filled(rng, sizes[0], np.uint8) for _ in range(3)]
     sums = [filled(rng, sizes[0], np.float32) for _ in range(2)]
     if rng.random() < 0.5:  # a few pixels aside
         matrices = [np.hstack([np.eye(3), rng.uniform(-3, 3, (3, 1))]) for _ in range(2)]
-    return [backend(rng), *inputs, *matrices, number(rng), number(rng), *counts, *sums]
+    return [backend(rng), *inputs, support, *matrices, number(rng), number(rng), least, *counts, *sums]
 
 
 def fuse_partner(rng: Random) -> Arguments:

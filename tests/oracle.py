@@ -76,7 +76,7 @@ def subpixel_offset(before, best, after):
     return 0 if rise <= 0 or best == 0 else int(np.trunc((before - after) * 128 / rise))
 
 
-def selection(aggregated, base, reference, target, max_difference):
+def selection(aggregated, base, reference, target, max_difference, max_excess):
     """Offsets (H, W) int32 in 1/256 pixel, OFFSET_INVALID = none."""
     height, width, depth = aggregated.shape
     offsets = np.full((height, width), OFFSET_INVALID, dtype=np.int32)
@@ -95,7 +95,8 @@ def selection(aggregated, base, reference, target, max_difference):
             r = x + int(base[y, x]) + best
             if best in (0, depth - 1) or r not in best_of_target or int(target[y, r]) >= CENSUS_INVALID:
                 continue
-            if any(abs(column - x) <= max_difference for column in best_of_target[r][1]):
+            least, columns = best_of_target[r]
+            if sums[best] - least <= max_excess or any(abs(column - x) <= max_difference for column in columns):
                 offsets[y, x] = (r - x) * 256 + subpixel_offset(*(int(s) for s in sums[best - 1 : best + 2]))
     return offsets
 
@@ -238,13 +239,15 @@ def _read_depth(depth, u, v):
     return 1 / (weights / corners).sum()
 
 
-def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma, max_error, tolerance):
+def check_consistency(view, depth, sigma, partner, maps, max_error, tolerance, min_support):
     """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner sees the point or would if it had a depth
     there, the partner's depth and sigma, clearance.
 
+    `maps` are the partner's depth, sigma and support.
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
     origin of depth maps. The clearance is the least relative distance from any gate or from a pixel's border.
     """
+    partner_depth, partner_sigma, partner_support = maps
     shape = depth.shape
     verdict, clearance = np.zeros(shape, dtype=int), np.full(shape, np.inf)
     carried, spread, observing = np.zeros(shape), np.zeros(shape), np.zeros(shape, dtype=bool)
@@ -264,7 +267,8 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
         found = _read_depth(partner_depth.astype(float), u, v)
         if not found > 0:
             continue
-        spread[row, col] = float(partner_sigma[int(np.floor(v + 0.5)), int(np.floor(u + 0.5))])
+        nearest = int(np.floor(v + 0.5)), int(np.floor(u + 0.5))
+        spread[row, col] = float(partner_sigma[nearest])
         back = partner.R.T @ (np.linalg.solve(partner.K, [u, v, 1.0]) * found - partner.t)
         back = view.R @ back + view.t
         home = view.K @ back
@@ -274,7 +278,7 @@ def check_consistency(view, depth, sigma, partner, partner_depth, partner_sigma,
         carried[row, col] = back[2]
         if back[2] > 0 and error <= max_error and abs(difference) <= gate:
             verdict[row, col] = 1
-        elif difference > 2 * gate:
+        elif difference > 2 * gate and partner_support[nearest] >= min_support:
             verdict[row, col] = -1
         observing[row, col] = difference >= -2 * gate
         clearance[row, col] = min(

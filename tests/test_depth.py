@@ -328,16 +328,16 @@ def plane_depth(view, depth):
     return ((depth - view.center[2]) / rays[:, 2]).reshape(column.shape).astype(np.float32)
 
 
-def estimate(depth, sigma=0.02):
+def estimate(depth, sigma=0.02, support=2):
     depth = depth.astype(np.float32)
     return DepthEstimate(
-        depth, np.where(depth > 0, np.float32(sigma), np.float32(0)), np.ones(depth.shape, np.uint8)
+        depth, np.where(depth > 0, np.float32(sigma), np.float32(0)), np.full(depth.shape, support, np.uint8)
     )
 
 
-def check(views, maps, options=OPTIONS):
-    partners = zip(views[1:], maps[1:], strict=True)
-    return check_depth(views[0], estimate(maps[0]), [(v, estimate(m)) for v, m in partners], options)
+def check(views, maps, options=OPTIONS, support=2):
+    partners = [(v, estimate(m, support=support)) for v, m in zip(views[1:], maps[1:], strict=True)]
+    return check_depth(views[0], estimate(maps[0]), partners, options)
 
 
 @pytest.mark.parametrize("kernels", _native.backends())
@@ -356,7 +356,7 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
         depth[rng.random(depth.shape) < 0.1] = 0
         depth[rng.random(depth.shape) < 0.1] *= 0.6
     reference, partner = views[0], views[1]
-    shape = maps[0].shape
+    shape, support = maps[0].shape, rng.integers(0, 4, maps[1].shape).astype(np.uint8)
     observing, agreeing, contradicting = (np.full(shape, counted, np.uint8) for _ in range(3))
     weighted, weight = np.full(shape, 0.5, np.float32), np.full(shape, 2, np.float32)
     forward = np.hstack([partner.R @ reference.R.T @ np.linalg.inv(reference.K), np.zeros((3, 1))])
@@ -369,10 +369,12 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
         sigmas[0],
         maps[1],
         sigmas[1],
+        support,
         partner.K @ forward,
         reference.K @ back,
         max_error,
         4.0,
+        2,
         observing,
         agreeing,
         contradicting,
@@ -380,7 +382,7 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
         weight,
     )
     verdict, seen, carried, spread, clearance = oracle.check_consistency(
-        reference, maps[0], sigmas[0], partner, maps[1], sigmas[1], max_error, 4.0
+        reference, maps[0], sigmas[0], partner, (maps[1], sigmas[1], support), max_error, 4.0, 2
     )
     clear = clearance > 1e-4
     assert clear.mean() > 0.95 and (verdict > 0).mean() > 0.1 and (verdict < 0).mean() > 0.01
@@ -405,12 +407,13 @@ def test_consistency_does_not_depend_on_the_backend(size, shift, odd):
     maps = [rng.uniform(*bounds, size).astype(np.float32) for bounds in ((9.9, 10.1), (0.01, 0.1)) * 2]
     for values in maps:
         values[rng.random(size) < 0.1] = odd
+    support = rng.integers(0, 4, size).astype(np.uint8)
     forward, back = (np.hstack([np.eye(3), [[sign * 10 * shift], [0], [0]]]) for sign in (1, -1))
     results = []
     for kernels in _native.backends():
         sums = [np.full(size, counted, np.uint8) for counted in (0, 254, 255)]
         sums += [np.full(size, -0.0, np.float32), np.full(size, 2, np.float32)]
-        _native.check_consistency(kernels, *maps, forward, back, 2.0, 4.0, *sums)
+        _native.check_consistency(kernels, *maps, support, forward, back, 2.0, 4.0, 2, *sums)
         results.append(sums)
     assert results[0][0].any() or size[1] <= abs(shift) + 1
     for other in results[1:]:
@@ -428,7 +431,8 @@ def test_at_the_rim_the_nearest_depth_is_taken():
             sums = [np.zeros((2, 3), np.uint8) for _ in range(3)] + [
                 np.zeros((2, 3), np.float32) for _ in range(2)
             ]
-            _native.check_consistency(kernels, *maps, partner, maps[1], forward, back, 2.0, 4.0, *sums)
+            support = np.ones((2, 3), np.uint8)
+            _native.check_consistency(kernels, *maps, partner, maps[1], support, forward, back, 2.0, 4.0, 2, *sums)
             assert sums[3][0, 2] / sums[4][0, 2] == pytest.approx(carried - 10, rel=1e-4)
 
 
@@ -530,6 +534,10 @@ def test_a_ghost_that_others_see_through_is_dropped():
     assert not check(views, maps).depth[inner].any()
     lenient = check(views, maps, replace(OPTIONS, max_contradiction=10.0))
     assert (lenient.depth[inner] > 0).all() and (lenient.support[inner] == 2).all()
+    # What a single pair says of the wall behind does not count against two views.
+    unsure = check(views, maps, support=1)
+    np.testing.assert_array_equal(unsure.depth[inner], lenient.depth[inner])
+    assert not check(views, maps, replace(OPTIONS, min_contradicting_support=1), support=1).depth[inner].any()
 
 
 def test_an_occluded_point_is_not_contradicted():
@@ -594,7 +602,7 @@ def test_a_view_without_pairs_has_no_depth():
             for value in (0, -1, np.nan)
         ],
         *[(name, np.nan) for name in ("max_reprojection_error", "consistency_tolerance", "max_contradiction")],
-        *[("min_support", value) for value in (0, 256)],
+        *[(name, value) for name in ("min_support", "min_contradicting_support") for value in (0, 256)],
         *[("min_consistent", value) for value in (-1, 256)],
         ("max_contradiction", -0.1),
         ("min_surface", 1.5),

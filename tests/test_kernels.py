@@ -90,9 +90,9 @@ def run_aggregation(backend, cost, base, image, p1, p2, max_slant=0):
     return aggregated
 
 
-def run_selection(backend, aggregated, base, reference, target, max_difference):
+def run_selection(backend, aggregated, base, reference, target, max_difference, max_excess=0):
     offset = np.full(base.shape, 5, dtype=np.int32)
-    _native.selection(backend, aggregated, base, reference, target, max_difference, offset)
+    _native.selection(backend, aggregated, base, reference, target, max_difference, max_excess, offset)
     return offset
 
 
@@ -240,17 +240,17 @@ def test_aggregation_of_one_pixel_is_four_times_its_cost(backend):
     kind=st.sampled_from(list(BASES)),
     sums=st.sampled_from([(0, 255), (0, 3), (250, 255), (255, 255)]),
     invalid=st.sampled_from([0.0, 0.2]),
-    max_difference=st.sampled_from([0, 2, INT32.max]),
+    limits=st.tuples(st.sampled_from([0, 2, INT32.max]), st.sampled_from([0, 1, 40, INT32.max])),
     seed=seeds,
 )
-def test_selection_is_the_oracles(backend, size, target_width, depth, kind, sums, invalid, max_difference, seed):
+def test_selection_is_the_oracles(backend, size, target_width, depth, kind, sums, invalid, limits, seed):
     rng = np.random.default_rng(seed)
     aggregated = rng.integers(sums[0], sums[1] + 1, (*size, depth)).astype(np.uint8)
     reference, target = words(rng, size, invalid), words(rng, (size[0], target_width), invalid)
     base = bases(rng, size, kind)
     np.testing.assert_array_equal(
-        run_selection(backend, aggregated, base, reference, target, max_difference),
-        oracle.selection(aggregated, base, reference, target, max_difference),
+        run_selection(backend, aggregated, base, reference, target, *limits),
+        oracle.selection(aggregated, base, reference, target, *limits),
     )
 
 
@@ -266,6 +266,20 @@ def test_selection_finds_a_planted_match(backend):
     offset = run_selection(backend, aggregated, base, content, content, 2)
     np.testing.assert_array_equal(offset[:, :7], oracle.OFFSET_INVALID)
     np.testing.assert_array_equal(offset[:, 7:], -7 * 256 + 64)
+
+
+@every_backend
+def test_selection_keeps_a_loser_of_little_excess(backend):
+    """Pixels 20 and 30 point at the same target pixel, the latter with a sum larger by 6."""
+    aggregated = np.full((1, 40, 32), 90, dtype=np.uint8)
+    aggregated[..., 16] = 50
+    base = np.full((1, 40), -16, dtype=np.int32)
+    aggregated[0, 20, 26], aggregated[0, 30, 16] = 10, 16
+    content = np.zeros((1, 40), dtype=np.uint64)
+    for excess, kept in ((0, False), (5, False), (6, True)):
+        offset = run_selection(backend, aggregated, base, content, content, 2, excess)
+        assert offset[0, 20] == 10 * 256
+        assert (offset[0, 30] == 0) == kept
 
 
 @every_backend
@@ -340,10 +354,10 @@ def test_refinement_finds_the_tip_between_whole_pixels(backend, position):
 # ---- the whole chain ---------------------------------------------------------------------------------------
 
 
-def run_match(backend, reference, target, base, image, p1, p2, max_slant, max_difference, depth, rows):
+def run_match(backend, reference, target, base, image, p1, p2, max_slant, check, depth, rows):
     scratch = np.full((2, rows * base.shape[1], depth), 77, dtype=np.uint8)
     offset = np.full(base.shape, 5, dtype=np.int32)
-    _native.match(backend, reference, target, base, image, p1, p2, max_slant, max_difference, scratch, offset)
+    _native.match(backend, reference, target, base, image, p1, p2, max_slant, *check, scratch, offset)
     return offset
 
 
@@ -362,8 +376,8 @@ def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, kind):
     np.testing.assert_array_equal(run_census(backend, right, valid[1]), target)
     image, p2 = (left[3:-3, 4:-4] // 64).astype(np.uint8), p2_table(rng, 10, 30, 120)
     sums = oracle.aggregation(oracle.matching_cost(reference, target, base, depth), base, image, 10, p2, 2)
-    expected = oracle.selection(sums, base, reference, target, 2)
+    expected = oracle.selection(sums, base, reference, target, 2, 5)
     # In one piece, and in bands of rows: to the bit the same.
     for rows in {1, 2, 3, size[0], size[0] + 1}:
-        offset = run_match(backend, reference, target, base, image, 10, p2, 2, 2, depth, rows)
+        offset = run_match(backend, reference, target, base, image, 10, p2, 2, (2, 5), depth, rows)
         np.testing.assert_array_equal(offset, expected)

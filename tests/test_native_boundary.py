@@ -47,6 +47,7 @@ def arguments(function):
             "base": np.zeros((H, W), np.int32),
             **census_pair,
             "max_difference": 2,
+            "max_excess": 4,
             "out offset": np.zeros((H, W), np.int32),
         },
         "match": {
@@ -58,6 +59,7 @@ def arguments(function):
             "p2": np.full(256, 60, u8),
             "max_slant": 2,
             "max_difference": 2,
+            "max_excess": 4,
             "out scratch": np.zeros((2, H * W, DEPTH), u8),
             "out offset": np.zeros((H, W), np.int32),
         },
@@ -102,10 +104,12 @@ def arguments(function):
             "sigma": np.ones((H, W), f32),
             "partner_depth": np.ones((5, 6), f32),
             "partner_sigma": np.ones((5, 6), f32),
+            "partner_support": np.ones((5, 6), u8),
             "partner_from_reference": matrix,
             "reference_from_partner": matrix.copy(),
             "max_error": 1.0,
             "tolerance": 4.0,
+            "min_support": 2,
             "out observing": np.zeros((H, W), u8),
             "out agreeing": np.zeros((H, W), u8),
             "out contradicting": np.zeros((H, W), u8),
@@ -413,9 +417,11 @@ def test_penalty_beyond_32_bits_is_refused(p1):
         call("aggregation", {**arguments("aggregation"), "p1": p1})
 
 
-def test_negative_left_right_difference_is_refused():
-    with pytest.raises(ValueError, match="left-right"):
-        call("selection", {**arguments("selection"), "max_difference": -1})
+@pytest.mark.parametrize("function", ["selection", "match"])
+@pytest.mark.parametrize("limit", ["max_difference", "max_excess"])
+def test_negative_limits_of_the_left_right_check_are_refused(function, limit):
+    with pytest.raises(ValueError, match="difference must" if limit == "max_difference" else "excess"):
+        call(function, {**arguments(function), limit: -1})
 
 
 def test_negative_slant_is_refused():
@@ -538,7 +544,7 @@ def test_empty_images_are_no_work(backend, size, target_width):
     _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.int16), image, words)
     _native.matching_cost(backend, words, target, base, volume)
     _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, volume.copy(), sums)
-    _native.selection(backend, sums, base, words, target, 2, np.zeros(size, np.int32))
+    _native.selection(backend, sums, base, words, target, 2, 0, np.zeros(size, np.int32))
 
 
 @every_backend
@@ -548,7 +554,7 @@ def test_target_without_columns_is_never_matched(backend):
     cost, offset = np.zeros((H, W, DEPTH), np.uint8), np.zeros((H, W), np.int32)
     _native.matching_cost(backend, reference, target, base, cost)
     np.testing.assert_array_equal(cost, oracle.COST_UNSEEN)
-    _native.selection(backend, cost, base, reference, target, 2, offset)
+    _native.selection(backend, cost, base, reference, target, 2, 0, offset)
     np.testing.assert_array_equal(offset, oracle.OFFSET_INVALID)
 
 
@@ -562,7 +568,7 @@ def test_empty_images_of_absurd_width_are_refused_or_no_work(backend):
     for function, values in {
         "aggregation": (volume, base, image, 10, p2, 2, volume.copy(), volume.copy()),
         "matching_cost": (words, words, base, volume),
-        "selection": (volume, base, words, words, 2, np.empty((0, width), np.int32)),
+        "selection": (volume, base, words, words, 2, 0, np.empty((0, width), np.int32)),
     }.items():
         with pytest.raises((ValueError, MemoryError)):
             getattr(_native, function)(backend, *values)
@@ -594,8 +600,8 @@ def test_empty_maps_are_no_work(shape):
     for reference, other in ((empty, partner), (partner, empty)):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
         for backend in BACKENDS:
-            maps = reference, reference, other, other
-            _native.check_consistency(backend, *maps, matrix, matrix, 1.0, 4.0, *counts)
+            maps = reference, reference, other, other, np.ones(other.shape, np.uint8)
+            _native.check_consistency(backend, *maps, matrix, matrix, 1.0, 4.0, 2, *counts)
             assert not any(count.any() for count in counts)
         fuse_empty(reference, other, matrix)
     _native.fit_planes(

@@ -1,5 +1,6 @@
 """Real images end to end: bounds, with some margin, that a broken stage would miss. Skipped without the data."""
 
+import importlib
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +48,24 @@ def run_on(source: Path, root: Path, names: list[str] | None, options: RunOption
         keep_images(root, names)
     report = colmap_sph.run(root / "sparse" / "0", options=options)
     return Result(Workspace(root / "dense"), report, source)
+
+
+STEREO_PAIRS = ("cloth3", "cones", "motorcycle", "reindeer", "wood2")
+
+
+@pytest.mark.parametrize("name", STEREO_PAIRS)
+def test_a_pair_alone_is_matched_better_than_by_opencv(name: str, data_dir: Path, monkeypatch) -> None:
+    """More matched, and less of it wrong: with some margin, as OpenCV's matcher may change."""
+    if not (data_dir / "stereo_pairs").is_dir():
+        pytest.skip(f"{data_dir / 'stereo_pairs'} is not among the real data")
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "scripts"))
+    scores = importlib.import_module("bench_matching").measure(data_dir / "stereo_pairs" / name)
+    ours, peer, voting = scores.values()
+    assert ours.matched > peer.matched - 0.002
+    assert ours.wrong < peer.wrong + 0.001
+    assert ours.median < peer.median
+    # Where other pairs fill the gaps, fewer wrong ones are worth more.
+    assert voting.matched < ours.matched and voting.median < peer.median
 
 
 @pytest.fixture(scope="module")

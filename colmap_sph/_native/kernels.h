@@ -26,8 +26,8 @@ enum {
     MAX_REFINEMENT = 256   /* 1/256 pixel */
 };
 
-/* Census images come in 1/64 grey value (_CENSUS_STEPS in matching.py); a difference up to half a grey value, which
- * may be rounding, counts as none. */
+/* Census images come in 1/64 grey value (_CENSUS_STEPS in matching.py); a difference up to half a grey value,
+ * which may be rounding, counts as none. */
 enum { CENSUS_MARGIN = 32 };
 
 /* Bit 63 of a census word marks a pixel without image content. */
@@ -61,12 +61,15 @@ typedef struct {
 typedef int aggregation_fn(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
                            path_penalties penalties, uint8_t *detours, uint8_t *aggregated);
 
-/* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. A winner
- * passes the check if, of all that point at its target pixel, one of the best is at most
- * `max_left_right_difference` columns from it. */
+/* Of all sums that point at a winner's target pixel there is a least one. The winner passes the check if its own
+ * sum is larger by at most `max_excess`, or if one of the least is at most `max_difference` columns from it. */
+typedef struct {
+    int32_t max_difference, max_excess;
+} left_right_check;
+
+/* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. */
 typedef int selection_fn(const uint8_t *aggregated, const int32_t *base, const uint64_t *reference,
-                         const uint64_t *target, match_size size, int32_t max_left_right_difference,
-                         int32_t *offset);
+                         const uint64_t *target, match_size size, left_right_check check, int32_t *offset);
 
 typedef struct {
     const uint64_t *reference, *target;
@@ -74,7 +77,7 @@ typedef struct {
     const uint8_t *image;
     match_size size;
     path_penalties penalties;
-    int32_t max_left_right_difference;
+    left_right_check check;
 } match_input;
 
 /* Cost, aggregation and selection in one. `scratch` has room for 2 bytes per slot of `band_rows` rows; the result
@@ -152,9 +155,11 @@ typedef struct {
 typedef void add_patch_equations_fn(const grey_image *reference, const patch_source *sources, ptrdiff_t count,
                                     const float *planes, patch_rows rows, patch_options options, float *equations);
 
-/* A view's depth (0 = none) and its standard deviation; fewer than 2^31 rows and columns. */
+/* A view's depth (0 = none), its standard deviation, and how many pairs are behind it (of a reference nobody
+ * asks); fewer than 2^31 rows and columns. */
 typedef struct {
     const float *depth, *sigma;
+    const uint8_t *support;
     ptrdiff_t height, width;
 } depth_map;
 
@@ -168,6 +173,7 @@ typedef struct {
 typedef struct {
     float max_reprojection_error; /* pixels */
     float tolerance;              /* standard deviations that depths may differ by */
+    int min_support;              /* pairs behind a depth that contradicts */
 } consistency_gates;
 
 /* Of the partners so far, per pixel: how many have the point in view and see nothing in front of it, agree, and

@@ -124,6 +124,11 @@ static int check_penalties(int p1, const uint8_t *p2) {
     return 1;
 }
 
+static int check_left_right(left_right_check limits) {
+    return check(limits.max_difference >= 0, "the left-right difference must not be negative") &&
+           check(limits.max_excess >= 0, "the excess must not be negative");
+}
+
 static PyObject *py_aggregation(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
@@ -158,8 +163,9 @@ static PyObject *py_selection(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
     PyObject *o[5];
-    int max_difference;
-    if (!PyArg_ParseTuple(args, "sOOOOiO", &backend, &o[0], &o[1], &o[2], &o[3], &max_difference, &o[4])) {
+    left_right_check limits;
+    if (!PyArg_ParseTuple(args, "sOOOOiiO", &backend, &o[0], &o[1], &o[2], &o[3], &limits.max_difference,
+                          &limits.max_excess, &o[4])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
@@ -173,10 +179,10 @@ static PyObject *py_selection(PyObject *self, PyObject *args) {
     const uint64_t *target = reference ? array_get(&arrays, o[3], "target", U64, 2, READ, target_shape) : NULL;
     int32_t *offset = target ? array_get(&arrays, o[4], "offset", I32, 2, WRITE, shape) : NULL;
     if (offset && check_depth(shape[2]) && check_width(shape[1]) && check_width(target_shape[1]) &&
-        check(max_difference >= 0, "the left-right difference must not be negative") && arrays_disjoint(&arrays)) {
+        check_left_right(limits) && arrays_disjoint(&arrays)) {
         const match_size size = {shape[0], shape[1], target_shape[1], shape[2]};
         Py_BEGIN_ALLOW_THREADS;
-        status = table->selection(aggregated, base, reference, target, size, max_difference, offset);
+        status = table->selection(aggregated, base, reference, target, size, limits, offset);
         Py_END_ALLOW_THREADS;
     }
     return finish(&arrays, status);
@@ -186,9 +192,10 @@ static PyObject *py_match(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
     PyObject *o[7];
-    int p1, max_slant, max_difference;
-    if (!PyArg_ParseTuple(args, "sOOOOiOiiOO", &backend, &o[0], &o[1], &o[2], &o[3], &p1, &o[4], &max_slant,
-                          &max_difference, &o[5], &o[6])) {
+    int p1, max_slant;
+    left_right_check limits;
+    if (!PyArg_ParseTuple(args, "sOOOOiOiiiOO", &backend, &o[0], &o[1], &o[2], &o[3], &p1, &o[4], &max_slant,
+                          &limits.max_difference, &limits.max_excess, &o[5], &o[6])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
@@ -207,14 +214,14 @@ static PyObject *py_match(PyObject *self, PyObject *args) {
         check(scratch_shape[1] > 0 && (shape[1] == 0 || scratch_shape[1] % shape[1] == 0),
               "scratch must have the size (2, pixels of one row or more, disparities)") &&
         check_penalties(p1, p2) && check(max_slant >= 0, "the slant must not be negative") &&
-        check(max_difference >= 0, "the left-right difference must not be negative") && arrays_disjoint(&arrays)) {
+        check_left_right(limits) && arrays_disjoint(&arrays)) {
         const match_input input = {reference,
                                    target,
                                    base,
                                    image,
                                    {shape[0], shape[1], target_shape[1], scratch_shape[2]},
                                    {(uint8_t)p1, p2, max_slant},
-                                   max_difference};
+                                   limits};
         const Py_ssize_t band_rows = shape[1] > 0 ? scratch_shape[1] / shape[1] : shape[0] + 1;
         Py_BEGIN_ALLOW_THREADS;
         status = table->match(&input, band_rows, scratch, offset);
@@ -382,10 +389,11 @@ static void get_depth_map(array_set *arrays, PyObject *depth, const char *depth_
 static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     (void)self;
     const char *backend;
-    PyObject *o[11];
+    PyObject *o[12];
     consistency_gates gates;
-    if (!PyArg_ParseTuple(args, "sOOOOOOffOOOOO", &backend, &o[0], &o[1], &o[2], &o[3], &o[4], &o[5],
-                          &gates.max_reprojection_error, &gates.tolerance, &o[6], &o[7], &o[8], &o[9], &o[10])) {
+    if (!PyArg_ParseTuple(args, "sOOOOOOOffiOOOOO", &backend, &o[0], &o[1], &o[2], &o[3], &o[4], &o[5], &o[6],
+                          &gates.max_reprojection_error, &gates.tolerance, &gates.min_support, &o[7], &o[8], &o[9],
+                          &o[10], &o[11])) {
         return NULL;
     }
     const kernel_table *table = table_or_error(backend);
@@ -399,14 +407,17 @@ static PyObject *py_check_consistency(PyObject *self, PyObject *args) {
     if (reference.sigma) {
         get_depth_map(&arrays, o[2], "partner_depth", o[3], "partner_sigma", &partner);
     }
-    const int ready = partner.sigma && copy_transfer(&arrays, o[4], o[5], &transfer);
+    Py_ssize_t partner_shape[2] = {partner.height, partner.width};
+    partner.support =
+        partner.sigma ? array_get(&arrays, o[4], "partner_support", U8, 2, READ, partner_shape) : NULL;
+    const int ready = partner.support && copy_transfer(&arrays, o[5], o[6], &transfer);
     Py_ssize_t shape[2] = {reference.height, reference.width};
-    sums.observing = ready ? array_get(&arrays, o[6], "observing", U8, 2, WRITE, shape) : NULL;
-    sums.agreeing = sums.observing ? array_get(&arrays, o[7], "agreeing", U8, 2, WRITE, shape) : NULL;
-    sums.contradicting = sums.agreeing ? array_get(&arrays, o[8], "contradicting", U8, 2, WRITE, shape) : NULL;
+    sums.observing = ready ? array_get(&arrays, o[7], "observing", U8, 2, WRITE, shape) : NULL;
+    sums.agreeing = sums.observing ? array_get(&arrays, o[8], "agreeing", U8, 2, WRITE, shape) : NULL;
+    sums.contradicting = sums.agreeing ? array_get(&arrays, o[9], "contradicting", U8, 2, WRITE, shape) : NULL;
     sums.weighted_depth =
-        sums.contradicting ? array_get(&arrays, o[9], "weighted_depth", F32, 2, WRITE, shape) : NULL;
-    sums.weight = sums.weighted_depth ? array_get(&arrays, o[10], "weight", F32, 2, WRITE, shape) : NULL;
+        sums.contradicting ? array_get(&arrays, o[10], "weighted_depth", F32, 2, WRITE, shape) : NULL;
+    sums.weight = sums.weighted_depth ? array_get(&arrays, o[11], "weight", F32, 2, WRITE, shape) : NULL;
     if (sums.weight && arrays_disjoint(&arrays)) {
         Py_BEGIN_ALLOW_THREADS;
         table->check_consistency(&reference, &partner, &transfer, gates, &sums);
@@ -671,9 +682,10 @@ static PyMethodDef methods[] = {
     {"aggregation", py_aggregation, METH_VARARGS,
      "aggregation(backend, cost, base, image, p1, p2, max_slant, detours, aggregated)"},
     {"selection", py_selection, METH_VARARGS,
-     "selection(backend, aggregated, base, reference, target, max_difference, offset)"},
+     "selection(backend, aggregated, base, reference, target, max_difference, max_excess, offset)"},
     {"match", py_match, METH_VARARGS,
-     "match(backend, reference, target, base, image, p1, p2, max_slant, max_difference, scratch, offset)"},
+     "match(backend, reference, target, base, image, p1, p2, max_slant, max_difference, max_excess, "
+     "scratch, offset)"},
     {"refine_offsets", py_refine_offsets, METH_VARARGS,
      "refine_offsets(backend, offset, reference, target, refined)"},
     {"transfer_disparity", py_transfer_disparity, METH_VARARGS, "transfer_disparity(left, max_step, right)"},
@@ -683,9 +695,9 @@ static PyMethodDef methods[] = {
      "is_left, first_row, depth, sigma)"},
     {"vote_depth", py_vote_depth, METH_VARARGS, "vote_depth(depths, sigmas, tolerance, depth, sigma, support)"},
     {"check_consistency", py_check_consistency, METH_VARARGS,
-     "check_consistency(backend, depth, sigma, partner_depth, partner_sigma, partner_from_reference, "
-     "reference_from_partner, max_reprojection_error, tolerance, observing, agreeing, contradicting, "
-     "weighted_depth, weight)"},
+     "check_consistency(backend, depth, sigma, partner_depth, partner_sigma, partner_support, "
+     "partner_from_reference, reference_from_partner, max_reprojection_error, tolerance, min_support, observing, "
+     "agreeing, contradicting, weighted_depth, weight)"},
     {"confirm_depth", py_confirm_depth, METH_VARARGS,
      "confirm_depth(depth, sigma, min_consistent, max_contradiction, min_surface, steepest, observing, "
      "agreeing, contradicting, weighted_depth, weight)"},

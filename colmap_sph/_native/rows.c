@@ -47,8 +47,8 @@ int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_
 }
 
 int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
-                const uint64_t *reference, const uint64_t *target, match_size size,
-                int32_t max_left_right_difference, int32_t *offset) {
+                const uint64_t *reference, const uint64_t *target, match_size size, left_right_check check,
+                int32_t *offset) {
     selection_buffers buffers;
     if (selection_begin(&buffers, size)) {
         return -1;
@@ -56,8 +56,7 @@ int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int
     for (ptrdiff_t y = 0; y < size.height; y++) {
         const ptrdiff_t row = y * size.width;
         kernels->selection_row(aggregated + row * size.depth, base + row, reference + row,
-                               target + y * size.target_width, size, max_left_right_difference, &buffers,
-                               offset + row);
+                               target + y * size.target_width, size, check, &buffers, offset + row);
     }
     free(buffers.winner);
     return 0;
@@ -98,8 +97,8 @@ static void backward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, const uint8_t
     for (ptrdiff_t r = 0; r < rows; r++) {
         const ptrdiff_t row = (y - r) * in->size.width;
         m->kernels->selection_row(row_sums - r * m->row_size, in->base + row, in->reference + row,
-                                  in->target + (y - r) * in->size.target_width, in->size,
-                                  in->max_left_right_difference, &m->selection, offset + row);
+                                  in->target + (y - r) * in->size.target_width, in->size, in->check, &m->selection,
+                                  offset + row);
     }
 }
 

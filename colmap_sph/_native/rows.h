@@ -51,12 +51,12 @@ typedef struct {
 /* 0, or -1 without memory; ended by free(buffers->winner). */
 int selection_begin(selection_buffers *buffers, match_size size);
 typedef void selection_row_fn(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
-                              const uint64_t *target, match_size size, int32_t max_left_right_difference,
+                              const uint64_t *target, match_size size, left_right_check check,
                               selection_buffers *buffers, int32_t *offset);
 
 /* The second half of selection_row_avx2, which AVX-512 has, too: what is left of `buffers->winner`, refined. */
 void check_winners_avx2(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
-                        int32_t max_left_right_difference, const selection_buffers *buffers, int32_t *offset);
+                        left_right_check check, const selection_buffers *buffers, int32_t *offset);
 
 /* ---- whole images from rows -------------------------------------------------------------------------------- */
 
@@ -77,8 +77,8 @@ int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const ui
 int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_t *base, const uint8_t *image,
                    match_size size, path_penalties penalties, uint8_t *detours, uint8_t *aggregated);
 int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
-                const uint64_t *reference, const uint64_t *target, match_size size,
-                int32_t max_left_right_difference, int32_t *offset);
+                const uint64_t *reference, const uint64_t *target, match_size size, left_right_check check,
+                int32_t *offset);
 int match_rows(const row_kernels *kernels, const match_input *input, ptrdiff_t band_rows, uint8_t *scratch,
                int32_t *offset);
 

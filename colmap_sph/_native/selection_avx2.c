@@ -78,7 +78,7 @@ static inline __m256i agrees(const uint8_t *sums, const int32_t *base, match_siz
 
 /* Pixels x to x + 7 of the row, those that `there` says. */
 static inline void check_eight(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
-                               int32_t max_difference, const selection_buffers *buffers, int32_t x, __m256i there,
+                               left_right_check check, const selection_buffers *buffers, int32_t x, __m256i there,
                                int32_t *offset) {
     const __m256i zero = _mm256_setzero_si256(), minus_one = _mm256_set1_epi32(-1);
     const __m256i depth = _mm256_set1_epi32((int)size.depth), width = _mm256_set1_epi32((int)size.target_width);
@@ -107,8 +107,9 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
     const __m256i after = _mm256_and_si256(_mm256_srli_epi32(three, 16), byte);
 
     const __m256i best_sum = gather_bytes(buffers->best_sum, _mm256_add_epi32(r, depth), found);
-    __m256i mutual = _mm256_and_si256(found, _mm256_cmpeq_epi32(sum, best_sum));
-    for (int32_t step = 1; step <= max_difference && step < (int32_t)size.width; step++) {
+    const __m256i excess = _mm256_sub_epi32(sum, best_sum);
+    __m256i mutual = _mm256_andnot_si256(_mm256_cmpgt_epi32(excess, _mm256_set1_epi32(check.max_excess)), found);
+    for (int32_t step = 1; step <= check.max_difference && step < (int32_t)size.width; step++) {
         const __m256i left = _mm256_andnot_si256(mutual, found);
         if (_mm256_testz_si256(left, left)) {
             break;
@@ -127,11 +128,11 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
 }
 
 void check_winners_avx2(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
-                        int32_t max_left_right_difference, const selection_buffers *buffers, int32_t *offset) {
+                        left_right_check check, const selection_buffers *buffers, int32_t *offset) {
     for (int32_t x = 0; x < (int32_t)size.width; x += 8) {
         const __m256i left = _mm256_set1_epi32((int)size.width - x);
         const __m256i there = _mm256_cmpgt_epi32(left, _mm256_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7));
-        check_eight(sums, base, target, size, max_left_right_difference, buffers, x, there, offset);
+        check_eight(sums, base, target, size, check, buffers, x, there, offset);
     }
 }
 

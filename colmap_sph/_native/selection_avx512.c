@@ -32,8 +32,8 @@ static selection_row_fn SELECTION_ROW;
 
 /* 32 slots fill half a register: nothing to gain. */
 void selection_row_avx512(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
-                          const uint64_t *target, match_size size, int32_t max_left_right_difference,
+                          const uint64_t *target, match_size size, left_right_check check,
                           selection_buffers *buffers, int32_t *offset) {
-    (size.depth % 64 ? selection_row_avx2 : selection_row_512)(sums, base, reference, target, size,
-                                                               max_left_right_difference, buffers, offset);
+    (size.depth % 64 ? selection_row_avx2 : selection_row_512)(sums, base, reference, target, size, check, buffers,
+                                                               offset);
 }

@@ -57,7 +57,7 @@ static ptrdiff_t first_minimum(const uint8_t *sums, ptrdiff_t depth) {
 }
 
 void selection_row_scalar(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
-                          const uint64_t *target, match_size size, int32_t max_left_right_difference,
+                          const uint64_t *target, match_size size, left_right_check check,
                           selection_buffers *buffers, int32_t *offset) {
     match_target_row(sums, base, reference, size, buffers->best_sum);
     for (ptrdiff_t x = 0; x < size.width; x++) {
@@ -67,7 +67,8 @@ void selection_row_scalar(const uint8_t *sums, const int32_t *base, const uint64
         const int found =
             !(reference[x] & CENSUS_INVALID) && best > 0 && best < size.depth - 1 && r >= 0 &&
             r < size.target_width && !(target[r] & CENSUS_INVALID) &&
-            is_mutual(sums, base, reference, size, buffers->best_sum[r], x, r, max_left_right_difference);
+            (own[best] - buffers->best_sum[r] <= check.max_excess ||
+             is_mutual(sums, base, reference, size, buffers->best_sum[r], x, r, check.max_difference));
         offset[x] =
             found ? (int32_t)(base[x] + best) * 256 + subpixel_offset(own[best - 1], own[best], own[best + 1])
                   : OFFSET_INVALID;
