@@ -83,14 +83,3 @@ const kernel_table *kernels_by_name(const char *name) {
 #endif
     return NULL;
 }
-
-const kernel_table *kernels_best(void) {
-    const char *names[] = {"avx512", "avx2"};
-    for (size_t k = 0; k < sizeof names / sizeof *names; k++) {
-        const kernel_table *table = kernels_by_name(names[k]);
-        if (table) {
-            return table;
-        }
-    }
-    return &scalar_kernels;
-}

@@ -211,8 +211,6 @@ add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add
 
 /* The table of this name, NULL when the processor or the build has no such version. */
 const kernel_table *kernels_by_name(const char *name);
-/* The fastest table this processor can run. */
-const kernel_table *kernels_best(void);
 
 /* ---- floating-point kernels: one version, so that the result never depends on the processor ---------------- */
 
