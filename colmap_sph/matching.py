@@ -1,8 +1,8 @@
 """Rectified pair → disparity map: hierarchical semi-global matching.
 
 Census (9 × 7) of the sharpened images, Hamming cost, aggregation along 8 paths (Hirschmüller 2008), left-right
-check, sub-pixel fit and removal of small segments, on an image pyramid with per-pixel search ranges (Rothermel et
-al. 2012, "tSGM").
+check, sub-pixel fit without pixel locking, and removal of small segments, on an image pyramid with per-pixel
+search ranges (Rothermel et al. 2012, "tSGM").
 Every pixel searches the same number of disparities from a base of its own, so memory stays regular.
 
 This module is the only caller of the matching kernels. Their convention is an *offset*, target column minus
@@ -38,6 +38,9 @@ _BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
 # Offsets that differ from the median around them by no more (pixels) are noise; what differs by more may be
 # another surface, and is left to the filter of small segments.
 _MAX_NOISE = 2
+# Pixel locking changes how often a fraction of a pixel comes by no more than this share; see `_evening_shifts`.
+_MAX_LOCKING = 0.25
+_SHIFT_STEPS = 4096
 _BEYOND = np.float32(1e9)  # what no offset reaches
 
 
@@ -191,6 +194,7 @@ def match_pair(
     assert offset is not None
     disparity = offset.astype(np.float32)
     disparity *= np.float32(-1 / _SUBPIXEL)
+    disparity -= _evening_shifts(offset)[offset & (_SUBPIXEL - 1)]
     disparity[offset == _OFFSET_INVALID] = np.nan
     return disparity
 
@@ -313,6 +317,21 @@ def _remove_small_segments(offset: NDArray[np.int32], min_segment: int) -> None:
     small[~valid] = -32768
     cv2.filterSpeckles(small, -32768, min_segment - 1, 4)
     offset[small == -32768] = _OFFSET_INVALID
+
+
+def _evening_shifts(offset: NDArray[np.int32]) -> NDArray[np.float32]:
+    """What to add to an offset, pixels, by its fraction, so that all fractions come about equally often.
+
+    Fine texture draws matches to whole pixels ("pixel locking"), though by little: fractions that are less even
+    are those of surfaces that both cameras face, and stay.
+    """
+    counts = np.bincount(offset[offset != _OFFSET_INVALID] & (_SUBPIXEL - 1), minlength=_SUBPIXEL)
+    turn = 2 * np.pi * np.arange(_SUBPIXEL) / _SUBPIXEL
+    # The density is about 1 + a cos + b sin; its integral says where a fraction ought to be.
+    a, b = (2 * (counts @ wave) / max(counts.sum(), 1) for wave in (np.cos(turn), np.sin(turn)))
+    shift = (a * np.sin(turn) - b * np.cos(turn)) / (2 * np.pi) * (np.hypot(a, b) < _MAX_LOCKING)
+    # In steps, so that the last bit of a sine does not make results differ between processors.
+    return np.asarray(np.round(shift * _SHIFT_STEPS) / _SHIFT_STEPS, dtype=np.float32)
 
 
 def _propagate(

@@ -64,6 +64,8 @@ def test_a_pair_alone_is_matched_better_than_by_opencv(name: str, data_dir: Path
     assert ours.matched > peer.matched - 0.002
     assert ours.wrong < peer.wrong + 0.001
     assert ours.median < peer.median
+    if name == "motorcycle":  # the one whose truth is not in steps of a fraction
+        assert ours.locked < 0.1 and voting.locked < 0.1
     # Where other pairs fill the gaps, fewer wrong ones are worth more.
     assert voting.matched < ours.matched and voting.median < peer.median
 
