@@ -116,7 +116,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"colmap_sph {colmap_sph.__version__}")
         return 0
     command = tyro.extras.subcommand_cli_from_dict(
-        # `run` alone has flags without a value.
+        # `run` alone has flags without a value, among its own options.
         {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
         prog="colmap_sph",
         description="Dense reconstruction for COLMAP without a GPU.",

@@ -3,7 +3,7 @@
 Each pair gives one depth candidate per pixel, read along the pixel's ray from the pair's disparity map, with a
 standard deviation from its geometry. The candidates vote: the largest mutually consistent cluster wins, and its
 weighted mean is the *photometric* depth. Depth maps of neighbouring views then check each other: what enough of
-them confirm and none sees through is the *geometric* depth.
+them confirm and few see through is the *geometric* depth.
 
 Depth is z in the camera frame along the ray K⁻¹ (col, row, 1): COLMAP's fusion reads depth maps so.
 """
@@ -49,7 +49,8 @@ class DepthOptions:
     max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
     min_contradicting_support: int = 2
-    """Pairs that must agree on a view's photometric depth before it can look through another's."""
+    """Pairs that must agree on a view's photometric depth before it can look through another's. A view with fewer
+    pairs contradicts no other."""
     min_surface: float = 0.6
     """Where one view alone confirms a depth, at least this share of the 7 x 7 pixels around it must be of the same
     surface: what a single pair found in passing is rarely right."""

@@ -38,8 +38,8 @@ _BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
 # Offsets that differ from the median around them by no more (pixels) are noise; what differs by more may be
 # another surface, and is left to the filter of small segments.
 _MAX_NOISE = 2
-# Pixel locking changes how often a fraction of a pixel comes by no more than this share; see `_evening_shifts`.
-_MAX_LOCKING = 0.25
+# Pixel locking makes whole pixels come more often than others by no more than this share; see `_evening_shifts`.
+_MAX_LOCKING = 0.15
 _SHIFT_STEPS = 4096
 _BEYOND = np.float32(1e9)  # what no offset reaches
 
@@ -69,8 +69,8 @@ class MatchingOptions:
     max_left_right_difference: int = 2
     """Largest difference, in pixels, between the matches found from the left and from the right image."""
     max_left_right_excess: int = 4
-    """A match that fails this is kept when no other one claims its pixel of the right image at an aggregated cost
-    (half the sum over 8 paths, census bits) that is lower by more. Where the other one is right, it is by far."""
+    """A match beyond `max_left_right_difference` is kept all the same when its aggregated cost (half the sum over
+    8 paths, census bits) exceeds that of the right pixel's best match by no more than this; 255 keeps all."""
     max_coarse_left_right_excess: int = 48
     """The same above full resolution, where matches only say where to search."""
     min_segment: int = 200
@@ -322,14 +322,16 @@ def _remove_small_segments(offset: NDArray[np.int32], min_segment: int) -> None:
 def _evening_shifts(offset: NDArray[np.int32]) -> NDArray[np.float32]:
     """What to add to an offset, pixels, by its fraction, so that all fractions come about equally often.
 
-    Fine texture draws matches to whole pixels ("pixel locking"), though by little: fractions that are less even
-    are those of surfaces that both cameras face, and stay.
+    Fine texture draws matches to whole pixels ("pixel locking"), by some hundredths of a pixel. Fractions that are
+    uneven in another way are the scene's own, of surfaces that both cameras face, and stay.
     """
     counts = np.bincount(offset[offset != _OFFSET_INVALID] & (_SUBPIXEL - 1), minlength=_SUBPIXEL)
     turn = 2 * np.pi * np.arange(_SUBPIXEL) / _SUBPIXEL
-    # The density is about 1 + a cos + b sin; its integral says where a fraction ought to be.
+    # The density is about 1 + a cos + b sin. Locking has no b: so much of a may be the scene's, too.
     a, b = (2 * (counts @ wave) / max(counts.sum(), 1) for wave in (np.cos(turn), np.sin(turn)))
-    shift = (a * np.sin(turn) - b * np.cos(turn)) / (2 * np.pi) * (np.hypot(a, b) < _MAX_LOCKING)
+    locking = np.clip(a - abs(b), 0, _MAX_LOCKING) * np.clip(2 - np.hypot(a, b) / _MAX_LOCKING, 0, 1)
+    # The density's integral says where a fraction ought to be.
+    shift = locking * np.sin(turn) / (2 * np.pi)
     # In steps, so that the last bit of a sine does not make results differ between processors.
     return np.asarray(np.round(shift * _SHIFT_STEPS) / _SHIFT_STEPS, dtype=np.float32)
 

@@ -314,19 +314,42 @@ def test_small_images_are_survived(shape):
 
 
 def test_offsets_are_drawn_away_from_whole_pixels_that_they_are_locked_to():
-    """Fractions of density 1 + 0.15 cos(2 pi (f - 0.1)) become even; those of one surface stay."""
+    """Fractions of density 1 + 0.12 cos(2 pi f) become even; those of one surface stay."""
     fraction = (np.arange(100000) + 0.5) / 100000
-    phase = 2 * np.pi * (fraction - 0.1)
-    drawn = np.interp(fraction, fraction + 0.15 * (np.sin(phase) + np.sin(0.2 * np.pi)) / (2 * np.pi), fraction)
+    drawn = np.interp(fraction, fraction + 0.12 * np.sin(2 * np.pi * fraction) / (2 * np.pi), fraction)
     offset = np.round(256 * (drawn + np.arange(drawn.size) % 9 - 4)).astype(np.int32)[None]
     shifts = matching._evening_shifts(offset)
-    for values, uneven in ((drawn, (0.12, 0.18)), (offset[0] / 256 + shifts[offset[0] & 255], (0, 0.03))):
+    for values, uneven in ((drawn, (0.1, 0.15)), (offset[0] / 256 + shifts[offset[0] & 255], (0, 0.03))):
         shares = np.histogram(values % 1, bins=8, range=(0, 1))[0] / drawn.size * 8
         assert uneven[0] < np.abs(shares - 1).max() < uneven[1]
+    # Drawn to anything but whole pixels, or by more than ever seen, they are the scene's.
+    for scenes in (offset + 77, offset - 128, np.round(64 * np.cos(offset / 50)).astype(np.int32)):
+        assert not matching._evening_shifts(scenes).any()
     for one in (0, 77, 128, -1):
         same = np.array([[one, matching._OFFSET_INVALID]], dtype=np.int32)
         assert matching._evening_shifts(same)[one & 255] == 0
     assert not matching._evening_shifts(np.full((2, 2), matching._OFFSET_INVALID, np.int32)).any()
+
+
+def test_the_excess_is_that_of_the_level(monkeypatch):
+    limits, match = [], _native.match
+    monkeypatch.setattr(_native, "match", lambda *a: (limits.append((a[4].shape, a[8], a[9])), match(*a)))
+    options = replace(
+        OPTIONS, max_left_right_difference=3, max_left_right_excess=7, max_coarse_left_right_excess=91
+    )
+    image = random_image((300, 400))
+    match_pair(image, image, -8, 8, options)
+    assert limits == [((75, 100), 3, 91), ((150, 200), 3, 91), ((300, 400), 3, 7)]
+
+
+@pytest.mark.parametrize("angle", [2.0, 5.0, 12.0])
+def test_planes_of_few_disparities_are_not_made_worse(angle, monkeypatch):
+    """Their fractions are uneven by themselves."""
+    scene = syn.slanted_plane_pair(angle, focal_length=FOCAL, size=SIZE)
+    error = [np.median(np.abs(Matched(scene, "frame").error))]
+    monkeypatch.setattr(matching, "_evening_shifts", lambda _: np.zeros(256, np.float32))
+    error.append(np.median(np.abs(Matched(scene, "frame").error)))
+    assert error[0] < 1.03 * error[1]
 
 
 def test_small_segments_are_removed():
@@ -378,6 +401,7 @@ def test_an_unknown_backend_is_refused(monkeypatch):
         {"max_left_right_excess": -1},
         {"max_left_right_excess": 256},
         {"max_coarse_left_right_excess": -1},
+        {"max_coarse_left_right_excess": 256},
         {"min_segment": -1},
         {"max_slant": -1},
     ],
