@@ -34,7 +34,10 @@ _VARIANTS: dict[str, list[str]] = {
     "three confirming views": ["--depth.min-consistent", "3"],
     "depths off their plane or glanced at stay": ["--normals.max-shift", "1e9", "--normals.max-incidence", "90"],
     "only a right pixel's best match passes the left-right check": ["--matching.max-left-right-excess", "0"],
-    "the same above full resolution": ["--matching.max-coarse-left-right-excess", "0"],
+    "only a right pixel's best match passes it above full resolution": [
+        "--matching.max-coarse-left-right-excess",
+        "0",
+    ],
     "matches that are worse by 48 pass the left-right check": ["--matching.max-left-right-excess", "48"],
     "a median of disparities at full resolution": ["--matching.median-filter", "True"],
     "what a single pair says contradicts, too": ["--depth.min-contradicting-support", "1"],
