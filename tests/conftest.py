@@ -16,6 +16,15 @@ SMALL_BLOCK = BlockOptions(
 )
 
 
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+
+
+@pytest.fixture
+def scripts_on_path(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Benchmarks and studies can be imported."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+
+
 @pytest.fixture(scope="session")
 def data_dir() -> Path:
     """Folder of the real data; the test is skipped where it is absent."""

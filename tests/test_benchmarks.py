@@ -9,16 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import SCRIPTS
 
 from colmap_sph import _native, cli
 from colmap_sph.synthetic import DemoBlock
 
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
-
-
-@pytest.fixture(autouse=True)
-def scripts_on_path(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
+pytestmark = pytest.mark.usefixtures("scripts_on_path")
 
 
 @pytest.fixture

@@ -2,9 +2,10 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
-SCRIPT = Path(__file__).resolve().parents[1] / "scripts" / "fuzz_native.py"
+from conftest import SCRIPTS
+
+SCRIPT = SCRIPTS / "fuzz_native.py"
 
 
 def fuzz(*arguments: str, before: str = "") -> subprocess.CompletedProcess[str]:

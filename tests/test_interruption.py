@@ -18,7 +18,6 @@ from conftest import keep_images
 from colmap_sph import cli
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
 
 
@@ -63,10 +62,8 @@ def wait_for(process: "subprocess.Popen[str]", pattern: str, folder: Path, numbe
 # ---- kills -------------------------------------------------------------------------------------------------
 
 
-def test_kills_cost_only_the_work_in_flight(
-    project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.syspath_prepend(str(SCRIPTS))
+@pytest.mark.usefixtures("scripts_on_path")
+def test_kills_cost_only_the_work_in_flight(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     script = importlib.import_module("check_interruptions")
     keep_images(project, NAMES)
     check = script.Check(project / "out", model=project / "sparse/0", kills=3, seed=3)
@@ -75,9 +72,9 @@ def test_kills_cost_only_the_work_in_flight(
     assert len(maps(project / "out/whole")) == 4 * len(NAMES)
 
 
-def test_the_check_of_kills_finds_faults(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("scripts_on_path")
+def test_the_check_of_kills_finds_faults(tmp_path: Path) -> None:
     """Work that was done again, a map and a cloud that differ, a map that is missing, leftovers."""
-    monkeypatch.syspath_prepend(str(SCRIPTS))
     script = importlib.import_module("check_interruptions")
     for root in ("killed", "whole"):
         for folder in ("depth_maps", "normal_maps"):

@@ -38,11 +38,16 @@ class Result:
     source: Path
 
 
-def run_on(source: Path, root: Path, names: list[str] | None, options: RunOptions) -> Result:
-    """Run on some images of a data set, from a copy of its model with links to its images."""
+def present(source: Path) -> Path:
+    """The folder of a data set; the test is skipped where it is absent."""
     if not source.is_dir():
         pytest.skip(f"{source} is not among the real data")
-    shutil.copytree(source / "sparse", root / "sparse")
+    return source
+
+
+def run_on(source: Path, root: Path, names: list[str] | None, options: RunOptions) -> Result:
+    """Run on some images of a data set, from a copy of its model with links to its images."""
+    shutil.copytree(present(source) / "sparse", root / "sparse")
     (root / "images").symlink_to(source / "images")
     if names is not None:
         keep_images(root, names)
@@ -53,13 +58,12 @@ def run_on(source: Path, root: Path, names: list[str] | None, options: RunOption
 STEREO_PAIRS = ("cloth3", "cones", "motorcycle", "reindeer", "wood2")
 
 
+@pytest.mark.usefixtures("scripts_on_path")
 @pytest.mark.parametrize("name", STEREO_PAIRS)
-def test_a_pair_alone_is_matched_better_than_by_opencv(name: str, data_dir: Path, monkeypatch) -> None:
+def test_a_pair_alone_is_matched_better_than_by_opencv(name: str, data_dir: Path) -> None:
     """More matched, and less of it wrong: with some margin, as OpenCV's matcher may change."""
-    if not (data_dir / "stereo_pairs").is_dir():
-        pytest.skip(f"{data_dir / 'stereo_pairs'} is not among the real data")
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "scripts"))
-    scores = importlib.import_module("bench_matching").measure(data_dir / "stereo_pairs" / name)
+    pairs = present(data_dir / "stereo_pairs")
+    scores = importlib.import_module("bench_matching").measure(pairs / name)
     ours, peer, voting = scores.values()
     assert ours.matched > peer.matched - 0.002
     assert ours.wrong < peer.wrong + 0.001

@@ -15,12 +15,7 @@ from colmap_sph.evaluation import DepthView
 from colmap_sph.options import RunOptions
 from colmap_sph.scene import View
 
-SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
-
-
-@pytest.fixture(autouse=True)
-def scripts_on_path(monkeypatch):
-    monkeypatch.syspath_prepend(str(SCRIPTS))
+pytestmark = pytest.mark.usefixtures("scripts_on_path")
 
 
 def made_up_pair(angle, frame, spherical):
