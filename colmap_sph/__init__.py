@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from colmap_sph.errors import ColmapSphError
-    from colmap_sph.options import RunOptions
-    from colmap_sph.pipeline import reconstruct, run
-    from colmap_sph.report import Progress, RunReport
+    from colmap_sph.pipeline.options import RunOptions
+    from colmap_sph.pipeline.reconstruct import reconstruct, run
+    from colmap_sph.pipeline.report import Progress, RunReport
 
 __all__ = ["ColmapSphError", "Progress", "RunOptions", "RunReport", "reconstruct", "run"]
 __version__ = "0.1.0"
 
 _MODULE_OF = {
     "ColmapSphError": "errors",
-    "Progress": "report",
-    "RunOptions": "options",
-    "RunReport": "report",
-    "reconstruct": "pipeline",
-    "run": "pipeline",
+    "Progress": "pipeline.report",
+    "RunOptions": "pipeline.options",
+    "RunReport": "pipeline.report",
+    "reconstruct": "pipeline.reconstruct",
+    "run": "pipeline.reconstruct",
 }
 
 

@@ -7,7 +7,7 @@ import sys
 def main() -> int:
     """Run the command line; an interruption while it loads ends without a traceback, too."""
     try:
-        from colmap_sph import cli
+        from colmap_sph.app import cli
 
         return cli.main()
     except BrokenPipeError:  # whoever reads the output has closed it, as `| head` does

@@ -21,7 +21,7 @@ import pycolmap
 from benchmarking import machine, table
 from scipy.spatial import cKDTree
 
-from colmap_sph.cloud_files import POINT
+from colmap_sph.scene import POINT
 
 _VARIANTS: dict[str, list[str]] = {
     "default": ["--overwrite"],

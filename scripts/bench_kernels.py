@@ -28,8 +28,8 @@ from machine_limits import copy_bandwidth, vector_throughput
 from numpy.typing import NDArray
 
 from colmap_sph import _native
-from colmap_sph.matching import MatchingOptions
-from colmap_sph.normals import NormalOptions
+from colmap_sph.stereo.matching import MatchingOptions
+from colmap_sph.stereo.normals import NormalOptions
 
 LEVELS = (32, 64)  # disparities at the matcher's levels below the coarsest
 SOURCES = 8  # images that the refinement matches in at once; each counts as so many pixels

@@ -27,7 +27,7 @@ import numpy as np
 from benchmarking import machine, table
 from numpy.typing import NDArray
 
-from colmap_sph.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
 
 _BLOCK = 3
 _BINS = 10

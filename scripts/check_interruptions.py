@@ -21,8 +21,8 @@ from pathlib import Path
 
 import tyro
 
-from colmap_sph.cli import PARTIAL_EXIT_CODE
-from colmap_sph.cloud_files import CLOUD_FILES
+from colmap_sph.app.cli import PARTIAL_EXIT_CODE
+from colmap_sph.project.cloud_files import CLOUD_FILES
 from colmap_sph.synthetic import make_demo_block
 
 

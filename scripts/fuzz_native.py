@@ -20,7 +20,7 @@ import numpy as np
 
 from colmap_sph import _native
 from colmap_sph.errors import InputError
-from colmap_sph.workspace import read_depth_map, read_normal_map
+from colmap_sph.project.map_files import read_depth_map, read_normal_map
 
 Random = np.random.Generator
 Arguments = list[Any]

@@ -15,8 +15,9 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.synthetic import Camera, look_at, pinhole
-from colmap_sph.workspace import Workspace, read_depth_map, read_normal_map
 
 Picture = NDArray[np.uint8]
 

@@ -19,11 +19,12 @@ import numpy as np
 import tyro
 from rectification_study import clouds, pairs, plots, runs, tables
 
+from colmap_sph.app.evaluate_command import exact_depth_views, score_depth_maps
 from colmap_sph.errors import ColmapSphError, OptionError
-from colmap_sph.evaluate_command import exact_depth_views, score_depth_maps
 from colmap_sph.evaluation import mean_of_depth_maps, write_json
-from colmap_sph.options import RunOptions
-from colmap_sph.scene import Scene, read_scene
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,7 @@ def prepare(project: Path, seed: int, case: Path) -> tuple[str, list[str]]:
 
 def run_command(arguments: list[str]) -> str:
     """Run the command; its exit code, and its sentence where it failed, or what it should not have done."""
-    from colmap_sph import cli
+    from colmap_sph.app import cli
 
     output = io.StringIO()
     try:

@@ -1,12 +1,16 @@
 """A dense workspace with exact maps: six views of a slanted plane."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from colmap_sph import synthetic as syn
-from colmap_sph.workspace import Workspace, write_depth_map, write_fusion_cfg, write_normal_map
+from colmap_sph.project.map_files import read_depth_map, read_normal_map, write_depth_map, write_normal_map
+from colmap_sph.project.pair_lists import write_fusion_cfg
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.fusion_losses import DepthAndNormals
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 150.0
 FLYING_HEIGHT = 10.0
@@ -55,3 +59,13 @@ def write_maps(workspace, name, depth=None, normals=None, *, kind="geometric"):
         write_depth_map(workspace.depth_map_path(name, kind), depth.astype(np.float32))
     if normals is not None:
         write_normal_map(workspace.normal_map_path(name, kind), normals.astype(np.float32))
+
+
+def stored_maps(workspace: Workspace) -> Callable[[str], DepthAndNormals]:
+    """The geometric maps of a workspace, for `explain_losses`."""
+
+    def maps_of(name: str) -> DepthAndNormals:
+        depth, normals = (of(name, "geometric") for of in (workspace.depth_map_path, workspace.normal_map_path))
+        return read_depth_map(depth), read_normal_map(normals)
+
+    return maps_of

@@ -7,10 +7,10 @@ import pytest
 from rendered import project
 
 from colmap_sph import synthetic as syn
-from colmap_sph.anchor import anchored
-from colmap_sph.rectification import RectificationOptions, rectify_pair
+from colmap_sph.pipeline.digests import digest
 from colmap_sph.scene import Scene, View
-from colmap_sph.state import digest
+from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 
 OFFSETS = [(5e5 + 1 / 3, 5e6 + 1 / 7, 300), (4201575.762, 168864.183, 4780229.051), (-8e6, 12.5, -9e6)]
 K = np.array([[1000.0, 0, 500], [0, 1010, 400], [0, 0, 1]])

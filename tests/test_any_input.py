@@ -13,10 +13,11 @@ from conftest import keep_images
 from PIL import Image
 from projects import block_camera, make_block_project, truth_of, write_picture
 
-from colmap_sph import cli
+from colmap_sph.app import cli
 from colmap_sph.evaluation import compare_depth_map
+from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.synthetic import DemoBlock
-from colmap_sph.workspace import Workspace, read_depth_map
 
 NADIR = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 WIDTH, HEIGHT = 320, 240

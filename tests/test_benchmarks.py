@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from conftest import SCRIPTS
 
-from colmap_sph import _native, cli
+from colmap_sph import _native
+from colmap_sph.app import cli
 from colmap_sph.synthetic import DemoBlock
 
 pytestmark = pytest.mark.usefixtures("scripts_on_path")

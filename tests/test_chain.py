@@ -7,10 +7,12 @@ import pytest
 from rendered import grey, scene_of
 
 from colmap_sph import synthetic as syn
-from colmap_sph.depth import DepthOptions, PairDisparity, check_depth, estimate_depth
-from colmap_sph.matching import MatchingOptions, RectifiedImage, match_pair
-from colmap_sph.normals import NormalOptions, fit_normals
-from colmap_sph.rectification import RectificationOptions, rectify_pair, resample
+from colmap_sph.stereo.depth import DepthOptions, check_depth, estimate_depth
+from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.normals import NormalOptions, fit_normals
+from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
+from colmap_sph.stereo.rectified_pair import PairDisparity
+from colmap_sph.stereo.resampling import resample
 
 SIZE, FOCAL, BASELINE = (240, 180), 300.0, 1.5
 

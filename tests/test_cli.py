@@ -21,15 +21,15 @@ from clouds import read_visibility
 from conftest import keep_images
 
 import colmap_sph
-from colmap_sph import cli
-from colmap_sph.depth import DepthOptions
-from colmap_sph.fusion import FusionOptions
-from colmap_sph.matching import MatchingOptions
-from colmap_sph.normals import NormalOptions
-from colmap_sph.pairs import PairOptions
-from colmap_sph.rectification import RectificationOptions
-from colmap_sph.refinement import RefinementOptions
-from colmap_sph.undistortion import UndistortionOptions
+from colmap_sph.app import cli
+from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.matching import MatchingOptions
+from colmap_sph.stereo.normals import NormalOptions
+from colmap_sph.stereo.pairs import PairOptions
+from colmap_sph.stereo.rectification import RectificationOptions
+from colmap_sph.stereo.refinement import RefinementOptions
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
 FAST = ["--threads", "2", "--num-pairs", "2"]
@@ -140,7 +140,7 @@ def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert re.search(r"peak memory \d+\.\d\d GiB", words)
     # The log file.
     log = (small / "dense/colmap_sph/log.txt").read_text().splitlines()
-    assert all(re.match(r"20\d\d-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} INFO colmap_sph\.\w+: ", line) for line in log)
+    assert all(re.match(r"20\d\d-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} INFO colmap_sph\.[\w.]+: ", line) for line in log)
     assert f"colmap_sph {colmap_sph.__version__}: RunCommand(" in log[0]
     assert "max_reproj_error=1" in log[0]
     assert any("Undistorting 3 images" in line for line in log)

@@ -13,20 +13,22 @@ import pytest
 from clouds import read_fused, read_visibility
 from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_maps
 
-from colmap_sph import cloud_stage, memory
-from colmap_sph.anchor import anchored
-from colmap_sph.cloud_files import join_parts, write_part
-from colmap_sph.cloud_stage import cloud_state, fuse_views
-from colmap_sph.colmap_fusion import fuse_by_colmap
-from colmap_sph.context import Context
 from colmap_sph.errors import NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import read_geometry
-from colmap_sph.fusion import FusionOptions
-from colmap_sph.keys import Keys
-from colmap_sph.memory import parse_memory
-from colmap_sph.options import RunOptions
-from colmap_sph.scene import read_scene
-from colmap_sph.workspace import Workspace, read_depth_map, write_depth_map, write_fusion_cfg
+from colmap_sph.pipeline.reconstruct import cloud_stage, memory
+from colmap_sph.pipeline.cloud_stage import cloud_state, fuse_views
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.memory import parse_memory
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.cloud_files import join_parts, write_part
+from colmap_sph.project.colmap_fusion import fuse_by_colmap
+from colmap_sph.project.map_files import read_depth_map, write_depth_map
+from colmap_sph.project.pair_lists import write_fusion_cfg
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.fusion import FusionOptions
 
 UTM = np.array([5e5 + 1 / 3, 5e6 + 1 / 7, 300.0])
 
@@ -115,7 +117,7 @@ def test_visibility_names_images_as_colmap_does(tmp_path):
         assert {index for listed in visible for index in listed} == set(range(5))
         return [seen_as_listed(workspace, ids, cloud, visible) for ids in (image_ids, by_name)]
 
-    fuse_by_colmap(workspace, FusionOptions(max_reproj_error=2.0), threads=1)
+    fuse_by_colmap(workspace, FusionOptions(max_reproj_error=2.0).for_colmap(), threads=1)
     theirs = shares()
     fuse(workspace)
     for right, wrong in (theirs, shares()):
@@ -125,7 +127,7 @@ def test_visibility_names_images_as_colmap_does(tmp_path):
 
 def test_files_are_colmaps_to_the_byte_but_for_their_points(workspace):
     """The same header; positions, normals and colours as 27 bytes; a count and as many lists."""
-    fuse_by_colmap(workspace, FusionOptions(), threads=1)
+    fuse_by_colmap(workspace, FusionOptions().for_colmap(), threads=1)
     theirs = workspace.fused_path.read_bytes().partition(b"end_header\n")
     fuse(workspace)
     ours = workspace.fused_path.read_bytes().partition(b"end_header\n")
@@ -326,7 +328,10 @@ def test_map_coordinates(workspace, tmp_path):
     np.testing.assert_allclose(near["xyz"] + origin, far_cloud.points, rtol=0, atol=1e-9)
     assert near["rgb"].tobytes() == read_fused(workspace.fused_path)["rgb"].tobytes()
     assert (local.root / "fused.ply.vis").read_bytes() == cloud_bytes(far)[1]
-    assert fuse_by_colmap(Workspace(shutil.copytree(local.root, tmp_path / "copy")), FusionOptions()) > 5000
+    assert (
+        fuse_by_colmap(Workspace(shutil.copytree(local.root, tmp_path / "copy")), FusionOptions().for_colmap())
+        > 5000
+    )
 
 
 # ---- what goes wrong ---------------------------------------------------------------------------------------

@@ -13,19 +13,16 @@ import cv2
 import numpy as np
 import pytest
 from clouds import read_fused, read_visibility
-from exact_maps import GSD, HEIGHT, NORMAL, WIDTH, make_workspace, write_maps
+from exact_maps import GSD, HEIGHT, NORMAL, WIDTH, make_workspace, stored_maps, write_maps
 
-from colmap_sph.colmap_fusion import fuse_by_colmap
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.fusion import FusionOptions
-from colmap_sph.fusion_losses import explain_losses
-from colmap_sph.scene import read_scene
-from colmap_sph.workspace import (
-    Workspace,
-    read_depth_map,
-    read_normal_map,
-    write_depth_map,
-)
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.colmap_fusion import fuse_by_colmap
+from colmap_sph.project.map_files import read_depth_map, read_normal_map, write_depth_map
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.fusion_losses import explain_losses
 
 COLMAP_DEFAULTS = FusionOptions(method="colmap", min_num_pixels=5, max_reproj_error=2.0, max_normal_error=10.0)
 # Our defaults of the options that COLMAP has, too.
@@ -42,7 +39,7 @@ def workspace(tmp_path):
 
 @pytest.mark.parametrize("options", [OURS, COLMAP_DEFAULTS], ids=["ours", "COLMAP's"])
 def test_exact_maps_fuse_to_the_true_plane(workspace, options):
-    count = fuse_by_colmap(workspace, options, threads=1)
+    count = fuse_by_colmap(workspace, options.for_colmap(), threads=1)
     cloud = read_fused(workspace.fused_path)
     assert count == len(cloud) > WIDTH * HEIGHT / 5
     distance = cloud["xyz"].astype(float) @ NORMAL
@@ -58,13 +55,13 @@ def test_exact_maps_fuse_to_the_true_plane(workspace, options):
 def test_half_a_pixel_would_show(tmp_path):
     """The measure above can tell depths of pixel centres from depths at COLMAP's pixel origin."""
     workspace = make_workspace(tmp_path / "dense", origin=0.5)
-    fuse_by_colmap(workspace, OURS, threads=1)
+    fuse_by_colmap(workspace, OURS.for_colmap(), threads=1)
     distance = read_fused(workspace.fused_path)["xyz"] @ NORMAL
     assert abs(distance.mean()) > 0.2 * GSD
 
 
 def test_visibility_lists_the_images_of_each_point(workspace):
-    count = fuse_by_colmap(workspace, COLMAP_DEFAULTS, threads=1)
+    count = fuse_by_colmap(workspace, COLMAP_DEFAULTS.for_colmap(), threads=1)
     cloud = read_fused(workspace.fused_path)
     visible = read_visibility(workspace.fused_path.with_name("fused.ply.vis"))
     views = read_scene(workspace.sparse_dir).views
@@ -80,15 +77,15 @@ def test_visibility_lists_the_images_of_each_point(workspace):
 
 
 def test_options_reach_colmap(workspace, tmp_path):
-    every = fuse_by_colmap(workspace, OURS, threads=1)
-    assert fuse_by_colmap(workspace, replace(OURS, min_num_pixels=4), threads=1) < 0.8 * every
+    every = fuse_by_colmap(workspace, OURS.for_colmap(), threads=1)
+    assert fuse_by_colmap(workspace, replace(OURS, min_num_pixels=4).for_colmap(), threads=1) < 0.8 * every
     masks = tmp_path / "masks"
     masks.mkdir()
     for name in "abcdef":
         mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
         mask[:, : WIDTH // 2] = 0
         cv2.imwrite(str(masks / f"{name}.png.png"), mask)
-    masked = fuse_by_colmap(workspace, replace(OURS, mask_path=masks), threads=1)
+    masked = fuse_by_colmap(workspace, replace(OURS, mask_path=masks).for_colmap(), threads=1)
     assert 0.3 * every < masked < 0.7 * every
 
 
@@ -96,19 +93,19 @@ def test_photometric_maps(workspace):
     for folder in ("depth_maps", "normal_maps"):
         for path in (workspace.stereo_dir / folder).iterdir():
             path.rename(path.with_name(path.name.replace("geometric", "photometric")))
-    assert fuse_by_colmap(workspace, OURS, threads=1, kind="photometric") > WIDTH * HEIGHT
+    assert fuse_by_colmap(workspace, OURS.for_colmap(), threads=1, kind="photometric") > WIDTH * HEIGHT
 
 
 def test_a_model_without_tracks_fuses_by_partners(tmp_path):
     """COLMAP finds no overlapping image without tracks; ours gives the same cloud as with them."""
-    expected = fuse_by_colmap(make_workspace(tmp_path / "tracks"), OURS, threads=1)
+    expected = fuse_by_colmap(make_workspace(tmp_path / "tracks"), OURS.for_colmap(), threads=1)
     workspace = make_workspace(tmp_path / "none", tracks=False)
     names = workspace.fusion_cfg_path.read_text().split()
     model = {path.name: path.read_bytes() for path in workspace.sparse_dir.iterdir()}
-    assert fuse_by_colmap(workspace, OURS, threads=1) == 0
+    assert fuse_by_colmap(workspace, OURS.for_colmap(), threads=1) == 0
     partners = {name: [other for other in names if other != name] for name in names}
     # Not to the point: COLMAP visits the images in the order of what they share.
-    count = fuse_by_colmap(workspace, OURS, threads=1, partners=partners)
+    count = fuse_by_colmap(workspace, OURS.for_colmap(), threads=1, partners=partners)
     assert count == pytest.approx(expected, rel=0.02)
     assert {path.name: path.read_bytes() for path in workspace.sparse_dir.iterdir()} == model
     assert workspace.images_dir.is_dir()
@@ -132,7 +129,7 @@ def test_debian_colmap_agrees(finished, tmp_path):
     assert done.returncode == 0, done.stderr
     dense = tmp_path / "dense"
     shutil.copytree(finished.dense, dense, ignore=shutil.ignore_patterns("colmap_sph"))
-    ours = fuse_by_colmap(Workspace(dense), COLMAP_DEFAULTS)
+    ours = fuse_by_colmap(Workspace(dense), COLMAP_DEFAULTS.for_colmap())
     theirs = len(read_fused(output))
     assert ours > 10_000
     assert theirs == pytest.approx(ours, rel=0.05)
@@ -181,7 +178,7 @@ def remove_depths(workspace, names):
 def test_the_gate_that_takes_the_points_is_named(workspace, spoil, options, gate):
     if spoil:
         spoil(workspace, workspace.fusion_cfg_path.read_text().split())
-    losses = explain_losses(workspace, read_scene(workspace.sparse_dir), options)
+    losses = explain_losses(stored_maps(workspace), read_scene(workspace.sparse_dir), options)
     shares = {name: getattr(losses, name) for name in ("unseen", "depth", "reprojection", "normal", "kept")}
     assert sum(shares.values()) == pytest.approx(1)
     assert max(shares, key=shares.__getitem__) == gate
@@ -189,7 +186,7 @@ def test_the_gate_that_takes_the_points_is_named(workspace, spoil, options, gate
     option = {"normal": "max_normal_error", "depth": "max_depth_error", "reprojection": "max_reproj_error"}
     assert gate not in option or f"loosen {option[gate]}" in losses.sentence()
     # COLMAP's own fusion loses (or keeps) the points indeed.
-    count = fuse_by_colmap(workspace, options, threads=1)
+    count = fuse_by_colmap(workspace, options.for_colmap(), threads=1)
     assert (count > WIDTH * HEIGHT / 5) == (gate == "kept")
 
 
@@ -209,7 +206,7 @@ def test_only_overlapping_views_are_compared(workspace):
     for view in far:
         write_maps(workspace, view.name, np.zeros((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH, 3)))
     block = replace(scene, views=tuple(sorted((*scene.views, *far), key=lambda view: view.name)))
-    assert explain_losses(workspace, block, OURS, max_views=5).kept > 0.9
+    assert explain_losses(stored_maps(workspace), block, OURS, max_views=5).kept > 0.9
 
 
 # ---- bad input ---------------------------------------------------------------------------------------------
@@ -230,11 +227,9 @@ def test_only_overlapping_views_are_compared(workspace):
         ({"mask_path": Path("/nowhere/masks")}, "/nowhere/masks"),
     ],
 )
-def test_options_out_of_bounds(workspace, options, words):
+def test_options_out_of_bounds(options, words):
     with pytest.raises(OptionError, match=words):
-        FusionOptions(**options).check()
-    with pytest.raises(OptionError, match=words):
-        fuse_by_colmap(workspace, FusionOptions(**options))
+        RunOptions(fusion=FusionOptions(**options)).check()
 
 
 @pytest.mark.parametrize("blocked", ["fused.ply", "fused.ply.vis", "colmap_sph"])
@@ -247,7 +242,7 @@ def test_unwritable_output(workspace, blocked):
         path.mkdir()
     before = sorted(workspace.root.rglob("*"))
     with pytest.raises(OutputError, match=blocked):
-        fuse_by_colmap(workspace, OURS, threads=1)
+        fuse_by_colmap(workspace, OURS.for_colmap(), threads=1)
     assert sorted(workspace.root.rglob("*")) == before
 
 
@@ -255,16 +250,16 @@ def test_a_missing_map_is_named(workspace):
     path = workspace.normal_map_path("c.png", "geometric")
     path.unlink()
     with pytest.raises(InputError, match=str(path)):
-        fuse_by_colmap(workspace, OURS)
+        fuse_by_colmap(workspace, OURS.for_colmap())
 
 
 def test_fusion_cfg_that_does_not_fit(workspace):
     workspace.fusion_cfg_path.write_text("a.png\nz.png\n")
     with pytest.raises(InputError, match=r"z\.png"):
-        fuse_by_colmap(workspace, OURS)
+        fuse_by_colmap(workspace, OURS.for_colmap())
     workspace.fusion_cfg_path.unlink()
     with pytest.raises(InputError, match=r"fusion\.cfg"):
-        fuse_by_colmap(workspace, OURS)
+        fuse_by_colmap(workspace, OURS.for_colmap())
 
 
 @pytest.mark.parametrize("kind", ["cut off", "other size", "no header"])
@@ -276,5 +271,5 @@ def test_a_damaged_map_is_named(workspace, kind):
     else:
         path.write_bytes(path.read_bytes()[:-100] if kind == "cut off" else b"\0" * 100)
     with pytest.raises(InputError, match=str(path)):
-        fuse_by_colmap(workspace, OURS)
+        fuse_by_colmap(workspace, OURS.for_colmap())
     assert not workspace.fused_path.exists()

@@ -10,7 +10,13 @@ from corruption import damage_bytes, make_cases
 from test_undistortion import make_project
 
 from colmap_sph.errors import ColmapSphError, InputError
-from colmap_sph.workspace import check_map, read_depth_map, read_normal_map, write_depth_map, write_normal_map
+from colmap_sph.project.map_files import (
+    check_map,
+    read_depth_map,
+    read_normal_map,
+    write_depth_map,
+    write_normal_map,
+)
 
 NUM_COMMANDS = 248
 NUM_MAPS = 90

@@ -20,21 +20,21 @@ from rendered import (
 
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
-from colmap_sph.depth import (
+from colmap_sph.errors import OptionError
+from colmap_sph.scene import View
+from colmap_sph.stereo.depth import (
     CHECK_OPTIONS,
     VOTE_OPTIONS,
     DepthEstimate,
     DepthOptions,
-    PairDisparity,
     check_depth,
     depth_candidates,
     estimate_depth,
     right_disparity,
 )
-from colmap_sph.errors import OptionError
-from colmap_sph.kernels import backend
-from colmap_sph.rectification import RectificationOptions, RectifiedPair, rectify_pair
-from colmap_sph.scene import View
+from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
+from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
 
 SPHERE, FRAME = RectificationOptions(), RectificationOptions(rectification="frame")
 OPTIONS = DepthOptions(

@@ -13,8 +13,9 @@ import trimesh
 from laspy.vlrs.known import WktCoordinateSystemVlr
 
 from colmap_sph import synthetic as syn
-from colmap_sph.cli import main
-from colmap_sph.workspace import Workspace, write_depth_map, write_normal_map
+from colmap_sph.app.cli import main
+from colmap_sph.project.map_files import write_depth_map, write_normal_map
+from colmap_sph.project.workspace import Workspace
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 100.0
 # The ground n · x = 10 m, seen from three places above it: a ground sampling distance of about 0.1 m.

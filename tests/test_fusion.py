@@ -7,16 +7,18 @@ import cv2
 import numpy as np
 import oracle
 import pytest
-from exact_maps import HEIGHT, WIDTH, make_workspace, write_maps
+from exact_maps import HEIGHT, WIDTH, make_workspace, stored_maps, write_maps
 from scipy.spatial import cKDTree
 
-from colmap_sph import fusion
 from colmap_sph import synthetic as syn
-from colmap_sph.cloud_files import POINT
 from colmap_sph.errors import InputError, OptionError
-from colmap_sph.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view, read_view_maps
-from colmap_sph.fusion_losses import explain_losses
-from colmap_sph.scene import View, read_scene
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.view_maps import read_view_maps
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.scene import POINT, View
+from colmap_sph.stereo import fusion
+from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.fusion_losses import explain_losses
 
 STONE = syn.Mottled(syn.Noise(0.1, seed=1))
 SIZE = (120, 90)
@@ -440,11 +442,11 @@ def test_unknown_method():
 def test_reprojection_takes_no_points_from_us(workspace):
     """What a narrow gate keeps apart agrees all the same; COLMAP's fusion loses it (see its tests)."""
     options = FusionOptions(max_reproj_error=0.02)
-    losses = explain_losses(workspace, read_scene(workspace.sparse_dir), options)
+    losses = explain_losses(stored_maps(workspace), read_scene(workspace.sparse_dir), options)
     assert losses.kept > 0.9
     assert losses.reprojection == 0
 
 
 def test_mask_folder_must_exist():
     with pytest.raises(OptionError, match="/nowhere/masks"):
-        FusionOptions(mask_path=Path("/nowhere/masks")).check()
+        RunOptions(fusion=FusionOptions(mask_path=Path("/nowhere/masks"))).check()

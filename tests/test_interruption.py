@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from conftest import keep_images
 
-from colmap_sph import cli
+from colmap_sph.app import cli
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
@@ -147,7 +147,7 @@ def test_signals_stop_a_run_which_then_goes_on(
 
 BUSY = """
     import hashlib, sys, concurrent.futures
-    from colmap_sph.interruption import stop_on_signals
+    from colmap_sph.app.interruption import stop_on_signals
 
     def long_work():  # in C, with the interpreter's lock released, for half a minute or more
         hashlib.pbkdf2_hmac("sha256", b"", b"", 200_000_000)
@@ -179,7 +179,7 @@ def test_signals_end_long_calls(thread: str, number: signal.Signals, code: int) 
 def test_signals_that_are_ignored_stay_ignored(project: Path) -> None:
     """As a shell's background jobs and nohup want it."""
     code = "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)\n" + textwrap.dedent("""
-        from colmap_sph.interruption import stop_on_signals
+        from colmap_sph.app.interruption import stop_on_signals
         with stop_on_signals(print):
             signal.raise_signal(signal.SIGINT)
         print("went on")
@@ -193,7 +193,7 @@ def test_interruption_while_the_program_loads() -> None:
         import signal, sys
         class Late:
             def find_spec(self, name, *_):
-                if name == "colmap_sph.cli":
+                if name == "colmap_sph.app.cli":
                     signal.raise_signal(signal.SIGINT)
         signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.meta_path.insert(0, Late())

@@ -5,7 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from colmap_sph.load_cache import LoadCache
+from colmap_sph.pipeline.load_cache import LoadCache
 
 
 class Loader:

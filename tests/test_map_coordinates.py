@@ -12,15 +12,16 @@ from conftest import keep_images
 from test_undistortion import make_project
 
 import colmap_sph
-from colmap_sph import map_coordinates
 from colmap_sph.evaluation import read_geometry
-from colmap_sph.map_coordinates import local_origin, move_cloud
-from colmap_sph.options import RunOptions
-from colmap_sph.pairs import PairOptions
-from colmap_sph.scene import read_scene
-from colmap_sph.staging import discard_workspace
-from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
-from colmap_sph.workspace import Workspace, read_depth_map, read_normal_map
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project import map_coordinates
+from colmap_sph.project.map_coordinates import local_origin, move_cloud
+from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.staging import discard_workspace
+from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.pairs import PairOptions
 
 UTM = (5e5 + 1 / 3, 5e6 + 1 / 7, 300.0)
 ECEF = (4201575.762, 168864.183, 4780229.051)

@@ -12,15 +12,16 @@ from PIL import Image
 from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 
 import colmap_sph
-from colmap_sph import cli
+from colmap_sph.app import cli
 from colmap_sph.errors import InputError
 from colmap_sph.evaluation import compare_depth_map, read_geometry
-from colmap_sph.masks import read_mask, undistort_mask
-from colmap_sph.options import RunOptions
-from colmap_sph.pairs import PairOptions
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.masks import read_mask, undistort_mask
+from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.pairs import PairOptions
 from colmap_sph.synthetic import Camera, DemoBlock
-from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
-from colmap_sph.workspace import Workspace, read_depth_map, read_normal_map
 
 NADIR = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 OPTIONS = RunOptions(threads=1, pairs=PairOptions(num_pairs=2))

@@ -8,12 +8,14 @@ import pytest
 from rendered import exact_disparity, grey, scene_of_pair
 from scipy import ndimage
 
-from colmap_sph import _native, matching
+from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
-from colmap_sph.kernels import backend
-from colmap_sph.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
-from colmap_sph.rectification import RectificationOptions, rectify_pair, resample
+from colmap_sph.stereo import matching
+from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
+from colmap_sph.stereo.resampling import resample
 
 SIZE, FOCAL = (240, 180), 300.0
 OPTIONS = MatchingOptions()

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from colmap_sph.errors import OptionError
-from colmap_sph.memory import MemoryGate, budget, format_memory, parse_memory, resident
+from colmap_sph.pipeline.memory import MemoryGate, budget, format_memory, parse_memory, resident
 
 GIB = 1 << 30
 

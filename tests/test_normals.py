@@ -7,10 +7,10 @@ import pytest
 from rendered import pixel_rays
 
 from colmap_sph import _native
-from colmap_sph.depth import DepthEstimate
 from colmap_sph.errors import OptionError
-from colmap_sph.normals import NormalOptions, fit_normals
 from colmap_sph.scene import View
+from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.normals import NormalOptions, fit_normals
 
 OPTIONS = NormalOptions(radius=4, tolerance=6.0, max_shift=1.0, max_incidence=90.0)
 # Two thousand pixels a radian of parallax: depth 10 with a baseline of 2 and a focal length of 400.

@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from colmap_sph.depth import PairDisparity
 from colmap_sph.errors import InputError, OutputError
-from colmap_sph.pair_files import read_pair, write_pair
-from colmap_sph.rectification import RectifiedPair
+from colmap_sph.pipeline.pair_files import read_pair, write_pair
+from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
 
 HEIGHT, WIDTH = 6, 9
 

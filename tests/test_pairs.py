@@ -15,15 +15,11 @@ import pycolmap
 import pytest
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
-from colmap_sph.pairs import (
-    PairOptions,
-    PairSelection,
-    overlapping_views,
-    partners_of,
-    select_pairs,
-)
-from colmap_sph.partner_choice import choose, triangulation_angles, worth_of
-from colmap_sph.scene import Scene, View, read_scene
+from colmap_sph.project.database import read_verified_matches
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.pairs import PairOptions, PairSelection, overlapping_views, partners_of, select_pairs
+from colmap_sph.stereo.partner_choice import choose, triangulation_angles, worth_of
 
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
 FEW = PairOptions(min_shared_points=1)
@@ -267,26 +263,26 @@ def test_database_stands_in_for_tracks(line: Scene, tmp_path: Path, caplog: pyte
     write_database(path, names, {(5, 4): 50, (2, 5): 70, (3, 5): 60, (1, 5): 9, (0, 5): 500, (2, 1): 30})
     before = path.read_bytes()
     with caplog.at_level(logging.INFO):
-        selection = select_pairs(without_tracks(line), PairOptions(), database=path)
+        selection = select_pairs(without_tracks(line), PairOptions(), matches=read_verified_matches(path))
     assert selection.source == "database"
     found = [(p.partner, p.shared_points) for p in selection.pairs["0.jpg"]]
     assert sorted(found) == [("1.jpg", 50), ("2.jpg", 60), ("3.jpg", 70)]
     assert partners(selection, "4.jpg") == ["3.jpg"]
     assert "verified matches in the database" in caplog.text
     assert path.read_bytes() == before
-    assert select_pairs(line, PairOptions(), database=path).source == "tracks"
+    assert select_pairs(line, PairOptions(), matches=read_verified_matches(path)).source == "tracks"
 
 
 def test_database_that_cannot_be_read(line: Scene, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"none\.db"):
-        select_pairs(without_tracks(line), FEW, database=tmp_path / "none.db")
+        select_pairs(without_tracks(line), FEW, matches=read_verified_matches(tmp_path / "none.db"))
     assert not (tmp_path / "none.db").exists()
     (tmp_path / "text.db").write_text("no database" * 100)
     with pytest.raises(InputError, match=r"text\.db"):
-        select_pairs(without_tracks(line), FEW, database=tmp_path / "text.db")
+        select_pairs(without_tracks(line), FEW, matches=read_verified_matches(tmp_path / "text.db"))
     sqlite3.connect(tmp_path / "empty.db").close()
     with pytest.raises(InputError, match=r"empty\.db"):
-        select_pairs(without_tracks(line), FEW, database=tmp_path / "empty.db")
+        select_pairs(without_tracks(line), FEW, matches=read_verified_matches(tmp_path / "empty.db"))
 
 
 def test_real_database(data_dir: Path) -> None:
@@ -307,7 +303,9 @@ def test_real_database(data_dir: Path) -> None:
         for image in sorted(model.images.values(), key=lambda image: image.name)
     )
     database = data_dir / "brighton" / "database.db"
-    selection = select_pairs(Scene(views, np.empty((0, 3))), PairOptions(), database=database)
+    selection = select_pairs(
+        Scene(views, np.empty((0, 3))), PairOptions(), matches=read_verified_matches(database)
+    )
     assert selection.source == "database" and selection.without_partner == ()
     reader = pycolmap.Database.open(database)
     for pair in selection.pairs["DJI_0024.jpg"]:

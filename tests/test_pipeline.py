@@ -15,29 +15,25 @@ from conftest import FinishedRun, keep_images
 import colmap_sph
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
-from colmap_sph.anchor import anchored
-from colmap_sph.cloud_stage import fuse_views
-from colmap_sph.context import Context
-from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import compare_depth_map
-from colmap_sph.fusion import FusionOptions
-from colmap_sph.keys import Keys
-from colmap_sph.options import RunOptions
-from colmap_sph.pairs import PairOptions, select_pairs
-from colmap_sph.pipeline import find_database, workspace_root
-from colmap_sph.rectification import RectificationOptions
-from colmap_sph.scene import read_scene
-from colmap_sph.stages import _MATCH_BYTES, check_views, estimate_views, match_pairs
+from colmap_sph.pipeline.cloud_stage import fuse_views
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.reconstruct import find_database, workspace_root
+from colmap_sph.pipeline.stages import _MATCH_BYTES, check_views, estimate_views, match_pairs
+from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.pair_lists import read_patch_match_cfg, write_patch_match_cfg
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.pairs import PairOptions, select_pairs
+from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.synthetic import DemoBlock
-from colmap_sph.undistortion import UndistortionOptions, prepare_workspace
-from colmap_sph.workspace import (
-    Workspace,
-    read_depth_map,
-    read_normal_map,
-    read_patch_match_cfg,
-    write_patch_match_cfg,
-)
 
 FEW_PAIRS = RunOptions(threads=2, pairs=PairOptions(num_pairs=2))
 FRAME = replace(FEW_PAIRS, rectification=RectificationOptions(rectification="frame"))
@@ -460,7 +456,7 @@ def test_find_database(project: Path) -> None:
 def test_a_pair_may_take_most_of_the_budget(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Caches and scratch memory take of what the largest pair leaves: two images do with twice a pair's bytes."""
     keep_images(project, NADIR[:2])
-    monkeypatch.setattr("colmap_sph.memory.resident", lambda: 0)
+    monkeypatch.setattr("colmap_sph.pipeline.memory.resident", lambda: 0)
     memory = f"{int(1.8 * _MATCH_BYTES * 320 * 240)}"
     report = colmap_sph.run(project / "sparse" / "0", options=replace(FEW_PAIRS, memory=memory))
     assert report.pairs == 1 and not report.skipped_pairs

@@ -12,12 +12,13 @@ from clouds import read_fused
 from conftest import keep_images
 
 import colmap_sph
-from colmap_sph.colmap_fusion import fuse_by_colmap
 from colmap_sph.evaluation import compare_depth_map, mean_of_depth_maps, truth_at_pixel_origin
-from colmap_sph.fusion import FusionOptions
-from colmap_sph.options import RunOptions
-from colmap_sph.undistortion import UndistortionOptions
-from colmap_sph.workspace import Workspace, read_depth_map
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.colmap_fusion import fuse_by_colmap
+from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.fusion import FusionOptions
 
 # Six neighbouring vertical images of the aerial block and oblique ones, from all four sides, of the same place.
 PENTA = [
@@ -123,7 +124,7 @@ def test_fountain(fountain: Result) -> None:
     assert min(fountain.report.coverage.values()) > 0.55
     kept = fountain.report.points
     colmaps = FusionOptions(min_num_pixels=5, max_reproj_error=2.0, max_normal_error=10.0)
-    assert kept > fuse_by_colmap(fountain.workspace, colmaps) > 90_000
+    assert kept > fuse_by_colmap(fountain.workspace, colmaps.for_colmap()) > 90_000
 
 
 def test_brighton(data_dir: Path, tmp_path: Path) -> None:

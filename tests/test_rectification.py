@@ -18,15 +18,10 @@ from rendered import (
 
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError, RectificationError
-from colmap_sph.rectification import (
-    RectificationOptions,
-    RectifiedPair,
-    pixel_from_rectified_ray,
-    rectified_ray_from_pixel,
-    rectify_pair,
-    resample,
-)
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
+from colmap_sph.stereo.rectified_pair import RectifiedPair, pixel_from_rectified_ray, rectified_ray_from_pixel
+from colmap_sph.stereo.resampling import resample
 
 SPHERE = RectificationOptions()
 FRAME = RectificationOptions(rectification="frame")

@@ -11,11 +11,13 @@ import pytest
 import colmap_sph
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
-from colmap_sph.depth import DepthEstimate
 from colmap_sph.errors import OptionError
-from colmap_sph.refinement import RefinementOptions, refine_maps
-from colmap_sph.scene import View, read_scene
-from colmap_sph.workspace import Workspace, read_depth_map, read_normal_map
+from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import View
+from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
 
 OPTIONS = RefinementOptions()
 NAME = "F_0.jpg"
@@ -133,7 +135,7 @@ def test_there_may_be_more_partners_than_one_call_takes(monkeypatch):
     sources = [(other, texture((other.height, other.width), seed)) for seed in range(35)]
     options, results = replace(OPTIONS, max_partners=35, min_score=-0.9), []
     for most in (32, 3):
-        monkeypatch.setattr("colmap_sph.refinement._SOURCES", most)
+        monkeypatch.setattr("colmap_sph.stereo.refinement._SOURCES", most)
         maps = normals.astype(np.float32), depth.copy()
         results.append(refine_maps(view, texture(truth.shape, 99), estimate, *maps, sources, options))
     assert (results[0][1] != depth).any()
@@ -318,7 +320,7 @@ def test_bands_of_rows_leave_no_trace(block, scene, monkeypatch):
     sources = [(other, images[other.name]) for other in views.views[:3]]
     results = []
     for rows in (7, 1000):
-        monkeypatch.setattr("colmap_sph.refinement._BAND_ROWS", rows)
+        monkeypatch.setattr("colmap_sph.stereo.refinement._BAND_ROWS", rows)
         results.append(
             refine_maps(view, images[NAME], estimate, normals.copy(), estimate.depth.copy(), sources, OPTIONS)
         )

@@ -13,24 +13,24 @@ import pytest
 from conftest import SMALL_BLOCK, keep_images
 
 import colmap_sph
-from colmap_sph import stages
-from colmap_sph.claim import claimed
-from colmap_sph.depth import DepthOptions
 from colmap_sph.errors import InputError, NoResultError, OutputError
-from colmap_sph.fusion import FusionOptions
-from colmap_sph.keys import Keys
-from colmap_sph.matching import MatchingOptions
-from colmap_sph.normals import NormalOptions
-from colmap_sph.options import RunOptions
-from colmap_sph.pairs import PairOptions, select_pairs
-from colmap_sph.plan import Plan, make_plan
-from colmap_sph.rectification import RectificationOptions
-from colmap_sph.refinement import RefinementOptions
-from colmap_sph.report import RunReport
-from colmap_sph.scene import read_scene
+from colmap_sph.pipeline.reconstruct import stages
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.plan import Plan, make_plan
+from colmap_sph.pipeline.report import RunReport
+from colmap_sph.project.claim import claimed
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.matching import MatchingOptions
+from colmap_sph.stereo.normals import NormalOptions
+from colmap_sph.stereo.pairs import PairOptions, select_pairs
+from colmap_sph.stereo.rectification import RectificationOptions
+from colmap_sph.stereo.refinement import RefinementOptions
 from colmap_sph.synthetic import make_demo_block
-from colmap_sph.undistortion import UndistortionOptions
-from colmap_sph.workspace import Workspace
 
 # Four images of one strip, and the pairs among them: all six.
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
@@ -252,7 +252,7 @@ def test_a_changed_mask_redoes_the_cloud(finished: Finished) -> None:
 
 
 def test_a_changed_program_redoes_everything(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("colmap_sph.keys.program_digest", lambda: "of another version")
+    monkeypatch.setattr("colmap_sph.pipeline.keys.program_digest", lambda _: "of another version")
     assert finished.rerun().made == finished.report.made
 
 

@@ -8,7 +8,8 @@ import pycolmap
 import pytest
 
 from colmap_sph.errors import InputError
-from colmap_sph.scene import load_model, read_scene
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.sparse_model import load_model
 
 
 def make_model(camera_model: str = "PINHOLE", num_images: int = 4) -> pycolmap.Reconstruction:

@@ -10,7 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_sph.errors import InputError
-from colmap_sph.state import digest, file_digest, forget, program_digest, vouch, vouched_facts
+from colmap_sph.pipeline.digests import digest, file_digest
+from colmap_sph.pipeline.program import program_digest
+from colmap_sph.pipeline.records import forget, vouch, vouched_facts
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
@@ -92,7 +94,7 @@ def test_the_digest_of_a_file_is_that_of_its_content(tmp_path: Path) -> None:
 
 
 def test_the_program_is_the_same_twice() -> None:
-    assert program_digest() == program_digest()
+    assert program_digest("colmap_sph.pipeline.reconstruct") == program_digest("colmap_sph.pipeline.reconstruct")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from conftest import keep_images
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError
 from colmap_sph.evaluation import DepthView
-from colmap_sph.options import RunOptions
+from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.scene import View
 
 pytestmark = pytest.mark.usefixtures("scripts_on_path")

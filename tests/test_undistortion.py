@@ -8,12 +8,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from colmap_sph import staging
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.image_check import image_problem, read_grey
-from colmap_sph.originals import find_images
-from colmap_sph.scene import read_scene
-from colmap_sph.undistortion import (
+from colmap_sph.project import staging
+from colmap_sph.project.image_check import image_problem
+from colmap_sph.project.images import read_grey
+from colmap_sph.project.originals import find_images
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.undistortion import (
     UndistortionOptions,
     leave_out_bad_images,
     open_workspace,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from colmap_sph.errors import InputError, OptionError, OutOfMemoryError, OutputError, RectificationError
-from colmap_sph.report import Silent
-from colmap_sph.workers import for_all
+from colmap_sph.pipeline.report import Silent
+from colmap_sph.pipeline.workers import for_all
 
 
 class Count(Silent):

@@ -10,18 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_sph.errors import InputError, OutputError
-from colmap_sph.workspace import (
-    SourceImages,
-    Workspace,
-    atomic_file,
-    read_depth_map,
-    read_normal_map,
-    read_patch_match_cfg,
-    write_depth_map,
-    write_fusion_cfg,
-    write_normal_map,
-    write_patch_match_cfg,
-)
+from colmap_sph.project.files import atomic_file
+from colmap_sph.project.map_files import read_depth_map, read_normal_map, write_depth_map, write_normal_map
+from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import SourceImages
 
 
 @pytest.fixture

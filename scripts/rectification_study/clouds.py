@@ -16,7 +16,7 @@ from colmap_sph.evaluation import (
     visible_surface,
 )
 from colmap_sph.evaluation.neighbours import PointIndex
-from colmap_sph.rectification import Model
+from colmap_sph.stereo.rectified_pair import Model
 from rectification_study.runs import Run
 
 SEEN_BY_LIDAR = 4.0

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.depth import PairDisparity, depth_candidates, right_disparity
 from colmap_sph.evaluation import DepthView, truth_at_pixel_origin, truth_normals_at_pixel_origin
-from colmap_sph.options import RunOptions
-from colmap_sph.pair_files import read_pair
-from colmap_sph.rectification import Model
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.pair_files import read_pair
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.depth import depth_candidates, right_disparity
+from colmap_sph.stereo.rectified_pair import Model, PairDisparity
 from rectification_study.runs import MODELS, Run
 
 CORRECT = 2.0

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.evaluation import DepthView
-from colmap_sph.options import RunOptions
-from colmap_sph.pair_files import read_pair
-from colmap_sph.rectification import Model, Side, resample
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.pair_files import read_pair
 from colmap_sph.scene import Scene
+from colmap_sph.stereo.rectified_pair import Model, Side
+from colmap_sph.stereo.resampling import resample
 from rectification_study.pairs import CORRECT, ExactMaps, pair_depths, pair_files
 from rectification_study.runs import MODELS, Run
 

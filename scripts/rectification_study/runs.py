@@ -13,9 +13,10 @@ from typing import Any
 import colmap_sph
 from colmap_sph.errors import InputError, OutputError
 from colmap_sph.evaluation import write_json
-from colmap_sph.options import RunOptions
-from colmap_sph.rectification import Model
-from colmap_sph.workspace import Workspace, read_depth_map
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.rectified_pair import Model
 
 MODELS: tuple[Model, ...] = ("frame", "spherical")
 

@@ -1,0 +1,338 @@
+"""`colmap_sph evaluate`: clouds and a workspace's depth maps against LiDAR, a mesh, or exact depth maps.
+
+The measuring is `colmap_sph.evaluation`'s, which reads no COLMAP model and no workspace; here are the files.
+"""
+
+import logging
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+import tyro
+from numpy.typing import NDArray
+from rich.console import Console
+
+from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
+from colmap_sph.evaluation import (
+    CloudScores,
+    DepthMapScores,
+    DepthView,
+    EvaluationOptions,
+    Reference,
+    compare_depth_map,
+    evaluate_cloud,
+    format_clouds,
+    format_depth_maps,
+    make_reference,
+    mean_of_depth_maps,
+    read_geometry,
+    truth_at_pixel_origin,
+    truth_normals_at_pixel_origin,
+    write_json,
+)
+from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.sparse_model import is_pinhole, load_model
+from colmap_sph.project.workspace import MapKind, Workspace
+
+logger = logging.getLogger(__name__)
+
+_DEPTH_FORMATS = (".png", ".tif", ".tiff", ".npy")
+_SAME_CAMERA = 1e-6
+"""Largest relative difference of the calibrations of one camera in two files."""
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Measure clouds against LiDAR or a mesh, or clouds and depth maps against exact depth.
+
+    Prints accuracy, completeness and F-score for every --tau, and the mean distance to the reference as
+    CloudCompare measures it. Clouds and meshes are PLY, OBJ, LAS or LAZ files, in metres, in one frame.
+    """
+
+    reference: Path
+    """What is true: a cloud or mesh file, or a folder of exact depth maps, sampled at pixel centres and named as
+    the images, with .png, .tif or .npy instead of, or after, the image's own ending; 0 = none."""
+    clouds: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="[CLOUD ...]")] = ()
+    """Clouds to measure, such as dense/fused.ply; may be left out where --workspace is given."""
+    model: Path | None = None
+    """Sparse model with the cameras of the exact depth maps. Default: that of --workspace."""
+    depth_scale: float | None = None
+    """Metres (model units) of one unit of the exact depth maps. Must be given for integer maps; default for
+    floating-point maps: 1."""
+    workspace: Path | None = None
+    """Dense workspace whose depth and normal maps are compared with the exact depth maps, too."""
+    map_kind: MapKind = "geometric"
+    """Which of the workspace's maps: those confirmed by other views, or the unchecked ones."""
+    json: Path | None = None
+    """File to write all results to, as JSON."""
+    options: Annotated[EvaluationOptions, tyro.conf.arg(name="")] = field(default_factory=EvaluationOptions)
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds or options that contradict each other, and
+        `InputError` or `OutputError` for a path that is not there."""
+        self.options.check()
+        if not self.clouds and self.workspace is None:
+            raise OptionError("give at least one cloud, or --workspace for its depth maps.")
+        if self.depth_scale is not None and not 0 < self.depth_scale < float("inf"):
+            raise OptionError(f"--depth-scale must be a positive number, not {self.depth_scale}.")
+        if self.reference.is_dir():
+            if self.model is None and self.workspace is None:
+                raise OptionError("exact depth maps need --model, a sparse model with their cameras.")
+        elif (self.model, self.depth_scale, self.workspace) != (None, None, None):
+            raise OptionError(
+                "--model, --depth-scale and --workspace go with a folder of exact depth maps as --reference, and "
+                f"{self.reference} is not a folder; leave them out, or give that folder."
+            )
+        for cloud in self.clouds:
+            if not cloud.is_file():
+                raise InputError(f"The cloud {cloud} does not exist or is not a file; check its path.")
+        if self.json is not None and not self.json.absolute().parent.is_dir():
+            raise OutputError(f"{self.json} cannot be written: its folder does not exist; create it first.")
+
+
+def evaluate_command(command: EvaluateCommand, console: Console) -> int:
+    """`colmap_sph evaluate`: tables on the standard output, JSON where asked for."""
+    command.check()
+    views: list[DepthView] = []
+    if command.reference.is_dir():
+        model = command.model or Workspace(command.workspace or Path()).sparse_dir
+        views = exact_depth_views(command.reference, model, command.depth_scale)
+    depth_maps: dict[str, DepthMapScores] = {}
+    if command.workspace is not None:
+        with console.status(f"depth maps of {command.workspace}"):
+            workspace, options = Workspace(command.workspace), command.options
+            depth_maps = score_depth_maps(workspace, views, kind=command.map_kind, gsd=options.gsd)
+    clouds = _score_clouds(command, views, console)
+    blocks = [format_clouds(clouds)] if clouds else []
+    if depth_maps:
+        gsd = "depth / focal length" if command.options.gsd is None else f"{command.options.gsd:g} m"
+        title = f"{command.map_kind} depth maps of {command.workspace}; GSD = {gsd}"
+        blocks.append(f"{title}\n\n{format_depth_maps(depth_maps)}")
+    print("\n\n".join(blocks))
+    if command.json is not None:
+        write_json(command.json, as_plain_values(command, clouds, depth_maps))
+    return 0
+
+
+def _score_clouds(command: EvaluateCommand, views: list[DepthView], console: Console) -> list[CloudScores]:
+    if not command.clouds:
+        return []
+    with console.status("reference") as status:
+        truth = views or read_geometry(command.reference)
+        reference: Reference = make_reference(truth, command.options)
+        scores = []
+        for path in command.clouds:
+            status.update(str(path))
+            scores.append(evaluate_cloud(read_geometry(path), reference, command.options))
+        return scores
+
+
+def as_plain_values(
+    command: EvaluateCommand, clouds: list[CloudScores], depth_maps: dict[str, DepthMapScores]
+) -> dict[str, object]:
+    """All results of an evaluation, for `write_json`."""
+    content: dict[str, object] = {
+        "reference": str(command.reference),
+        "clouds": [cloud.as_dict() for cloud in clouds],
+    }
+    if depth_maps:
+        content["depth_maps"] = {
+            "workspace": str(command.workspace),
+            "kind": command.map_kind,
+            "gsd_m": command.options.gsd,
+            "mean": mean_of_depth_maps(depth_maps).as_dict(),
+            "images": {name: scores.as_dict() for name, scores in depth_maps.items()},
+        }
+    return content
+
+
+# ---- exact depth maps ---------------------------------------------------------------------------------------
+
+
+def exact_depth_views(folder: Path, model_dir: Path, depth_scale: float | None = None) -> list[DepthView]:
+    """The images of a model that have an exact depth map in a folder, by name.
+
+    Parameters
+    ----------
+    folder : Path
+        Depth maps at pixel centres, named as the images; sub-folders of image names are sub-folders here.
+    model_dir : Path
+        COLMAP model of undistorted images.
+    depth_scale : float, optional
+        Model units per unit of the depth maps; see `read_exact_depth`.
+
+    Returns
+    -------
+    list of DepthView
+        Each reads its file when asked. Images without a file are left out with a warning.
+
+    Raises
+    ------
+    InputError
+        No readable model, no depth map for any of its images, or a distorted camera.
+    """
+    model = load_model(model_dir)
+    views, missing = [], []
+    for image in sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: str(image.name)):
+        path = _depth_file(folder, image.name)
+        pose = np.array(image.cam_from_world().matrix(), dtype=np.float64)
+        if path is None or not np.isfinite(pose).all():
+            missing.append(image.name)
+            continue
+        camera = model.camera(image.camera_id)
+        if not is_pinhole(camera):
+            raise InputError(
+                f"{image.name} in {model_dir} has a distorted {camera.model_name} camera, and exact depth maps "
+                "belong to undistorted images; give the model of these, such as dense/sparse."
+            )
+        shape = (int(camera.height), int(camera.width))
+        read_depth = partial(read_exact_depth, path, shape=shape, depth_scale=depth_scale)
+        K = np.array(camera.calibration_matrix(), dtype=np.float64)
+        views.append(DepthView(image.name, K, pose[:, :3], pose[:, 3], read_depth))
+    if not views:
+        raise InputError(
+            f"{folder} has no depth map for any of the {len(missing)} images of {model_dir}: "
+            f"{Path(missing[0]).with_suffix('.png')} (or .tif, .npy) is expected for {missing[0]}."
+        )
+    if missing:
+        total = len(views) + len(missing)
+        logger.warning(
+            "%d of %d images have no exact depth, such as %s; left out", len(missing), total, missing[0]
+        )
+    return views
+
+
+def read_exact_depth(
+    path: Path, *, shape: tuple[int, int], depth_scale: float | None = None
+) -> NDArray[np.float32]:
+    """Read an exact depth map: a one-channel image of 16 bits or more, or a NumPy file.
+
+    Parameters
+    ----------
+    path : Path
+        PNG, TIFF or ``.npy``; 0, negative or not finite = none.
+    shape : (int, int)
+        Rows and columns it must have.
+    depth_scale : float, optional
+        Model units per unit of the file; None: 1, and an error for integers, whose unit nothing tells.
+
+    Returns
+    -------
+    (H, W) float32 ndarray
+        z-depth at pixel centres in model units, 0 = none.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, is no depth map, or has another size.
+    OptionError
+        Integers without a scale.
+    """
+    stored = _read_array(path)
+    if stored.ndim != 2 or stored.dtype == np.uint8 or stored.dtype.kind not in "uif":
+        channels = 1 if stored.ndim == 2 else stored.shape[-1]
+        raise InputError(
+            f"{path} is not a depth map: it has {channels} channel(s) of {stored.dtype}; one channel of 16-bit "
+            "integers or floating-point numbers is needed."
+        )
+    if stored.shape != shape:
+        raise InputError(
+            f"{path} has {stored.shape[1]} x {stored.shape[0]} pixels and its camera {shape[1]} x {shape[0]}; "
+            "give the model of the images that the depth maps were made for."
+        )
+    if depth_scale is None and stored.dtype.kind != "f":
+        raise OptionError(
+            f"{path} holds integers: give --depth-scale, the metres of one unit (such as 0.001 for millimetres)."
+        )
+    depth = stored.astype(np.float32) * np.float32(depth_scale or 1.0)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def _read_array(path: Path) -> NDArray[np.generic]:
+    if path.suffix == ".npy":
+        try:
+            return np.asarray(np.load(path, allow_pickle=False))
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(f"{path} cannot be read as a NumPy array ({error}); write it again.") from error
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise InputError(f"{path} cannot be read as an image, it may be damaged; write it again.")
+    return np.asarray(image)
+
+
+def _depth_file(folder: Path, name: str) -> Path | None:
+    """The depth map of image `name`: its ending replaced or followed by that of a depth format."""
+    stems = (Path(name).with_suffix(""), Path(name))
+    candidates = (folder / f"{stem}{ending}" for stem in stems for ending in _DEPTH_FORMATS)
+    return next((path for path in candidates if path.is_file()), None)
+
+
+# ---- depth maps of a workspace ------------------------------------------------------------------------------
+
+
+def score_depth_maps(
+    workspace: Workspace, views: list[DepthView], *, kind: MapKind = "geometric", gsd: float | None = None
+) -> dict[str, DepthMapScores]:
+    """Compare a workspace's depth and normal maps with exact depth, at COLMAP's pixel origin.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    views : list of DepthView
+        Images with exact depth; those without a map in the workspace are left out with a warning.
+    kind : {"geometric", "photometric"}
+    gsd : float, optional
+        Ground sampling distance, model units; None: of every pixel, its exact depth / focal length.
+
+    Returns
+    -------
+    dict
+        Image name → scores.
+
+    Raises
+    ------
+    InputError
+        No map for any view, a damaged map, or a camera that differs from that of the exact depth.
+    """
+    model = load_model(workspace.sparse_dir)
+    cameras = {model.image(i).name: model.camera(model.image(i).camera_id) for i in model.reg_image_ids()}
+    scores = {}
+    for view in views:
+        path = workspace.depth_map_path(view.name, kind)
+        if view.name not in cameras or not path.is_file():
+            logger.warning("%s has no %s depth map in %s; left out", view.name, kind, workspace.root)
+            continue
+        if not np.allclose(cameras[view.name].calibration_matrix(), view.K, rtol=_SAME_CAMERA):
+            raise InputError(
+                f"The camera of {view.name} in {workspace.sparse_dir} is not that of its exact depth map; "
+                "give exact depth of the undistorted images."
+            )
+        try:
+            scores[view.name] = _score_depth_map(workspace, view, kind, gsd)
+        except NoResultError:
+            logger.warning("%s: its exact depth map is empty; left out", view.name)
+    if not scores:
+        raise InputError(
+            f"{workspace.root} has no {kind} depth map to compare with exact depth; run colmap_sph on it first."
+        )
+    return scores
+
+
+def _score_depth_map(workspace: Workspace, view: DepthView, kind: MapKind, gsd: float | None) -> DepthMapScores:
+    centre_depth = view.read_depth()
+    truth = truth_at_pixel_origin(centre_depth)
+    path, normal_path = (of(view.name, kind) for of in (workspace.depth_map_path, workspace.normal_map_path))
+    depth = read_depth_map(path)
+    if depth.shape != truth.shape:
+        raise InputError(f"{path} has another size than its image; delete it and compute it again.")
+    has_normals = normal_path.is_file()
+    return compare_depth_map(
+        depth,
+        truth,
+        gsd=truth / np.float32(view.K[0, 0]) if gsd is None else gsd,
+        normals=read_normal_map(normal_path) if has_normals else None,
+        truth_normals=truth_normals_at_pixel_origin(centre_depth, view.K) if has_normals else None,
+    )

@@ -1,0 +1,1 @@
+"""A run of the method: its stages over all pairs and images, what is done already, memory and workers."""

@@ -1,0 +1,92 @@
+"""The keys of a run's results: each names everything that its result depends on, and nothing else."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.pipeline.digests import digest, file_digest
+from colmap_sph.pipeline.load_cache import LoadCache
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.program import program_digest
+from colmap_sph.project.sparse_model import model_files
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import View
+from colmap_sph.stereo.depth import CHECK_OPTIONS, VOTE_OPTIONS
+from colmap_sph.stereo.rectified_pair import RectifiedPair
+
+
+class Keys:
+    """Makes the keys of one run; may be used by several threads.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        Its images and their masks are read once each.
+    options : RunOptions
+    """
+
+    def __init__(self, workspace: Workspace, options: RunOptions) -> None:
+        self._workspace, self._options = workspace, options
+        self._program = program_digest("colmap_sph.pipeline.reconstruct")
+        self._images: LoadCache[str] = LoadCache(
+            lambda name: file_digest(workspace.image_path(name)), lambda _: 0, capacity=0
+        )
+        self._masks: LoadCache[str | None] = LoadCache(
+            lambda name: _digest_if_there(workspace.mask_path(name)), lambda _: 0, capacity=0
+        )
+
+    def pair(self, left: View, right: View, geometry: RectifiedPair) -> str:
+        """Of a disparity map. The sparse points and the options of rectification are in `geometry`."""
+        images = [self._images.get(view.name) for view in (left, right)]
+        masks = [self._masks.get(view.name) for view in (left, right)]
+        cameras = [_camera(view) for view in (left, right)]
+        return digest("pair", self._program, images, masks, cameras, geometry, self._options.matching)
+
+    def vote(self, view: View, pair_keys: Sequence[str]) -> str:
+        """Of a photometric estimate, from the keys of its pairs in the order in which they vote."""
+        mask, options = self._masks.get(view.name), self._depth_options(VOTE_OPTIONS)
+        return digest("vote", self._program, _camera(view), mask, pair_keys, options)
+
+    def photometric(self, vote: str) -> str:
+        """Of the photometric maps of the view with this vote."""
+        return digest("photometric", vote, self._options.normals)
+
+    def geometric(self, vote: str, partner_votes: Sequence[str]) -> str:
+        """Of the geometric maps of a view, from its own vote and those of its partners, in their order."""
+        # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
+        options = (self._depth_options(CHECK_OPTIONS), self._options.normals, self._options.refinement)
+        return digest("geometric", vote, partner_votes, *options)
+
+    def cloud(
+        self, maps: Mapping[str, str], partners: Mapping[str, Sequence[str]], origin: NDArray[np.float64]
+    ) -> str:
+        """Of the cloud, from the keys of the geometric maps of the images to fuse, and the scene's origin.
+
+        The photometric maps need none of their own: the key of the geometric ones stands for them, too.
+        """
+        options, folder = self._options, self._options.fusion.mask_path
+        masks = [folder / f"{name}.png" for name in maps] if folder else []
+        return digest(
+            "cloud",
+            maps,
+            [self._images.get(name) for name in maps],
+            partners,
+            origin,
+            [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
+            options.fusion,
+            [_digest_if_there(path) for path in masks],
+            options.fusion_input,
+        )
+
+    def _depth_options(self, names: Sequence[str]) -> dict[str, float]:
+        return {name: getattr(self._options.depth, name) for name in names}
+
+
+def _camera(view: View) -> tuple[object, ...]:
+    return view.name, view.width, view.height, view.K, view.R, view.t
+
+
+def _digest_if_there(path: Path) -> str | None:
+    return file_digest(path) if path.is_file() else None

@@ -1,0 +1,70 @@
+"""Options of all stages in one record: what the command line, the Python API and the pipeline share."""
+
+import os
+from dataclasses import dataclass, field
+
+from colmap_sph.errors import OptionError
+from colmap_sph.pipeline.memory import budget, parse_memory
+from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.workspace import MapKind
+from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.matching import MatchingOptions
+from colmap_sph.stereo.normals import NormalOptions
+from colmap_sph.stereo.pairs import PairOptions
+from colmap_sph.stereo.rectification import RectificationOptions
+from colmap_sph.stereo.refinement import RefinementOptions
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """Options of all stages and of the run itself."""
+
+    threads: int = 0
+    """Worker threads; 0: as many as the process may use cores."""
+    memory: str = ""
+    """Memory the run may use, such as "6GiB"; empty: a safe share of what is free."""
+    fusion_input: MapKind = "geometric"
+    """Maps to fuse: "geometric" (confirmed by other views) or "photometric"."""
+    undistortion: UndistortionOptions = field(default_factory=UndistortionOptions)
+    pairs: PairOptions = field(default_factory=PairOptions)
+    rectification: RectificationOptions = field(default_factory=RectificationOptions)
+    matching: MatchingOptions = field(default_factory=MatchingOptions)
+    depth: DepthOptions = field(default_factory=DepthOptions)
+    normals: NormalOptions = field(default_factory=NormalOptions)
+    refinement: RefinementOptions = field(default_factory=RefinementOptions)
+    fusion: FusionOptions = field(default_factory=FusionOptions)
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds, in any stage."""
+        if not 0 <= self.threads <= 1024:
+            raise OptionError(f"threads must lie in 0..1024, not {self.threads}.")
+        parse_memory(self.memory)
+        if self.fusion_input not in ("geometric", "photometric"):
+            raise OptionError(f"fusion_input must be 'geometric' or 'photometric', not {self.fusion_input!r}.")
+        for stage in (
+            self.undistortion,
+            self.pairs,
+            self.rectification,
+            self.matching,
+            self.depth,
+            self.normals,
+            self.refinement,
+            self.fusion,
+        ):
+            stage.check()
+        folder = self.fusion.mask_path
+        if folder is not None and not folder.is_dir():
+            raise OptionError(f"the fusion mask folder {folder} does not exist.")
+        backend()  # what COLMAP_SPH_KERNELS asks for must be there, too
+
+    @property
+    def num_threads(self) -> int:
+        """Worker threads to use."""
+        return self.threads or len(os.sched_getaffinity(0))
+
+    @property
+    def memory_budget(self) -> int:
+        """Bytes of memory the run may use."""
+        return budget(parse_memory(self.memory))

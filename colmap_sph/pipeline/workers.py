@@ -1,0 +1,93 @@
+"""Worker threads: one function over many items, where the failure of one item costs that item alone."""
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
+from typing import TypeVar
+
+import cv2
+
+from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError
+from colmap_sph.pipeline.report import Progress
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+# Errors that no other item of a stage would be spared.
+_FATAL = (OptionError, OutputError)
+
+
+def for_all(
+    work: Callable[[T], R],
+    items: Sequence[T],
+    *,
+    threads: int,
+    progress: Progress,
+    skip: Callable[[T, str], None],
+) -> dict[T, R]:
+    """`work` on all items in worker threads.
+
+    Parameters
+    ----------
+    work : callable
+        Item → result; called in a worker thread.
+    items : sequence
+        Hashable, each once.
+    threads : int
+    progress : Progress
+        Advanced once per item.
+    skip : callable
+        Called with an item that raised a `ColmapSphError` or found no memory, and the reason. Any other error,
+        a wrong option and an output that cannot be written end the stage.
+
+    Returns
+    -------
+    dict
+        Item → result, in the items' order, without those skipped.
+    """
+    results: dict[T, R] = {}
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            futures = _submit(pool, work, items)
+            for future in as_completed(list(futures)):
+                item = futures.pop(future)
+                try:
+                    results[item] = future.result()
+                except _FATAL:
+                    raise
+                except ColmapSphError as error:
+                    skip(item, str(error))
+                except (MemoryError, cv2.error) as error:
+                    if not is_memory_error(error):
+                        raise
+                    skip(item, str(OutOfMemoryError()))
+                # Nothing may keep a future: with its exception it keeps all arrays of the item that failed.
+                del future
+                progress.advance()
+        except BaseException:
+            pool.shutdown(wait=True, cancel_futures=True)
+            raise
+    return {item: results[item] for item in items if item in results}
+
+
+def is_memory_error(error: BaseException) -> bool:
+    """Whether an error says that memory was refused, by Python or by OpenCV."""
+    return isinstance(error, MemoryError) or (isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem)
+
+
+@contextmanager
+def one_opencv_thread() -> Iterator[None]:
+    """Our workers are the threads; OpenCV's own would fight them for the cores."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _submit(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Sequence[T]) -> dict[Future[R], T]:
+    try:
+        return {pool.submit(work, item): item for item in items}
+    except RuntimeError as error:  # "can't start new thread": no memory for its stack, or a limit on threads
+        raise OutOfMemoryError from error

@@ -1,0 +1,131 @@
+"""What is to be undistorted: a sparse model, its images and their masks, found and checked."""
+
+import hashlib
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.image_check import image_problem
+from colmap_sph.project.masks import check_masks
+from colmap_sph.project.sparse_model import cameras_of_images, image_names, load_model, model_files
+from colmap_sph.project.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Usable:
+    """Sorted names of the images that are fit for undistortion, and of those of them that have a mask."""
+
+    images: list[str]
+    masked: list[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Originals:
+    """A sparse model, its images, and their masks.
+
+    Attributes
+    ----------
+    model_dir, image_dir : Path
+    mask_dir : Path or None
+        None: without masks.
+    model : pycolmap.Reconstruction
+        What is in `model_dir`.
+    """
+
+    model_dir: Path
+    image_dir: Path
+    mask_dir: Path | None
+    model: pycolmap.Reconstruction
+
+    def fingerprint(self) -> dict[str, str | None]:
+        """Hash of the model's content, and of names, sizes and times of images and masks."""
+        names = image_names(self.model)
+        masks = None if self.mask_dir is None else _hash_times(self.mask_dir, [f"{name}.png" for name in names])
+        return {"model": _hash_model(self.model_dir), "images": _hash_times(self.image_dir, names), "masks": masks}
+
+    def usable(self) -> Usable:
+        """Find the images to undistort; the others are reported by a warning.
+
+        Raises
+        ------
+        InputError
+            No image is usable, or a mask does not fit its image.
+        """
+        source, cameras, good = Workspace(self.image_dir), cameras_of_images(self.model), {}
+        for name, camera in sorted(cameras.items()):
+            source.image_path(name)  # refuses a name that leads out of the folder
+            problem = image_problem(self.image_dir / name, camera.width, camera.height)
+            if problem is None:
+                good[name] = camera
+            else:
+                logger.warning("%s %s; left out", self.image_dir / name, problem)
+        if not good:
+            raise InputError(
+                f"None of the model's {len(cameras)} images in {self.image_dir} is usable; check --images."
+            )
+        return Usable(list(good), [] if self.mask_dir is None else check_masks(self.mask_dir, good))
+
+
+def read_originals(model_dir: Path, image_dir: Path | None, mask_dir: Path | None) -> Originals:
+    """Read a sparse model; where its images are is found out, if not given.
+
+    Raises
+    ------
+    InputError
+        No readable model, or no images.
+    """
+    model = load_model(model_dir)
+    if image_dir is None:
+        image_dir = find_images(model_dir, image_names(model))
+    elif not image_dir.is_dir():
+        is_file = image_dir.is_file()
+        raise InputError(
+            f"The image folder {image_dir} {'is a file' if is_file else 'does not exist'}; check --images."
+        )
+    return Originals(model_dir, image_dir, mask_dir, model)
+
+
+def find_images(model_dir: Path, names: Sequence[str]) -> Path:
+    """Find the image folder of a model by COLMAP's usual layouts.
+
+    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
+    folder that holds most of the model's images is taken, the first among equals.
+
+    Raises
+    ------
+    InputError
+        None of the folders holds any image of the model; the message lists them.
+    """
+    absolute, resolved = Path.cwd() / model_dir, Path(model_dir).resolve()
+    parents = [p for model in (absolute, resolved) for p in (model.parent.parent, model.parent, model)]
+    folders = list(dict.fromkeys(parent / "images" for parent in parents))
+    found = [sum((folder / name).is_file() for name in names) for folder in folders]
+    if max(found) == 0:
+        tried = ", ".join(str(folder) for folder in folders)
+        raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
+    return folders[found.index(max(found))]
+
+
+def _hash_model(model_dir: Path) -> str:
+    digest = hashlib.sha256()
+    for path in model_files(model_dir):
+        with path.open("rb") as file:
+            digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
+    return digest.hexdigest()
+
+
+def _hash_times(folder: Path, names: list[str]) -> str:
+    """Hash names, sizes and times of images: their content would take as long to read as to undistort."""
+    digest = hashlib.sha256()
+    for name in names:
+        with suppress(OSError):
+            status = (folder / name).stat()
+            digest.update(f"{name}\n{status.st_size} {status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()

@@ -1,0 +1,112 @@
+"""COLMAP sparse model → frozen `Scene` of pinhole `View`s and sparse points."""
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.map_coordinates import is_plausible, local_origin
+from colmap_sph.project.sparse_model import is_pinhole, load_model
+from colmap_sph.scene import Scene, View
+
+logger = logging.getLogger(__name__)
+
+
+def read_scene(sparse_dir: Path) -> Scene:
+    """Read an undistorted COLMAP model, such as the ``sparse`` folder of a dense workspace.
+
+    Views whose pose or calibration is impossible (not finite, say), and such points, are left out with a warning.
+    A model in map coordinates is moved near its origin, see `Scene.origin`.
+
+    Parameters
+    ----------
+    sparse_dir : Path
+        Folder with a binary or text model; all cameras without distortion, of whatever camera model.
+
+    Returns
+    -------
+    Scene
+        Views sorted by name, float64 throughout.
+
+    Raises
+    ------
+    InputError
+        No readable model in the folder, no registered image, or a distorted camera.
+    """
+    return scene_of_model(load_model(sparse_dir), sparse_dir)
+
+
+def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
+    """Return the scene of a model read from `sparse_dir`; see `read_scene`."""
+    origin = local_origin(model)
+    if origin.any():
+        logger.info("%s is in map coordinates; worked on relative to %s", sparse_dir, tuple(origin.tolist()))
+    points, row_of = _read_points(model)
+    views = [_read_view(model, image_id, row_of, sparse_dir, origin) for image_id in model.reg_image_ids()]
+    usable = [view for view in views if _is_possible(view)]
+    for view in views:
+        if not _is_possible(view):
+            logger.warning("%s: the pose or calibration in %s is impossible; left out", view.name, sparse_dir)
+    if not usable:
+        raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
+    views_by_name = tuple(sorted(usable, key=lambda view: view.name))
+    return Scene(views_by_name, points - origin, origin, image_ids=tuple(model.reg_image_ids()))
+
+
+def _read_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], dict[int, int]]:
+    """Return the (N, 3) finite points, by ascending id, and the row of each point id."""
+    xyz_of = {point_id: point.xyz for point_id, point in model.points3D.items()}
+    ids = sorted(xyz_of)
+    points = np.array([xyz_of[i] for i in ids], dtype=np.float64).reshape(-1, 3)
+    kept = np.flatnonzero(is_plausible(points))
+    if len(kept) < len(ids):
+        logger.warning("%d sparse points have no possible coordinates; left out", len(ids) - len(kept))
+    return points[kept], {ids[index]: row for row, index in enumerate(kept)}
+
+
+def _read_view(
+    model: pycolmap.Reconstruction,
+    image_id: int,
+    row_of: dict[int, int],
+    sparse_dir: Path,
+    origin: NDArray[np.float64],
+) -> View:
+    image = model.image(image_id)
+    camera = model.camera(image.camera_id)
+    if not is_pinhole(camera):
+        raise InputError(
+            f"{image.name} in {sparse_dir} has a distorted {camera.model_name} camera; "
+            "give this folder as --model to have it undistorted, or run COLMAP's image_undistorter."
+        )
+    pose = np.array(image.cam_from_world().matrix(), dtype=np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):  # an impossible pose is told later
+        translation = pose[:, 3] + pose[:, :3] @ origin
+    points2D = image.points2D
+    rows = {row_of.get(points2D[i].point3D_id, -1) for i in image.get_observation_point2D_idxs()} - {-1}
+    return View(
+        image_id=image_id,
+        name=image.name,
+        width=camera.width,
+        height=camera.height,
+        K=np.array(camera.calibration_matrix(), dtype=np.float64),
+        R=np.ascontiguousarray(pose[:, :3]),
+        t=translation,
+        point_indices=np.array(sorted(rows), dtype=np.int64),
+    )
+
+
+def _is_possible(view: View) -> bool:
+    size, focal = max(view.width, view.height), np.array([view.K[0, 0], view.K[1, 1]])
+    return bool(
+        min(view.width, view.height) > 0
+        # Fields of view from half a second of arc to just under 180 degrees.
+        and (focal > 1e-3 * size).all()
+        and (focal < 1e6 * size).all()
+        and (np.abs(view.K[:2, 2]) < 1e3 * size).all()
+        and is_plausible(view.t[None])[0]
+        and (np.abs(view.R) < 1.01).all()
+        and abs(np.linalg.det(view.R) - 1.0) < 1e-3
+    )

@@ -1,0 +1,136 @@
+"""COLMAP sparse models on disk, found, checked and read; and their cameras."""
+
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pycolmap
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.model_check import check_binary_file
+
+MODEL_FILES = ("cameras", "images", "points3D")
+
+
+# Files that COLMAP 3.12 added; older models do not have them.
+RIG_FILES = ("rigs", "frames")
+
+
+def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
+    """Read a COLMAP model with any camera model, binary preferred to text as COLMAP does.
+
+    Parameters
+    ----------
+    sparse_dir : Path
+        Folder holding ``cameras``, ``images`` and ``points3D``, all ``.bin`` or all ``.txt``.
+
+    Returns
+    -------
+    pycolmap.Reconstruction
+        With at least one registered image.
+
+    Raises
+    ------
+    InputError
+        The folder or its model is missing, empty or damaged, or has no registered image.
+    """
+    sparse_dir = Path(sparse_dir)
+    files = model_files(sparse_dir)
+    binary = files[0].suffix == ".bin"
+    if binary:
+        for path in files:
+            check_binary_file(path)
+    try:
+        model = pycolmap.Reconstruction()
+        (model.read_binary if binary else model.read_text)(sparse_dir)
+        registered = model.reg_image_ids()
+        names = [model.image(image_id).name for image_id in registered]
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"The model in {sparse_dir} has the image name {error.object!r}, which is not UTF-8; "
+            "rename the image, and export the model from COLMAP again."
+        ) from error
+    except (RuntimeError, ValueError, IndexError, KeyError, MemoryError) as error:
+        raise InputError(
+            f"The model in {sparse_dir} is damaged ({_one_line(error)}); export it from COLMAP again."
+        ) from error
+    if not registered:
+        raise InputError(
+            f"The model in {sparse_dir} has no registered image; run COLMAP's mapper or give another model."
+        )
+    _check_names(names, sparse_dir)
+    return model
+
+
+def _check_names(names: list[str], sparse_dir: Path) -> None:
+    """Every image needs a place of its own; COLMAP ends the process where one lies in the other's."""
+    known = set(names)
+    if len(known) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"The model in {sparse_dir} has two images named {twice!r}; rename one of them.")
+    for name in names:
+        inside = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in known), None)
+        if inside is not None:
+            raise InputError(
+                f"The model in {sparse_dir} has the images {inside!r} and {name!r}, "
+                "and a file cannot be a folder; rename one of them."
+            )
+
+
+def image_names(model: pycolmap.Reconstruction) -> list[str]:
+    """Sorted names of the registered images of a model."""
+    return sorted(model.image(image_id).name for image_id in model.reg_image_ids())
+
+
+def cameras_of_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Camera]:
+    """Cameras of the registered images of a model, by the image's name."""
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    return {image.name: model.camera(image.camera_id) for image in images}
+
+
+def is_pinhole(camera: pycolmap.Camera) -> bool:
+    """Whether a camera of any model maps as its calibration matrix does, to 0.001 px inside the image."""
+    if camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE):
+        return True
+    if not camera.is_perspective() or not np.all(np.isfinite(camera.params)) or camera.mean_focal_length() <= 0:
+        return False
+    u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))
+    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
+    rays = pixels @ np.linalg.inv(camera.calibration_matrix()).T
+    mapped = np.asarray(camera.img_from_cam(rays), dtype=np.float64)
+    return bool(np.abs(mapped - pixels[:, :2]).max() < 1e-3)
+
+
+def make_pinhole(camera: pycolmap.Camera) -> None:
+    """Turn a camera without distortion, of whatever model, into a PINHOLE one that maps alike."""
+    if not is_pinhole(camera):
+        raise ValueError(f"camera {camera.camera_id} ({camera.model_name}) is distorted")
+    K = camera.calibration_matrix()
+    camera.model = pycolmap.CameraModelId.PINHOLE
+    camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+
+
+def model_files(sparse_dir: Path) -> list[Path]:
+    """Return the files that make up the model in a folder; `InputError` where they are not complete."""
+    if not sparse_dir.is_dir():
+        is_file = sparse_dir.is_file()
+        raise InputError(
+            f"The model folder {sparse_dir} {'is a file' if is_file else 'does not exist'}; "
+            "give the folder of a COLMAP model."
+        )
+    for extension in (".bin", ".txt"):
+        if all((sparse_dir / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
+            files = [sparse_dir / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
+            return [path for path in files if path.is_file()]
+    # A workspace's own model, `dense/sparse`, last: it is what undistortion made of the one that is meant.
+    inside = sorted(
+        (path.parent for depth in ("*", "*/*") for path in sparse_dir.glob(f"{depth}/cameras.bin")),
+        key=lambda path: (path.name == "sparse" and path.parent != sparse_dir, path),
+    )
+    hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
+    raise InputError(
+        f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
+    )
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

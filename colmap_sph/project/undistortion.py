@@ -1,0 +1,368 @@
+"""Sparse model and original images → COLMAP dense workspace of undistorted images; or open an existing one.
+
+COLMAP itself undistorts (`pycolmap.undistort_images`). What goes in is checked before (see `originals`), because
+COLMAP ends the process at some bad input. What comes out is mended here, because COLMAP leaves images which it did
+not undistort, and cameras without distortion but of a distorted model, in the model it writes.
+"""
+
+import logging
+import shutil
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from colmap_sph.errors import InputError, OptionError, OutputError
+from colmap_sph.project.colmap_library import quiet_colmap
+from colmap_sph.project.files import make_dir
+from colmap_sph.project.image_check import image_problem
+from colmap_sph.project.masks import check_masks, undistort_mask
+from colmap_sph.project.originals import Originals, read_originals
+from colmap_sph.project.pair_lists import write_fusion_cfg, write_patch_match_cfg
+from colmap_sph.project.scene_reader import scene_of_model
+from colmap_sph.project.sparse_model import cameras_of_images, is_pinhole, load_model, make_pinhole, model_files
+from colmap_sph.project.staging import (
+    check_discardable,
+    discard_workspace,
+    is_finished,
+    move_into_place,
+    read_marker,
+    scratch_folder,
+    write_marker,
+)
+from colmap_sph.project.workspace import Workspace, mask_path
+from colmap_sph.scene import Scene
+
+logger = logging.getLogger(__name__)
+
+_FULL_DISK_BYTES = 64 << 20
+# Space that undistortion is given, relative to the files it starts from; JPEGs come out up to 1.6 times larger.
+_SPACE_FACTOR = 2
+
+
+@dataclass(frozen=True)
+class UndistortionOptions:
+    """How the original images become undistorted ones."""
+
+    max_image_size: int = -1
+    """Longest side of the undistorted images in pixels; larger ones are reduced. -1: keep their size."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of its bounds."""
+        if self.max_image_size != -1 and self.max_image_size < 16:
+            raise OptionError(
+                f"max_image_size must be -1 (keep the size) or at least 16, not {self.max_image_size}."
+            )
+
+
+def prepare_workspace(
+    model_dir: Path,
+    image_dir: Path | None,
+    output: Path,
+    options: UndistortionOptions,
+    masks: Path | None = None,
+    *,
+    overwrite: bool = False,
+) -> Workspace:
+    """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
+
+    Everything is made inside ``output/colmap_sph`` and moved to its place when complete, so that an
+    interrupted undistortion is never taken for a workspace. An image that is missing, unreadable or not of
+    its camera's size is reported and left out of the workspace and its model.
+
+    Parameters
+    ----------
+    model_dir : Path
+        COLMAP model, binary or text, any camera model that has a pinhole equivalent.
+    image_dir : Path or None
+        Original images; None: found by `originals.find_images`.
+    output : Path
+        The dense workspace; created where missing.
+    options : UndistortionOptions
+    masks : Path, optional
+        Folder of masks of the original images, see `colmap_sph.masks`; they are undistorted, too.
+    overwrite : bool
+        Discard what an earlier run has made, once it is clear that this one can start.
+
+    Returns
+    -------
+    Workspace
+        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
+
+    Raises
+    ------
+    InputError
+        No usable model or image, a mask that does not fit its image, or `output` holds a workspace made from
+        something else.
+    OutputError
+        `output` cannot be written.
+    """
+    options.check()
+    originals = read_originals(model_dir, image_dir, masks)
+    marker, workspace = _marker(originals, options), Workspace(output)
+    scratch = workspace.state_dir / "undistorting"
+    if not overwrite and _is_made(workspace, scratch, marker):
+        return workspace
+    usable = originals.usable()
+    if overwrite:
+        discard_workspace(workspace)
+    _check_space(originals, usable.images, output, options)
+    with scratch_folder(scratch):
+        kept = _undistort(originals, usable.images, scratch, options)
+        _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
+        Workspace(scratch).create_stereo_dirs(kept)
+        shutil.rmtree(Workspace(scratch).state_dir)
+        write_marker(scratch, marker)
+        move_into_place(scratch, workspace)
+    logger.info("Undistorted %d of %d images into %s", len(kept), originals.model.num_reg_images(), output)
+    return workspace
+
+
+@dataclass(frozen=True)
+class Foreseen:
+    """A workspace that is not there yet: its scene, and the pixels of all original images together."""
+
+    scene: Scene
+    original_pixels: int
+
+
+def foresee_workspace(
+    model_dir: Path,
+    image_dir: Path | None,
+    output: Path,
+    options: UndistortionOptions,
+    masks: Path | None = None,
+    *,
+    overwrite: bool,
+) -> Foreseen | None:
+    """Return what `prepare_workspace` would make, without making it; None where it is made already.
+
+    Parameters
+    ----------
+    model_dir, image_dir, output, options, masks
+        As for `prepare_workspace`, which raises the same.
+    overwrite : bool
+        The workspace that is there will be discarded first.
+    """
+    options.check()
+    originals = read_originals(model_dir, image_dir, masks)
+    if overwrite:
+        check_discardable(Workspace(output))
+    elif is_finished(Workspace(output), _marker(originals, options)):
+        return None
+    model = _submodel(originals.model, set(originals.usable().images))
+    cameras = [model.camera(image.camera_id) for image in model.images.values()]
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    _replace_ideal_fisheyes(model)
+    for camera in model.cameras.values():
+        undistorted = pycolmap.undistort_camera(_camera_options(options), camera)
+        camera.model, camera.params = undistorted.model, undistorted.params
+        camera.width, camera.height = undistorted.width, undistorted.height
+    return Foreseen(scene_of_model(model, model_dir), pixels)
+
+
+def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
+    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and write nothing there.
+
+    Parameters
+    ----------
+    root : Path
+    masks : Path, optional
+        Folder of masks of the undistorted images; without it those in the workspace's own ``masks``.
+
+    Raises
+    ------
+    InputError
+        The folder is missing or is not a dense workspace, or a mask does not fit its image.
+    """
+    workspace = Workspace(root, masks)
+    if not root.is_dir():
+        raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
+    for folder in (workspace.images_dir, workspace.sparse_dir):
+        if not folder.is_dir():
+            raise InputError(
+                f"{root} is not a dense workspace: it has no {folder.name} folder; "
+                "run COLMAP's image_undistorter, or give the sparse model with --model."
+            )
+    model = load_model(workspace.sparse_dir)
+    if masks is not None or workspace.masks_dir.is_dir():
+        check_masks(workspace.masks_dir, cameras_of_images(model))
+    return workspace
+
+
+def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
+    """Return the scene without the views whose undistorted image is missing, damaged or of another size.
+
+    Each of them is reported by a warning.
+
+    Raises
+    ------
+    InputError
+        No view is left.
+    """
+    good = []
+    for view in scene.views:
+        problem = image_problem(workspace.image_path(view.name), view.width, view.height)
+        if problem is None:
+            good.append(view)
+        else:
+            logger.warning("%s %s; left out", workspace.image_path(view.name), problem)
+    if not good:
+        raise InputError(f"None of the {len(scene.views)} images in {workspace.images_dir} is usable.")
+    return replace(scene, views=tuple(good))
+
+
+def _is_made(workspace: Workspace, scratch: Path, marker: dict[str, Any]) -> bool:
+    """Whether the workspace is there, once a move into place that was interrupted is finished."""
+    if read_marker(scratch) == marker:
+        move_into_place(scratch, workspace)
+    finished = is_finished(workspace, marker)
+    if finished:
+        logger.info("The undistorted images in %s are up to date", workspace.root)
+    return finished
+
+
+def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any]:
+    """What a workspace is made from."""
+    return {"version": 1, "options": asdict(options), **originals.fingerprint()}
+
+
+def _undistort(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> list[str]:
+    """Let COLMAP undistort images `names` into `scratch`; return the names that came out well."""
+    model_dir = originals.model_dir
+    if _replace_ideal_fisheyes(originals.model):
+        model_dir = scratch / "model"
+        make_dir(model_dir)
+        originals.model.write_binary(model_dir)
+    logger.info("Undistorting %d images", len(names))
+    try:
+        with quiet_colmap():
+            pycolmap.undistort_images(
+                scratch,
+                model_dir,
+                originals.image_dir,
+                image_names=names,
+                undistort_options=_camera_options(options),
+            )
+    except (RuntimeError, ValueError, OSError) as error:
+        _raise_if_disk_is_full(scratch)
+        raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {error}") from error
+    return _mend_workspace(Workspace(scratch), names)
+
+
+def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
+    """Our options as COLMAP's."""
+    camera_options = pycolmap.UndistortCameraOptions()
+    camera_options.max_image_size = options.max_image_size
+    return camera_options
+
+
+def _undistort_masks(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> None:
+    """Undistort the masks of images `names` into `scratch`."""
+    if originals.mask_dir is None:
+        return
+    logger.info("Undistorting %d masks", len(names))
+    cameras = cameras_of_images(originals.model)
+    for name in names:
+        target = Workspace(scratch).mask_path(name)
+        undistort_mask(mask_path(originals.mask_dir, name), cameras[name], _camera_options(options), target)
+
+
+def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
+    """Make COLMAP undistort fisheye cameras whose coefficients are all zero.
+
+    COLMAP takes any camera without distortion coefficients for a pinhole and copies its images. A coefficient
+    just above its threshold (1e-8) changes nothing: at 1 rad and f = 4000 px it is 4e-4 px.
+    """
+    changed = False
+    for camera in model.cameras.values():
+        if camera.is_spherical():
+            raise InputError(
+                f"Camera {camera.camera_id} is a panorama ({camera.model_name}); "
+                "render perspective images from it and register those."
+            )
+        if camera.is_undistorted() and not is_pinhole(camera):
+            K = camera.calibration_matrix()
+            camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 1e-7, 0.0, 0.0, 0.0]
+            changed = True
+    return changed
+
+
+def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
+    """Leave only undistorted images and PINHOLE cameras in the model; write the configuration for them."""
+    model = _load_written_model(workspace)
+    cameras, kept = cameras_of_images(model), []
+    for name in names:
+        problem = image_problem(workspace.image_path(name), cameras[name].width, cameras[name].height)
+        if problem is None:
+            kept.append(name)
+        else:
+            _raise_if_disk_is_full(workspace.root)
+            logger.warning("%s could not be undistorted: the result %s; left out", name, problem)
+    if not kept:
+        raise InputError("COLMAP could not undistort any of the images; see its messages above.")
+    if len(kept) < model.num_reg_images():
+        model = _submodel(model, set(kept))
+    for camera in model.cameras.values():
+        make_pinhole(camera)
+    shutil.rmtree(workspace.sparse_dir)
+    make_dir(workspace.sparse_dir)
+    model.write_binary(workspace.sparse_dir)
+    _load_written_model(workspace)
+    write_fusion_cfg(workspace.fusion_cfg_path, kept)
+    write_patch_match_cfg(workspace.patch_match_cfg_path, dict.fromkeys(kept, 20))
+    return kept
+
+
+def _submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Reconstruction:
+    """Return the model of images `names` alone, with the tracks of two or more observations they share."""
+    part = pycolmap.Reconstruction()
+    images = [model.image(i) for i in model.reg_image_ids() if model.image(i).name in names]
+    for camera_id in sorted({image.camera_id for image in images}):
+        part.add_camera_with_trivial_rig(model.camera(camera_id))
+    for image in images:
+        keypoints = [point.xy for point in image.points2D]
+        copy = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
+        part.add_image_with_trivial_frame(copy, image.cam_from_world())
+    ids = {image.image_id for image in images}
+    for point_id, point in model.points3D.items():
+        elements = [element for element in point.track.elements if element.image_id in ids]
+        if len(elements) >= 2:
+            kept = pycolmap.Point3D()
+            kept.xyz, kept.color, kept.error = point.xyz, point.color, point.error
+            kept.track = pycolmap.Track(elements)
+            part.add_point3D_with_id(point_id, kept)
+    return part
+
+
+def _check_space(originals: Originals, names: list[str], output: Path, options: UndistortionOptions) -> None:
+    """Raise `OutputError` unless the undistorted images will fit: COLMAP may not notice a full disk."""
+    needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
+    cameras, limit = cameras_of_images(originals.model), options.max_image_size
+    for name in names:
+        longest = max(cameras[name].width, cameras[name].height)
+        scale = min(1.0, limit / longest) if limit > 0 else 1.0
+        needed += int(scale**2 * (originals.image_dir / name).stat().st_size)
+    needed *= _SPACE_FACTOR
+    free = shutil.disk_usage(next(path for path in (output, *output.absolute().parents) if path.exists())).free
+    if free < needed:
+        raise OutputError(
+            f"The undistorted images need about {needed / 1e6:.0f} MB, but on the disk of {output} only "
+            f"{free / 1e6:.0f} MB are free; free some space or choose another --output."
+        )
+
+
+def _load_written_model(workspace: Workspace) -> pycolmap.Reconstruction:
+    """Read a model that COLMAP has just written, without noticing whether the disk took it."""
+    try:
+        return load_model(workspace.sparse_dir)
+    except InputError:
+        _raise_if_disk_is_full(workspace.root)
+        raise
+
+
+def _raise_if_disk_is_full(folder: Path) -> None:
+    if shutil.disk_usage(folder).free < _FULL_DISK_BYTES:
+        raise OutputError(f"The disk of {folder} is full; free some space or choose another --output.")

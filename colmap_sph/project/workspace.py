@@ -1,0 +1,129 @@
+"""COLMAP's dense workspace: where things lie in it."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.files import make_dir
+
+MapKind = Literal["photometric", "geometric"]
+
+# What a file system takes, less the longest ending: ``.photometric.json``.
+_MAX_NAME_BYTES = 255 - 17
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """Paths of one dense workspace.
+
+    Attributes
+    ----------
+    root : Path
+        The workspace's folder, usually called ``dense``.
+    given_masks : Path, optional
+        Where the masks of its images are, if not in the workspace itself.
+    """
+
+    root: Path
+    given_masks: Path | None = None
+
+    @property
+    def images_dir(self) -> Path:
+        """Undistorted images."""
+        return self.root / "images"
+
+    @property
+    def sparse_dir(self) -> Path:
+        """Sparse model of the undistorted images."""
+        return self.root / "sparse"
+
+    @property
+    def stereo_dir(self) -> Path:
+        """Depth maps, normal maps and COLMAP's configuration files."""
+        return self.root / "stereo"
+
+    @property
+    def fused_path(self) -> Path:
+        """The fused point cloud."""
+        return self.root / "fused.ply"
+
+    @property
+    def fusion_cfg_path(self) -> Path:
+        """Names of the images that take part in fusion."""
+        return self.stereo_dir / "fusion.cfg"
+
+    @property
+    def patch_match_cfg_path(self) -> Path:
+        """Source images of every reference image."""
+        return self.stereo_dir / "patch-match.cfg"
+
+    @property
+    def state_dir(self) -> Path:
+        """Our own state, report and log, which COLMAP never looks at."""
+        return self.root / "colmap_sph"
+
+    @property
+    def local_dir(self) -> Path:
+        """For a model in map coordinates: a workspace near its origin, for COLMAP's own programs to go on."""
+        return self.state_dir / "local"
+
+    def image_path(self, name: str) -> Path:
+        """Undistorted image `name`."""
+        return self.images_dir / _checked_name(name)
+
+    @property
+    def masks_dir(self) -> Path:
+        """Masks of the undistorted images; need not exist."""
+        return self.given_masks or self.root / "masks"
+
+    def mask_path(self, name: str) -> Path:
+        """Mask of undistorted image `name`; need not exist."""
+        return mask_path(self.masks_dir, name)
+
+    def depth_map_path(self, name: str, kind: MapKind) -> Path:
+        """Depth map of image `name`."""
+        return self.stereo_dir / "depth_maps" / f"{_checked_name(name)}.{kind}.bin"
+
+    def normal_map_path(self, name: str, kind: MapKind) -> Path:
+        """Normal map of image `name`."""
+        return self.stereo_dir / "normal_maps" / f"{_checked_name(name)}.{kind}.bin"
+
+    def create_stereo_dirs(self, names: Iterable[str]) -> None:
+        """Create the folders that the maps of images `names` and our own state go to.
+
+        Raises
+        ------
+        OutputError
+            A folder cannot be created.
+        """
+        folders = {
+            self.stereo_dir / "depth_maps",
+            self.stereo_dir / "normal_maps",
+            self.stereo_dir / "consistency_graphs",
+            self.state_dir,
+        }
+        for name in names:
+            folders.add(self.depth_map_path(name, "geometric").parent)
+            folders.add(self.normal_map_path(name, "geometric").parent)
+        for folder in sorted(folders):
+            make_dir(folder)
+
+
+def mask_path(folder: Path, name: str) -> Path:
+    """Where COLMAP looks for the mask of image `name` in a folder of masks."""
+    return folder / f"{_checked_name(name)}.png"
+
+
+def _checked_name(name: str) -> str:
+    """Refuse a name that would lead out of the workspace, or that leaves no room for the endings of our files."""
+    parts = PurePosixPath(name)
+    if not name or parts.is_absolute() or ".." in parts.parts:
+        raise InputError(f"The image name {name!r} leads out of the workspace; rename the image in the model.")
+    if len(parts.name.encode()) > _MAX_NAME_BYTES:
+        raise InputError(
+            f"The image name '{parts.name[:20]}…' is longer than the {_MAX_NAME_BYTES} bytes for which the names "
+            "of its maps fit the disk; rename the image."
+        )
+    return name

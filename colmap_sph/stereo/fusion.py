@@ -1,0 +1,171 @@
+"""Depth and normal maps → cloud: one point for every piece of surface, from the pixel that sees it best.
+
+Every pixel with a depth is looked up in the maps of the images that overlap its own. It becomes a point where
+enough of them see the same surface and none sees that piece of it with a finer pixel. So the cloud is as dense as
+its finest image everywhere, and an image is fused from the maps alone: images may be done in any order, by any
+number of threads, with the maps of few images in memory, and the cloud is the same to the byte.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, fields
+from itertools import islice
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.errors import OptionError
+from colmap_sph.scene import POINT, View, pixel_transfer
+
+# A bit for each of them.
+MAX_PARTNERS = 64
+# Points are made from so many pixels at a time: one that 50 images see takes 231 bytes.
+_BAND_PIXELS = 1 << 16
+
+
+@dataclass(frozen=True)
+class FusionOptions:
+    """How maps become a cloud: under COLMAP's names, with defaults for our maps."""
+
+    method: Literal["best-pixel", "colmap"] = "best-pixel"
+    """Our own, a point from the pixel that sees a piece of surface best; or COLMAP's stereo_fusion."""
+    min_num_pixels: int = 2
+    """Pixels, of different images, that must agree on a point (COLMAP: 5)."""
+    max_reproj_error: float = 0.5
+    """Pixels within this distance of a point's projection are merged into it (COLMAP: 2)."""
+    max_depth_error: float = 0.01
+    """Largest relative difference of depths that agree."""
+    max_normal_error: float = 30.0
+    """Largest angle, degrees, of normals that agree (COLMAP: 10)."""
+    check_num_images: int = 50
+    """Overlapping images to look for agreement in; our own looks in no more than 64."""
+    mask_path: Path | None = None
+    """Folder of NAME.png masks in undistorted geometry, black = excluded."""
+    max_num_pixels: int = 10000
+    """Most pixels to merge into one point (COLMAP's only)."""
+    max_traversal_depth: int = 100
+    """Longest chain of pixels, from image to image, that makes one point (COLMAP's only)."""
+    use_cache: bool = False
+    """Keep only part of the maps in memory, `cache_size` of them (COLMAP's only; ours always does)."""
+    cache_size: float = 32.0
+    """Gigabytes of maps to keep in memory with `use_cache`."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds."""
+        if self.method not in ("best-pixel", "colmap"):
+            raise OptionError(f"fusion method must be 'best-pixel' or 'colmap', not {self.method!r}.")
+        for name in ("min_num_pixels", "max_num_pixels", "max_traversal_depth", "check_num_images"):
+            if getattr(self, name) < 1:
+                raise OptionError(f"fusion {name} must be at least 1, not {getattr(self, name)}.")
+        if self.max_num_pixels < self.min_num_pixels:
+            raise OptionError(
+                f"fusion max_num_pixels ({self.max_num_pixels}) must not be less than "
+                f"min_num_pixels ({self.min_num_pixels})."
+            )
+        for name in ("max_reproj_error", "max_depth_error", "max_normal_error", "cache_size"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"fusion {name} must be positive, not {getattr(self, name)}.")
+
+    def for_colmap(self) -> dict[str, Any]:
+        """The options that COLMAP's fusion has, too, under its names."""
+        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "method"}
+        return {name: value for name, value in values.items() if value is not None}
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMaps:
+    """A view with what is fused of it.
+
+    Attributes
+    ----------
+    view : View
+    index : int
+        Its place among the images of the model: what ``fused.ply.vis`` calls it by.
+    depth : (H, W) float32 ndarray
+        z-depth along the ray K⁻¹ (col, row, 1), model units; 0 = none.
+    normals : (3, H, W) float32 ndarray
+        Unit vectors in the camera frame, towards the camera, plane by plane as in COLMAP's file.
+    image : (H, W, 3) uint8 ndarray
+        Blue, green, red, as OpenCV reads it.
+    """
+
+    view: View
+    index: int
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    image: NDArray[np.uint8]
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return self.depth.nbytes + self.normals.nbytes + self.image.nbytes
+
+
+def fuse_view(
+    reference: ViewMaps,
+    partners: Iterable[ViewMaps],
+    options: FusionOptions,
+    offset: NDArray[np.float64] | float = 0.0,
+) -> Iterator[tuple[NDArray[np.void], NDArray[np.uint32]]]:
+    """Make the points of a cloud which one view sees better than any other.
+
+    A partner agrees with a pixel where the depth and the normal at the pixel next to its projection do. It covers
+    it where that projection is within `max_reproj_error` of the partner's pixel, and that pixel stands for less
+    surface: depth² / (fx fy |n · r|), r the ray of depth 1. As this orders all pixels, one at least of those that
+    see a piece of surface is not covered. It has its own partners: where these are too few, for noise at a gate,
+    no other pixel takes its place.
+
+    Parameters
+    ----------
+    reference : ViewMaps
+    partners : iterable of ViewMaps
+        At most 64 are looked at, one after the other.
+    options : FusionOptions
+    offset : (3,) float64 ndarray or 0
+        Added to the points before they become 32-bit floats.
+
+    Yields
+    ------
+    points : (n,) ndarray of `scene.POINT`
+        World frame and `offset`; the colour is the mean over the views that agree.
+    visibility : (m,) uint32 ndarray
+        For each point the number of these views and their indices: ``fused.ply.vis``.
+    """
+    shape = reference.depth.shape
+    covered, agreeing = np.zeros(shape, np.uint8), np.zeros(shape, np.uint64)
+    colour = reference.image.astype(np.uint16)
+    indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
+    indices[0] = reference.index
+    for bit, partner in enumerate(islice(partners, MAX_PARTNERS)):
+        indices[1 + bit] = partner.index
+        _native.fuse_partner(
+            reference.depth,
+            reference.normals,
+            np.linalg.inv(reference.view.K),
+            partner.depth,
+            partner.normals,
+            np.linalg.inv(partner.view.K),
+            partner.image,
+            pixel_transfer(reference.view, partner.view),
+            reference.view.R @ partner.view.R.T,
+            options.max_reproj_error,
+            options.max_depth_error,
+            np.cos(np.radians(options.max_normal_error)),
+            partner.index < reference.index,
+            bit,
+            covered,
+            agreeing,
+            colour,
+        )
+    view, step = reference.view, max(_BAND_PIXELS // shape[1], 1)
+    pixels = (reference.depth, reference.normals, covered, agreeing, colour, options.min_num_pixels)
+    world_from_pixel, world_from_camera = view.R.T @ np.linalg.inv(view.K), view.R.T
+    frame = (np.ascontiguousarray(world_from_pixel), np.ascontiguousarray(world_from_camera), view.center + offset)
+    for first in range(0, shape[0], step):
+        rows = (first, min(first + step, shape[0]))
+        num_points, num_words = _native.count_points(*pixels, *rows)
+        points, visibility = np.empty((num_points, POINT.itemsize), np.uint8), np.empty(num_words, np.uint32)
+        _native.write_points(*pixels, *rows, *frame, indices, points, visibility)
+        yield points.view(POINT)[:, 0], visibility

@@ -1,0 +1,109 @@
+"""Depth map → normal map, by robust local planes.
+
+On a plane the inverse depth is affine in pixel coordinates. A weighted least-squares fit over the pixel's own
+surface gives the plane, hence the normal and a denoised depth.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.errors import OptionError
+from colmap_sph.scene import View
+from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.kernels import backend
+
+# Rows that are fitted at a time, which bounds the memory for it.
+_BAND_ROWS = 256
+# Depths that differ from their plane's by less are noise.
+_SHIFT_SIGMAS = 2
+# What so many support may be seen under any angle.
+_WELL_SUPPORTED = 3
+
+
+@dataclass(frozen=True)
+class NormalOptions:
+    """How normals are fitted to a depth map."""
+
+    radius: int = 4
+    """Radius of the window, pixels."""
+    tolerance: float = 3.0
+    """Neighbours further from the plane than this many standard deviations hardly count."""
+    max_shift: float = 2.0
+    """A depth that differs from its plane's by more than this many times the size of its pixel, or the plane's
+    change of depth to the next pixel where that is more, and by more than two standard deviations, is dropped."""
+    max_incidence: float = 80.0
+    """Largest angle, degrees, between the ray and the normal of a pixel whose depth fewer than three others
+    support: what few see at a glance is rarely right."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds."""
+        if not 1 <= self.radius <= 16:
+            raise OptionError(f"the normals' radius must lie in 1..16, not {self.radius}.")
+        if not self.tolerance > 0:
+            raise OptionError(f"the normals' tolerance must be positive, not {self.tolerance}.")
+        if not self.max_shift > 0:
+            raise OptionError(f"the normals' max_shift must be positive, not {self.max_shift}.")
+        if not 0 < self.max_incidence <= 90:
+            raise OptionError(f"the normals' max_incidence must lie in 0..90 degrees, not {self.max_incidence}.")
+
+
+def fit_normals(
+    view: View, estimate: DepthEstimate, options: NormalOptions
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Fit a plane to every pixel's neighbourhood.
+
+    Parameters
+    ----------
+    view : View
+    estimate : DepthEstimate
+        (H, W) depth and standard deviation.
+    options : NormalOptions
+
+    Returns
+    -------
+    normals : (H, W, 3) float32 ndarray
+        Unit vectors in the camera frame, towards the camera; (0, 0, 0) where no plane fits.
+    depth : (H, W) float32 ndarray
+        Depth of each plane at its pixel; 0 where no plane fits.
+    """
+    normals = np.empty((*estimate.depth.shape, 3), dtype=np.float32)
+    fitted = np.empty_like(estimate.depth)
+    for first in range(0, view.height, _BAND_ROWS):
+        end = min(first + _BAND_ROWS, view.height)
+        low, high = max(first - options.radius, 0), min(end + options.radius, view.height)
+        kept = slice(first - low, end - low)
+        band_normals, band_fitted = _fit_rows(view, estimate, low, high, options)
+        normals[first:end], fitted[first:end] = band_normals[kept], band_fitted[kept]
+    return normals, fitted
+
+
+def _fit_rows(
+    view: View, estimate: DepthEstimate, first: int, end: int, options: NormalOptions
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    depth, sigma = estimate.depth[first:end], estimate.sigma[first:end]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
+    inverse_sigma = (sigma * inverse * inverse).astype(np.float32)
+    normals = np.empty((*inverse.shape, 3), dtype=np.float32)
+    fitted = np.empty_like(inverse)
+    K = view.K.copy()
+    K[1, 2] -= first  # the rows of a band count from its first
+    _native.fit_planes(
+        backend(),
+        inverse,
+        inverse_sigma,
+        estimate.support[first:end],
+        K,
+        options.radius,
+        options.tolerance,
+        options.max_shift,
+        _SHIFT_SIGMAS,
+        np.cos(np.radians(options.max_incidence)),
+        _WELL_SUPPORTED,
+        normals,
+        fitted,
+    )
+    return normals, fitted

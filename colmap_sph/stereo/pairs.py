@@ -1,0 +1,355 @@
+"""Scene → for every image the partners it is matched with, best first.
+
+Candidates share sparse points (3D points both images observe), seen under some parallax; the best of them together
+see all of the image. Without tracks the verified matches of COLMAP's database stand in for the shared points, and
+without these the overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
+"""
+
+import logging
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from colmap_sph.errors import NoResultError, OptionError
+from colmap_sph.scene import Scene, SourceImages
+from colmap_sph.stereo.frusta import observe_frusta, observe_points
+from colmap_sph.stereo.partner_choice import choose, triangulation_angles, worth_of
+
+logger = logging.getLogger(__name__)
+
+PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
+# Candidates that a view chooses from, unless it is to have more; points that tell a pair's angle and its worth.
+_MAX_CANDIDATES = 100
+_MAX_ANGLE_POINTS = 512
+_MAX_WORTH_POINTS = 512
+_ANGLE_PERCENTILE = 75
+
+
+@dataclass(frozen=True)
+class PairOptions:
+    """Which pairs of images are matched."""
+
+    num_pairs: int = 10
+    """Partners of each image, at most."""
+
+    min_triangulation_angle: float = 1.0
+    """Least parallax of a pair in degrees: its 75th percentile over the points that both images see."""
+
+    max_triangulation_angle: float = 60.0
+    """Parallax in degrees above which a partner comes after all others."""
+
+    min_shared_points: int = 10
+    """Least number of sparse points (or verified matches) that both images must have."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of its bounds."""
+        if self.num_pairs < 1:
+            raise OptionError(f"num_pairs must be at least 1, not {self.num_pairs}.")
+        if not 0 <= self.min_triangulation_angle < self.max_triangulation_angle <= 180:
+            raise OptionError(
+                "0 <= min_triangulation_angle < max_triangulation_angle <= 180 degrees must hold, not "
+                f"{self.min_triangulation_angle} and {self.max_triangulation_angle}."
+            )
+        if self.min_shared_points < 1:
+            raise OptionError(f"min_shared_points must be at least 1, not {self.min_shared_points}.")
+
+
+@dataclass(frozen=True)
+class Pair:
+    """A reference image and one of its partners.
+
+    Attributes
+    ----------
+    reference, partner : str
+        Image names.
+    shared_points : int
+        Sparse points which both images observe; verified matches or common samples of the frusta where the
+        pair was found by these.
+    angle : float
+        75th percentile of the triangulation angle over these points in degrees; NaN where there is none.
+    """
+
+    reference: str
+    partner: str
+    shared_points: int
+    angle: float
+
+
+@dataclass(frozen=True)
+class PairSelection:
+    """The partners of every reference image.
+
+    Attributes
+    ----------
+    pairs : mapping of str to tuple of Pair
+        For each reference image, in the order of the scene, its pairs with the best first; may be empty.
+    source : "tracks", "database", "frusta" or "patch-match.cfg"
+        What the selection rests on.
+    """
+
+    pairs: Mapping[str, tuple[Pair, ...]]
+    source: PairSource
+
+    @property
+    def without_partner(self) -> tuple[str, ...]:
+        """Reference images that have no pair."""
+        return tuple(name for name, pairs in self.pairs.items() if not pairs)
+
+    def unique_pairs(self) -> list[tuple[str, str]]:
+        """Return every unordered pair once, as two sorted names, in sorted order."""
+        names = {tuple(sorted((p.reference, p.partner))) for pairs in self.pairs.values() for p in pairs}
+        return sorted((first, second) for first, second in names)
+
+
+def select_pairs(
+    scene: Scene,
+    options: PairOptions,
+    *,
+    explicit: Mapping[str, SourceImages] | None = None,
+    matches: Mapping[tuple[str, str], int] | None = None,
+) -> PairSelection:
+    """Choose the partners of every image.
+
+    Parameters
+    ----------
+    scene : Scene
+    options : PairOptions
+    explicit : mapping, optional
+        ``patch-match.cfg`` as `read_patch_match_cfg` returns it. Only its reference images are processed;
+        their lists are obeyed without any gate; ``__auto__`` means the choice made here.
+    matches : mapping, optional
+        Names of two images → number of their verified matches; serves where the model has no tracks.
+
+    Returns
+    -------
+    PairSelection
+
+    Raises
+    ------
+    NoResultError
+        No image has a partner.
+    """
+    options.check()
+    graph = _build_graph(scene, options, matches)
+    if explicit is None:
+        pairs = {view.name: _best_pairs(graph, options, i) for i, view in enumerate(scene.views)}
+        selection = PairSelection(pairs, graph.source)
+    else:
+        selection = _explicit_selection(graph, options, explicit)
+    _report(selection, options)
+    return selection
+
+
+def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
+    """Names of up to `most` views that overlap each view, those which share most points with it first.
+
+    Where the model has no tracks, projected points or the frusta say what overlaps.
+    """
+    graph = _build_graph(scene, PairOptions(min_shared_points=1), None)
+    return {
+        view.name: [scene.views[j].name for j in graph.candidates(i)[0][:most]]
+        for i, view in enumerate(scene.views)
+    }
+
+
+def partners_of(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+    """Partners of each image, sorted."""
+    partners: dict[str, list[str]] = {}
+    for left, right in pairs:
+        partners.setdefault(left, []).append(right)
+        partners.setdefault(right, []).append(left)
+    return {name: sorted(others) for name, others in partners.items()}
+
+
+class _Graph:
+    """Candidates of every view with the weight of each, and the angles of pairs, computed when asked for."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        source: PairSource,
+        weights: sparse.csr_array,
+        points: NDArray[np.float64],
+        observed: list[NDArray[np.int64]],
+    ) -> None:
+        self.scene, self.source = scene, source
+        self.centers = np.array([view.center for view in scene.views])
+        self._weights, self._points, self._observed = weights, points, observed
+        self._angles: dict[tuple[int, int], float] = {}
+        self._is_observed = np.zeros(len(points), dtype=bool)
+
+    def weight(self, i: int, j: int) -> int:
+        """Return what views `i` and `j` share."""
+        return int(self._weights[i, j])
+
+    def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the views that share something with view `i`, most first, and how much it is."""
+        row = slice(self._weights.indptr[i], self._weights.indptr[i + 1])
+        views, weights = self._weights.indices[row], self._weights.data[row]
+        order = np.lexsort((views, -weights))
+        return views[order].astype(np.int64), weights[order].astype(np.int64)
+
+    def angle(self, i: int, j: int) -> float:
+        """Return the 75th percentile of the triangulation angles in degrees; NaN without common points."""
+        key = (min(i, j), max(i, j))
+        if key not in self._angles:
+            self._angles[key] = self._compute_angle(*key)
+        return self._angles[key]
+
+    def worth(self, i: int, j: int) -> NDArray[np.float32]:
+        """Return how well view `j` would serve the points of view `i`, or an even part of them."""
+        rows = self._observed[i]
+        rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
+        believed: NDArray[np.bool_] | float
+        if self.source == "database":
+            believed = float(self.weight(i, j) / self._weights[[i]].max())
+        else:
+            believed = self._observes(j, rows)
+        views = self.scene.views
+        return worth_of(views[i], views[j], self._points[rows], believed)
+
+    def _observes(self, i: int, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which of the points view `i` observes."""
+        self._is_observed[self._observed[i]] = True
+        result = self._is_observed[rows]
+        self._is_observed[self._observed[i]] = False
+        return result
+
+    def _compute_angle(self, i: int, j: int) -> float:
+        shared = self._observed[j][self._observes(i, self._observed[j])]
+        if len(shared) == 0:
+            return float("nan")
+        # Spread evenly over the points, whose order says nothing about where they are.
+        points = self._points[shared[:: -(-len(shared) // _MAX_ANGLE_POINTS)]]
+        angles = triangulation_angles(points, self.centers[i], self.centers[j])
+        return float(np.percentile(angles, _ANGLE_PERCENTILE))
+
+
+def _build_graph(scene: Scene, options: PairOptions, matches: Mapping[tuple[str, str], int] | None) -> _Graph:
+    """Find what views have in common: tracks, else verified matches, else samples of the frusta."""
+    finite = np.asarray(np.isfinite(scene.points).all(axis=1))
+    posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
+    observed = [
+        view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
+        for view, good in zip(scene.views, posed, strict=True)
+    ]
+    if any(len(indices) for indices in observed):
+        weights = _shared_points(observed, len(scene.points), options.min_shared_points)
+        return _Graph(scene, "tracks", weights, scene.points, observed)
+    points = scene.points[finite]
+    if len(points):
+        observed = observe_points(scene, points)
+    else:
+        points, observed = observe_frusta(scene)
+    if matches is not None:
+        weights = _match_counts(scene, matches, options.min_shared_points)
+        if weights.nnz:
+            return _Graph(scene, "database", weights, points, observed)
+        logger.warning("the database has no verified matches of the model's images")
+    return _Graph(scene, "frusta", _shared_points(observed, len(points), 1), points, observed)
+
+
+def _shared_points(observed: list[NDArray[np.int64]], num_points: int, least: int) -> sparse.csr_array:
+    """Count the points that two views share, as a (V, V) matrix of counts of at least `least`."""
+    indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
+    indices = np.concatenate([*observed, np.empty(0, np.int64)])
+    ones = np.ones(len(indices), dtype=np.int32)
+    seen = sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
+    return _without_self_and_few(seen @ seen.T, least)
+
+
+def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_array:
+    entries = counts.tocoo()
+    keep = (entries.row != entries.col) & (entries.data >= least)
+    kept = (entries.data[keep], (entries.row[keep], entries.col[keep]))
+    return sparse.csr_array(kept, shape=counts.shape)
+
+
+def _match_counts(scene: Scene, matches: Mapping[tuple[str, str], int], least: int) -> sparse.csr_array:
+    """Numbers of verified matches between views, as a (V, V) matrix of those of at least `least`."""
+    index_of = scene.index_of
+    known = [(index_of[a], index_of[b], n) for (a, b), n in matches.items() if a in index_of and b in index_of]
+    first, second, counts = np.array(known, dtype=np.int64).reshape(-1, 3).T
+    both = (np.tile(counts, 2), (np.concatenate([first, second]), np.concatenate([second, first])))
+    return _without_self_and_few(sparse.csr_array(both, shape=(len(scene.views),) * 2), least)
+
+
+def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]:
+    """Return the best pairs of view `i`: those that together see most of it, then those under a wide angle."""
+    near: list[Pair] = []
+    wide: list[Pair] = []
+    worths: list[NDArray[np.float32]] = []
+    most = max(_MAX_CANDIDATES, options.num_pairs)
+    for j, weight in zip(*graph.candidates(i), strict=True):
+        if len(near) == most or len(near) + len(wide) == 2 * most:
+            break
+        angle = graph.angle(i, int(j))
+        if np.isnan(angle) and np.array_equal(graph.centers[i], graph.centers[j]):
+            continue
+        if angle < options.min_triangulation_angle:
+            continue
+        pair = Pair(graph.scene.views[i].name, graph.scene.views[j].name, int(weight), angle)
+        if angle > options.max_triangulation_angle:
+            wide.append(pair)
+        else:
+            near.append(pair)
+            worths.append(graph.worth(i, int(j)))
+    chosen = [near[k] for k in choose(worths, options.num_pairs)]
+    return tuple((chosen + wide)[: options.num_pairs])
+
+
+def _explicit_selection(
+    graph: _Graph, options: PairOptions, explicit: Mapping[str, SourceImages]
+) -> PairSelection:
+    index_of = graph.scene.index_of
+    _warn_unknown(explicit, index_of)
+    pairs: dict[str, tuple[Pair, ...]] = {}
+    obeyed = set(index_of) - set(explicit) != set()
+    for name in sorted(explicit.keys() & index_of.keys(), key=index_of.__getitem__):
+        sources, i = explicit[name], index_of[name]
+        if isinstance(sources, int):
+            pairs[name] = _best_pairs(graph, options, i)
+            continue
+        obeyed = True
+        partners = index_of if sources == "__all__" else sources
+        known = [index_of[partner] for partner in partners if partner in index_of and partner != name]
+        pairs[name] = tuple(
+            Pair(name, graph.scene.views[j].name, graph.weight(i, j), graph.angle(i, j)) for j in known
+        )
+    return PairSelection(pairs, "patch-match.cfg" if obeyed else graph.source)
+
+
+def _warn_unknown(explicit: Mapping[str, SourceImages], index_of: Mapping[str, int]) -> None:
+    listed: set[str] = set(explicit)
+    for sources in explicit.values():
+        if isinstance(sources, list):
+            listed.update(sources)
+    for name in sorted(listed - set(index_of)):
+        logger.warning("patch-match.cfg names %s, which is not among the usable images; ignored", name)
+
+
+def _report(selection: PairSelection, options: PairOptions) -> None:
+    words = {
+        "tracks": "the sparse points that images share",
+        "database": "the verified matches in the database, as the model has no tracks",
+        "frusta": "the overlap of the viewing frusta, as the model has no tracks",
+        "patch-match.cfg": "patch-match.cfg",
+    }
+    num_unique = len(selection.unique_pairs())
+    if num_unique == 0:
+        if selection.source == "patch-match.cfg":
+            raise NoResultError(
+                "No pair of the model's usable images comes of patch-match.cfg; mend or delete it."
+            )
+        raise NoResultError(
+            f"No pair of images overlaps, going by {words[selection.source]}: at least "
+            f"{options.min_shared_points} shared points and a triangulation angle of "
+            f"{options.min_triangulation_angle} degrees are needed; check the model or lower these bounds."
+        )
+    logger.info("%d pairs of %d images, by %s", num_unique, len(selection.pairs), words[selection.source])
+    for name in selection.without_partner:
+        logger.warning("%s has no partner with enough overlap and parallax; it gets no depth map", name)

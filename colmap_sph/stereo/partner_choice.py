@@ -1,0 +1,85 @@
+"""Which candidates together serve a view best: every part of it in several partners' sight, none in vain.
+
+The images that share most sparse points with a view tend to see one and the same part of it. What only others see,
+at the rim of a block or on the far side of a house, would then never be matched. So partners are chosen one after
+the other, and what a view's chosen partners see already counts less for the next.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.scene import View
+from colmap_sph.stereo.frusta import sees
+
+# What a point that a view and a candidate both observe is worth; one that only lies in the candidate's view, where
+# something may hide it, is worth the rest.
+_OBSERVED = 0.5
+# What is left of a point's worth with each partner that sees it well.
+_SEEN_AGAIN = 0.2
+# Parallax angles in degrees: matched best between the middle two, worth nothing beyond the outer two.
+_ANGLES = (0.0, 6.0, 40.0, 70.0)
+
+
+def triangulation_angles(
+    points: NDArray[np.float64], center1: NDArray[np.float64], center2: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the angles in degrees, 0 to 180, between the rays from (N, 3) points to two centres."""
+    rays1, rays2 = center1 - points, center2 - points
+    # Unlike the arc cosine, exact for small angles.
+    sines = np.linalg.norm(np.cross(rays1, rays2), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sines, np.einsum("ij,ij->i", rays1, rays2))))
+
+
+def worth_of(
+    view: View, candidate: View, points: NDArray[np.float64], observed: NDArray[np.bool_] | float
+) -> NDArray[np.float32]:
+    """How well a candidate would serve each point of a view.
+
+    Parameters
+    ----------
+    view, candidate : View
+    points : (N, 3) float64 ndarray
+        Points that the view observes, world frame.
+    observed : (N,) bool ndarray or float
+        Which of them the candidate observes, too; or where that is not known, how much to believe that it does.
+
+    Returns
+    -------
+    (N,) float32 ndarray
+        0 to 1.
+    """
+    angles = triangulation_angles(points, view.center, candidate.center)
+    in_sight = sees(candidate, points)
+    if isinstance(observed, np.ndarray):
+        in_sight |= observed  # whatever the rounding at the image's rim
+    parallax = np.interp(angles, _ANGLES, (0.0, 1.0, 1.0, 0.0))
+    return np.asarray(in_sight * parallax * (1 - _OBSERVED + _OBSERVED * observed), dtype=np.float32)
+
+
+def choose(worths: Sequence[NDArray[np.float32]], count: int) -> list[int]:
+    """Choose up to `count` candidates, the best first.
+
+    Parameters
+    ----------
+    worths : sequence of (N,) float32 ndarray
+        Worth of each candidate for each point, see `worth_of`.
+    count : int
+
+    Returns
+    -------
+    list of int
+        Indices of candidates; of equals the first.
+    """
+    chosen: list[int] = []
+    table, need = np.array(worths), np.ones(len(worths[0]) if worths else 0)
+    left = np.ones(len(worths), dtype=bool)
+    while left.any() and len(chosen) < count:
+        # Rounded: of candidates that serve alike the first must win, however their points' places are rounded.
+        gains = np.where(left, np.round(np.einsum("ij,j->i", table, need), 3), -1.0)
+        best = int(np.argmax(gains))
+        chosen.append(best)
+        left[best] = False
+        need *= 1 - (1 - _SEEN_AGAIN) * table[best]
+    return chosen

@@ -1,0 +1,105 @@
+"""The geometry of a rectified pair, and what matching finds for it.
+
+Rectified frame: x along the baseline from the left to the right centre, z towards the scene. On the sphere
+(Elhashash & Qin, §3.2, after their swap of axes) the ray of a rectified pixel is
+
+    (sin θ, cos θ sin λ, cos θ cos λ),   λ = row angle about the baseline, θ = angle inside the epipolar plane
+
+and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. On the plane ("frame" model, §3.1) the
+ray is (x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described by one record, `RectifiedPair`:
+array coordinate = (angle or tangent) · scale − origin, with pixel centres at whole array coordinates.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.scene import View
+
+Model = Literal["spherical", "frame"]
+
+
+Side = Literal["left", "right"]
+
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RectifiedPair:
+    """Geometry of a rectified pair, without its pixels.
+
+    Attributes
+    ----------
+    model : {"spherical", "frame"}
+    rectified_from_world : (3, 3) float64 ndarray
+        Rotation to the rectified frame.
+    baseline : float
+        Distance of the projection centres, model units.
+    columns_per_radian, rows_per_radian : float
+        Scale of the sphere; both the focal length in pixels on the plane.
+    row_origin, left_origin, right_origin : float
+        Angle (or tangent) times scale at array coordinate 0: of the rows, and of each image's columns.
+    height, left_width, right_width : int
+        Sizes of the rectified images.
+    min_disparity, max_disparity : float
+        Range to search, in array coordinates: column in the left image minus column in the right image.
+    """
+
+    model: Model
+    rectified_from_world: Float
+    baseline: float
+    columns_per_radian: float
+    rows_per_radian: float
+    row_origin: float
+    left_origin: float
+    right_origin: float
+    height: int
+    left_width: int
+    right_width: int
+    min_disparity: float
+    max_disparity: float
+
+    @property
+    def disparity_origin(self) -> float:
+        """Parallax in pixels at disparity 0."""
+        return self.left_origin - self.right_origin
+
+    def width(self, side: Side) -> int:
+        """Columns of one of the two images."""
+        return self.left_width if side == "left" else self.right_width
+
+    def column_origin(self, side: Side) -> float:
+        """Column origin of one of the two images."""
+        return self.left_origin if side == "left" else self.right_origin
+
+
+def pixel_from_rectified_ray(view: View, pair: RectifiedPair) -> Float:
+    """(3, 3) matrix from a ray in the rectified frame to the homogeneous pixel of `view`."""
+    return np.asarray(view.K @ view.R @ pair.rectified_from_world.T)
+
+
+def rectified_ray_from_pixel(view: View, pair: RectifiedPair) -> Float:
+    """(3, 3) matrix from (col, row, 1) of `view` to the ray of depth 1 in the rectified frame."""
+    return np.asarray(pair.rectified_from_world @ view.R.T @ np.linalg.inv(view.K))
+
+
+@dataclass(frozen=True, eq=False)
+class PairDisparity:
+    """What matching found for a rectified pair.
+
+    Attributes
+    ----------
+    left, right : str
+        Image names.
+    geometry : RectifiedPair
+    disparity : (H, W_left) float32 ndarray
+        Disparity of the left image's pixels; NaN = none.
+    """
+
+    left: str
+    right: str
+    geometry: RectifiedPair
+    disparity: NDArray[np.float32]

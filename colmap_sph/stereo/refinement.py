@@ -1,0 +1,223 @@
+"""Checked depth and normals → refined ones, by least-squares matching of small planes.
+
+Every pixel's plane carries the window around it into the images of its partners. How far the windows differ there,
+and how that changes with the plane, gives normal equations; all partners together move the plane a little, against
+the pull of what the depth maps already know. This is multi-photo geometrically constrained matching (Grün &
+Baltsavias, 1988): it uses all images at once, while the disparity maps saw two at a time.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.errors import OptionError
+from colmap_sph.scene import View, pixel_transfer
+from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.normals import NormalOptions, fit_normals
+
+# Rows whose equations are in memory at a time.
+_BAND_ROWS = 32
+# Which partners say most is found on every so many rows.
+_SURVEY_ROWS = 16
+# Partners that bring the planes near in the rounds before the last.
+_FIRST_PARTNERS = 3
+# Arrays of equations, and sources of one call; see `kernels.h`.
+_EQUATIONS, _SOURCES = 12, 32
+
+# A partner's image, and where the pixels of the view lie in it.
+_Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class RefinementOptions:
+    """How depth and normals are refined on the images."""
+
+    rounds: int = 2
+    """Times that all planes are refined; 0 leaves them as the disparity maps gave them."""
+    max_partners: int = 8
+    """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
+    depth_freedom: float = 6.0
+    """How far a depth may move: the standard deviation it is given, as a multiple of that of the checked depth."""
+    slope_freedom: float = 5.0
+    """How far a plane may turn: the standard deviation it is given, degrees."""
+    contrast: float = 20.0
+    """Pixels of a window that differ from its middle by more than this (grey values) hardly count."""
+    min_score: float = 0.5
+    """Partners whose window correlates less than this with the image's have no say."""
+    smoothing_radius: int = 2
+    """Radius of the window, pixels, in which planes are fitted again between two rounds."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds."""
+        if not 0 <= self.rounds <= 16:
+            raise OptionError(f"the refinement's rounds must lie in 0..16, not {self.rounds}.")
+        if not self.max_partners >= 1:
+            raise OptionError(f"max_partners must be at least 1, not {self.max_partners}.")
+        for name in ("depth_freedom", "contrast"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
+        if not 0 < self.slope_freedom < 90:
+            raise OptionError(f"slope_freedom must lie between 0 and 90 degrees, not {self.slope_freedom}.")
+        if not -1 <= self.min_score < 1:
+            raise OptionError(f"min_score must lie in -1..1, not {self.min_score}.")
+        if not 1 <= self.smoothing_radius <= 16:
+            raise OptionError(f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.")
+
+    def images_used(self, partners: int) -> int:
+        """How often a partner's image is matched in, all rounds together, where there are so many partners."""
+        last = min(partners, self.max_partners)
+        return (self.rounds - 1) * min(last, _FIRST_PARTNERS) + last if self.rounds else 0
+
+
+def refine_maps(
+    view: View,
+    image: NDArray[np.uint8],
+    estimate: DepthEstimate,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    sources: Sequence[tuple[View, NDArray[np.uint8]]],
+    options: RefinementOptions,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Refine a view's maps, in place, on the images of its partners.
+
+    Parameters
+    ----------
+    view : View
+    image : (H, W) uint8 ndarray
+        Its grey image.
+    estimate : DepthEstimate
+        Checked depth, whose standard deviations say how far the planes may move.
+    normals, depth : (H, W, 3) and (H, W) float32 ndarray
+        The planes that `fit_normals` fitted to it; changed.
+    sources : sequence of (View, (h, w) uint8 ndarray)
+        Partners and their grey images.
+    options : RefinementOptions
+
+    Returns
+    -------
+    normals, depth
+        The parameters; where there was none, there is none.
+    """
+    partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
+    if options.rounds:
+        partners = _most_telling(view, image, estimate, normals, depth, partners, options)
+    for done in range(options.rounds):
+        if done:
+            smooth, moved = NormalOptions(radius=options.smoothing_radius), replace(estimate, depth=depth)
+            smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
+            fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
+            normals[fitted], depth[fitted] = smooth_normals[fitted], smooth_depth[fitted]
+        for first in range(0, view.height, _BAND_ROWS):
+            rows = slice(first, min(first + _BAND_ROWS, view.height), 1)
+            planes = _planes_of_maps(view, normals, depth, rows)
+            last = done == options.rounds - 1
+            used = partners if last else partners[:_FIRST_PARTNERS]
+            equations = _equations(image, used, planes, rows, options)
+            sigma = _freedom(estimate.sigma[rows], planes, options)
+            slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
+            _native.refine_planes(equations, sigma, slope_sigma, planes)
+            normals[rows], depth[rows] = _maps_of_planes(view, planes, rows)
+    return normals, depth
+
+
+def _most_telling(
+    view: View,
+    image: NDArray[np.uint8],
+    estimate: DepthEstimate,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    partners: list[_Partner],
+    options: RefinementOptions,
+) -> list[_Partner]:
+    """The partners whose images tell most about the depth on some of the rows, those which tell most first."""
+    rows = slice(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS)
+    planes = _planes_of_maps(view, normals, depth, rows)
+    sigma = _freedom(estimate.sigma[rows], planes, options)
+    information = np.zeros(len(partners))
+    for index, partner in enumerate(partners):
+        equations = _equations(image, [partner], planes, rows, options)
+        matched = equations[0] > 0
+        weight, difference, curvature = (equations[k][matched] for k in (0, 1, 6))
+        # What a pixel gains, in nats: a long baseline that few pixels match must not outdo all others.
+        gain = np.log1p(np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma[matched] ** 2)
+        information[index] = gain.sum(dtype=float)
+    best = np.argsort(-information, kind="stable")[: options.max_partners]
+    return [partners[index] for index in best]
+
+
+def _freedom(
+    sigma: NDArray[np.float32], planes: NDArray[np.float32], options: RefinementOptions
+) -> NDArray[np.float32]:
+    """Standard deviation that planes' inverse depths are given, from that of their checked depth."""
+    return np.asarray(options.depth_freedom * sigma * planes[0] ** 2, np.float32)
+
+
+def _equations(
+    image: NDArray[np.uint8],
+    partners: Sequence[_Partner],
+    planes: NDArray[np.float32],
+    rows: slice,
+    options: RefinementOptions,
+) -> NDArray[np.float32]:
+    """(12, h, W) sums of the normal equations of all partners for planes of the image's `rows`."""
+    equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
+    for start in range(0, len(partners), _SOURCES):
+        sources, transfers = zip(*partners[start : start + _SOURCES], strict=True)
+        limits = options.contrast, options.min_score
+        _native.add_patch_equations(
+            backend(), image, sources, np.stack(transfers), planes, rows.start, rows.step, *limits, equations
+        )
+    return equations
+
+
+def _planes_of_maps(
+    view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], rows: slice
+) -> NDArray[np.float32]:
+    """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
+    normals, depth = normals[rows], depth[rows]
+    # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d. No matrix product: it would wake BLAS's
+    # threads for three columns.
+    (a, b, c), (_, d, e), _ = np.linalg.inv(view.K).astype(np.float32)
+    x, y, z = (normals[..., axis] for axis in range(3))
+    column, row = _pixels(view, rows)
+    planes = np.empty((3, *depth.shape), np.float32)
+    inverse, along_x, along_y = planes
+    np.multiply(x, a, out=along_x)
+    np.add(x * b, y * d, out=along_y)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        np.divide(1, depth, out=inverse)
+        scale = inverse / (along_x * column + along_y * row + (x * c + y * e + z))
+        planes[1:] *= scale
+    planes[:, ~((depth > 0) & np.isfinite(planes).all(axis=0))] = 0
+    return planes
+
+
+def _maps_of_planes(
+    view: View, planes: NDArray[np.float32], rows: slice
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Inverse of `_planes_of_maps`: normals (h, W, 3) and depth (h, W)."""
+    inverse, along_x, along_y = planes
+    (a, b, c), (_, d, e), _ = view.K.astype(np.float32)
+    column, row = _pixels(view, rows)
+    normals = np.empty((*inverse.shape, 3), np.float32)
+    x, y, z = (normals[..., axis] for axis in range(3))
+    np.multiply(along_x, -a, out=x)
+    np.negative(along_x * b + along_y * d, out=y)
+    np.negative(along_x * c + along_y * e + (inverse - along_x * column - along_y * row), out=z)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        normals /= np.sqrt(x * x + y * y + z * z)[..., None]
+        depth = 1 / inverse
+    lost = ~(inverse > 0)
+    normals[lost], depth[lost] = 0, 0
+    return normals, depth
+
+
+def _pixels(view: View, rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    return (
+        np.arange(view.width, dtype=np.float32)[None],
+        np.arange(rows.start, rows.stop, rows.step, dtype=np.float32)[:, None],
+    )

@@ -1,0 +1,99 @@
+"""Undistorted image → its rectified image: resampled once, straight from its pixels."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.scene import View
+from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, pixel_from_rectified_ray
+
+# Images are resampled in bands of this many rows, which bounds the memory for their maps.
+_BAND_ROWS = 128
+
+
+def resample(
+    image: NDArray[np.uint8] | NDArray[np.float32],
+    view: View,
+    pair: RectifiedPair,
+    side: Side,
+    mask: NDArray[np.uint8] | None = None,
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Resample an image to the rectified surface, once and straight from its pixels.
+
+    Parameters
+    ----------
+    image : (view.height, view.width) uint8 or float32 ndarray
+        Grey undistorted image.
+    view : View
+        Its camera and pose.
+    pair : RectifiedPair
+    side : {"left", "right"}
+        Which of the pair's images `view` is.
+    mask : (view.height, view.width) uint8 ndarray, optional
+        255 where the image counts, 0 where it is to be ignored.
+
+    Returns
+    -------
+    rectified : (H, W) float32 ndarray
+        Not rounded: on weak texture, fractions of a grey value are what there is to match.
+    valid : (H, W) uint8 ndarray
+        255 where the rectified pixel lies inside the image and no ignored pixel has a part in it, else 0.
+    """
+    shape, image = (pair.height, pair.width(side)), image.astype(np.float32, copy=False)
+    rectified, valid = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.uint8)
+    tables = _ray_tables(view, pair, side)
+    for first in range(0, pair.height, _BAND_ROWS):
+        band = slice(first, first + _BAND_ROWS)
+        columns, rows, inside = _pixel_maps(view, tables, band)
+        if mask is not None:
+            inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
+        valid[band] = inside
+        rectified[band] = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return rectified, valid
+
+
+@dataclass(frozen=True, eq=False)
+class _RayTables:
+    """Homogeneous source pixel of a rectified one: ``rows[:, row] * weights[column] + columns[:, column]``.
+
+    No trigonometry per pixel.
+    """
+
+    rows: NDArray[np.float32]
+    columns: NDArray[np.float32]
+    weights: NDArray[np.float32]
+
+
+def _ray_tables(view: View, pair: RectifiedPair, side: Side) -> _RayTables:
+    A = pixel_from_rectified_ray(view, pair)
+    along = (np.arange(pair.width(side)) + pair.column_origin(side)) / pair.columns_per_radian
+    across = (np.arange(pair.height) + pair.row_origin) / pair.rows_per_radian
+    if pair.model == "spherical":
+        column_table, column_weight = np.sin(along), np.cos(along)
+        row_table = np.outer(A[:, 1], np.sin(across)) + np.outer(A[:, 2], np.cos(across))
+    else:
+        column_table, column_weight = along, np.ones_like(along)
+        row_table = np.outer(A[:, 1], across) + A[:, 2:3]
+    tables = row_table, np.outer(A[:, 0], column_table), column_weight
+    return _RayTables(*(table.astype(np.float32) for table in tables))
+
+
+def _pixel_maps(
+    view: View, tables: _RayTables, band: slice
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """Source columns and rows (pixel centres at whole numbers) of a band of rectified rows, and the valid mask."""
+    x, y, z = (
+        np.multiply.outer(row[band], tables.weights) + column
+        for row, column in zip(tables.rows, tables.columns, strict=True)
+    )
+    in_front = z > 1e-6
+    np.divide(1, z, out=z, where=in_front)
+    x *= z
+    y *= z
+    inside = in_front & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
+    # COLMAP counts from the pixel's corner, cv2.remap from its centre.
+    x -= 0.5
+    y -= 0.5
+    return x, y, inside.astype(np.uint8) * 255
