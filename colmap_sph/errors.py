@@ -4,6 +4,9 @@ The command line prints the message as one sentence and exits with `exit_code`; 
 for these. A message names the file or option and says what to do.
 """
 
+import re
+from collections.abc import Callable
+
 
 class ColmapSphError(Exception):
     """Base of every error this package raises on purpose."""
@@ -18,9 +21,29 @@ class InputError(ColmapSphError):
 
 
 class OptionError(ColmapSphError, ValueError):
-    """An option out of its bounds, or options that contradict each other."""
+    """An option out of its bounds, or options that contradict each other.
+
+    Parameters
+    ----------
+    message : str
+    *names : str
+        The options that the message names: fields of their record, such as "num_pairs".
+    """
 
     exit_code = 2
+
+    def __init__(self, message: str, *names: str) -> None:
+        super().__init__(message)
+        self.names = names
+
+    def spelled(self, spell: Callable[[str], str]) -> "OptionError":
+        """The same error with the options called otherwise: as parts of a larger record, or as typed."""
+        message = str(self)
+        for name in self.names:
+            found = re.search(rf"(?<![\w.-]){re.escape(name)}\b", message)
+            if found:
+                message = message[: found.start()] + spell(name) + message[found.end() :]
+        return OptionError(message, *map(spell, self.names))
 
 
 class OutputError(ColmapSphError):

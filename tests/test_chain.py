@@ -7,12 +7,13 @@ import pytest
 from rendered import grey, scene_of
 
 from colmap_sph import synthetic as syn
-from colmap_sph.stereo.depth import DepthOptions, check_depth, estimate_depth
+from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, match_pair
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity
 from colmap_sph.stereo.resampling import resample
+from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
 SIZE, FOCAL, BASELINE = (240, 180), 300.0, 1.5
 
@@ -34,13 +35,13 @@ def reconstruct(surfaces, light, cameras):
         disparity = match_pair(*images, pair.min_disparity, pair.max_disparity, MatchingOptions())
         pairs.append(PairDisparity(left.name, right.name, pair, disparity))
     own = {
-        view.name: estimate_depth(view, [p for p in pairs if view.name in (p.left, p.right)], DepthOptions())
+        view.name: vote_depth(view, [p for p in pairs if view.name in (p.left, p.right)], VoteOptions())
         for view in scene.views
     }
     results = []
     for view in scene.views:
         partners = [(other, own[other.name]) for other in scene.views if other is not view]
-        checked = check_depth(view, own[view.name], partners, DepthOptions())
+        checked = confirm_depth(view, own[view.name], partners, ConfirmOptions())
         normals, fitted = fit_normals(view, checked, NormalOptions())
         checked.depth[fitted == 0] = 0
         results.append((checked, normals))

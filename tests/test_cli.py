@@ -23,13 +23,14 @@ from conftest import keep_images
 import colmap_sph
 from colmap_sph.app import cli
 from colmap_sph.project.undistortion import UndistortionOptions
-from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.normals import NormalOptions
 from colmap_sph.stereo.pairs import PairOptions
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.refinement import RefinementOptions
+from colmap_sph.stereo.vote import VoteOptions
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
 FAST = ["--threads", "2", "--num-pairs", "2"]
@@ -86,7 +87,8 @@ def test_help_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
         ("", PairOptions),
         ("", RectificationOptions),
         ("matching.", MatchingOptions),
-        ("depth.", DepthOptions),
+        ("vote.", VoteOptions),
+        ("confirm.", ConfirmOptions),
         ("normals.", NormalOptions),
         ("refinement.", RefinementOptions),
         ("fusion.", FusionOptions),
@@ -97,7 +99,17 @@ def test_help_of_run_explains_every_option(prefix: str, options: type, capsys: p
     assert code == 0
     words = " ".join(output.replace("│", " ").split())
     assert "--workspace for a dense workspace" in words
-    stages = {"undistortion", "pairs", "rectification", "matching", "depth", "normals", "refinement", "fusion"}
+    stages = {
+        "undistortion",
+        "pairs",
+        "rectification",
+        "matching",
+        "vote",
+        "confirm",
+        "normals",
+        "refinement",
+        "fusion",
+    }
     for field in fields(options):
         if options is cli.RunCommand and field.name in stages:
             continue
@@ -296,7 +308,7 @@ BAD = {
     "pairs": ([*RUN, "--num-pairs", "0"], 2, "num_pairs must be at least 1, not 0"),
     "p1": ([*RUN, "--matching.p1", "500"], 2, "not 500, "),
     "sampling": ([*RUN, "--sampling", "nan"], 2, "sampling"),
-    "depth": ([*RUN, "--depth.vote-tolerance", "0"], 2, "vote_tolerance"),
+    "vote": ([*RUN, "--vote.tolerance", "0"], 2, "tolerance"),
     "normals": ([*RUN, "--normals.radius", "0"], 2, "radius"),
     "fusion": ([*RUN, "--fusion.min-num-pixels", "0"], 2, "min_num_pixels"),
     "masks": ([*RUN, "--fusion.mask-path", "none"], 2, "none does not exist"),

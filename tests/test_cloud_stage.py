@@ -15,7 +15,7 @@ from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_
 
 from colmap_sph.errors import NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import read_geometry
-from colmap_sph.pipeline.reconstruct import cloud_stage, memory
+from colmap_sph.pipeline import cloud_stage, memory
 from colmap_sph.pipeline.cloud_stage import cloud_state, fuse_views
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys

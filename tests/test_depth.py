@@ -1,7 +1,6 @@
 """Depth from disparities against exact geometry, the vote and the consistency check against the oracle."""
 
-from dataclasses import fields, replace
-from types import SimpleNamespace
+from dataclasses import replace
 
 import numpy as np
 import oracle
@@ -22,31 +21,17 @@ from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
 from colmap_sph.scene import View
-from colmap_sph.stereo.depth import (
-    CHECK_OPTIONS,
-    VOTE_OPTIONS,
-    DepthEstimate,
-    DepthOptions,
-    check_depth,
-    depth_candidates,
-    estimate_depth,
-    right_disparity,
-)
+from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
+from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
+from colmap_sph.stereo.vote import VoteOptions, depth_candidates, right_disparity, vote_depth
 
 SPHERE, FRAME = RectificationOptions(), RectificationOptions(rectification="frame")
-OPTIONS = DepthOptions(
-    disparity_sigma=0.3,
-    max_disparity_step=2.0,
-    vote_tolerance=3.0,
-    min_support=1,
-    max_reprojection_error=1.0,
-    consistency_tolerance=4.0,
-    min_consistent=2,
-    max_contradiction=1.0,
-    min_surface=0.0,
+VOTE = VoteOptions(disparity_sigma=0.3, max_disparity_step=2.0, tolerance=3.0, min_support=1)
+CONFIRM = ConfirmOptions(
+    max_reprojection_error=1.0, tolerance=4.0, min_consistent=2, max_contradiction=1.0, min_surface=0.0
 )
 SIZE = (160, 120)
 RENDERED = {
@@ -66,7 +51,7 @@ property_test = settings(max_examples=30, deadline=None, derandomize=True)
 # ---- triangulation -----------------------------------------------------------------------------------------
 
 
-def triangulate_pixel(view, pair, side, column, row, disparity, options=OPTIONS):
+def triangulate_pixel(view, pair, side, column, row, disparity, options=VOTE):
     """Depth and sigma of one pixel for a disparity in float64.
 
     The disparity map holds float32: what rounding takes away goes to the pair's origin.
@@ -116,7 +101,7 @@ def test_sigma_is_the_slope_of_depth_over_disparity(name, options, side):
         step = 0.01
         nearer, _ = triangulate_pixel(view, pair, side, column, row, disparity + step)
         farther, _ = triangulate_pixel(view, pair, side, column, row, disparity - step)
-        assert sigma == pytest.approx(OPTIONS.disparity_sigma * (farther - nearer) / (2 * step), rel=1e-3)
+        assert sigma == pytest.approx(VOTE.disparity_sigma * (farther - nearer) / (2 * step), rel=1e-3)
 
 
 @every_case
@@ -128,7 +113,7 @@ def test_a_map_of_exact_disparities_gives_the_depth_map(name, options, side):
     pair = rectify_pair(scene, left, right, options)
     view = left if side == "left" else right
     disparity, _ = exact_disparity(synthetic.surfaces, left, right, pair, side)
-    depth, sigma = depth_candidates(view, disparity.astype(np.float32), pair, side, OPTIONS)
+    depth, sigma = depth_candidates(view, disparity.astype(np.float32), pair, side, VOTE)
     truth, _, _ = syn.exact_geometry(synthetic.surfaces, getattr(synthetic, side), origin=0.0)
     found = (depth > 0) & (truth > 0)
     assert found.mean() > 0.9
@@ -177,7 +162,7 @@ def test_candidates_do_not_depend_on_the_backend(options, monkeypatch):
         results = []
         for kernels in _native.backends():
             monkeypatch.setenv("COLMAP_SPH_KERNELS", kernels)
-            results.append(depth_candidates(view, disparity.astype(np.float32), pair, side, OPTIONS))
+            results.append(depth_candidates(view, disparity.astype(np.float32), pair, side, VOTE))
         assert (results[0][0] > 0).mean() > 0.3
         for other in results[1:]:
             np.testing.assert_array_equal(other, results[0])
@@ -191,7 +176,7 @@ def test_disparities_without_a_point_in_front_give_none():
         for side, view in (("left", left), ("right", right)):
             for value in (np.nan, -pair.disparity_origin, -pair.disparity_origin - 5):
                 flat = np.full((pair.height, pair.width(side)), value, dtype=np.float32)
-                depth, sigma = depth_candidates(view, np.nextafter(flat, np.float32(-1e9)), pair, side, OPTIONS)
+                depth, sigma = depth_candidates(view, np.nextafter(flat, np.float32(-1e9)), pair, side, VOTE)
                 assert not depth.any() and not sigma.any()
 
 
@@ -204,11 +189,11 @@ def test_surfaces_are_not_mixed_across_a_step():
     disparity[:, 50:] = right
     for step, expected in ((2.0, right), (4.0, 0.25 * left + 0.75 * right)):
         # Ray 50 reads column 49.75: nearer to column 50.
-        depth, _ = depth_candidates(view, disparity, pair, "left", replace(OPTIONS, max_disparity_step=step))
+        depth, _ = depth_candidates(view, disparity, pair, "left", replace(VOTE, max_disparity_step=step))
         assert 100 / depth[4, 50] == pytest.approx(expected, rel=1e-6)
         assert 100 / depth[4, 49] == pytest.approx(left, rel=1e-6)
     disparity[:, 50:] = np.nan
-    depth, _ = depth_candidates(view, disparity, pair, "left", OPTIONS)
+    depth, _ = depth_candidates(view, disparity, pair, "left", VOTE)
     assert 100 / depth[4, 49] == pytest.approx(left, rel=1e-6) and depth[4, 50] == 0
 
 
@@ -335,9 +320,9 @@ def estimate(depth, sigma=0.02, support=2):
     )
 
 
-def check(views, maps, options=OPTIONS, support=2):
+def check(views, maps, options=CONFIRM, support=2):
     partners = [(v, estimate(m, support=support)) for v, m in zip(views[1:], maps[1:], strict=True)]
-    return check_depth(views[0], estimate(maps[0]), partners, options)
+    return confirm_depth(views[0], estimate(maps[0]), partners, options)
 
 
 @pytest.mark.parametrize("kernels", _native.backends())
@@ -444,7 +429,7 @@ def test_exact_maps_confirm_each_other_and_stay_as_they_are():
     np.testing.assert_allclose(checked.depth[kept], maps[0][kept], rtol=1e-4)
     assert (checked.sigma[kept] < 0.02).all() and not checked.sigma[~kept].any()
     assert checked.support.max() == 4
-    alone = checked.support[kept] < OPTIONS.min_consistent
+    alone = checked.support[kept] < CONFIRM.min_consistent
     assert 0 < alone.mean() < 0.3
 
 
@@ -484,8 +469,8 @@ def test_what_too_few_views_confirm_is_dropped():
     maps[2][:] = maps[3][:] = 0
     seen = in_view(views[0], views[2], 10.0)
     assert not check(views, maps).depth[seen].any()
-    assert check(views, maps, replace(OPTIONS, min_consistent=1)).depth[seen].any()
-    assert (check(views, maps, replace(OPTIONS, min_consistent=0)).depth > 0).all()
+    assert check(views, maps, replace(CONFIRM, min_consistent=1)).depth[seen].any()
+    assert (check(views, maps, replace(CONFIRM, min_consistent=0)).depth > 0).all()
 
 
 def test_what_one_view_confirms_in_passing_is_dropped():
@@ -498,7 +483,7 @@ def test_what_one_view_confirms_in_passing_is_dropped():
     block = np.zeros(shape, bool)
     block[15:45, 20:50] = True
     maps[0] = np.where(speckles | block, maps[0], 0)
-    checked = check(views, maps, replace(OPTIONS, min_surface=0.8)).depth > 0
+    checked = check(views, maps, replace(CONFIRM, min_surface=0.8)).depth > 0
     inner = np.zeros(shape, bool)
     inner[18:42, 23:47] = True
     assert (inner & second).sum() > 100
@@ -532,12 +517,12 @@ def test_a_ghost_that_others_see_through_is_dropped():
     inner = (slice(20, 28), slice(28, 36))
     assert (maps[0][inner] < 6).all()
     assert not check(views, maps).depth[inner].any()
-    lenient = check(views, maps, replace(OPTIONS, max_contradiction=10.0))
+    lenient = check(views, maps, replace(CONFIRM, max_contradiction=10.0))
     assert (lenient.depth[inner] > 0).all() and (lenient.support[inner] == 2).all()
     # What a single pair says of the wall behind does not count against two views.
     unsure = check(views, maps, support=1)
     np.testing.assert_array_equal(unsure.depth[inner], lenient.depth[inner])
-    assert not check(views, maps, replace(OPTIONS, min_contradicting_support=1), support=1).depth[inner].any()
+    assert not check(views, maps, replace(CONFIRM, min_contradicting_support=1), support=1).depth[inner].any()
 
 
 def test_an_occluded_point_is_not_contradicted():
@@ -546,7 +531,7 @@ def test_an_occluded_point_is_not_contradicted():
     views = [views[3], *views[:3], *views[4:]]
     maps = [maps[3], *maps[:3], *maps[4:]]
     hidden = with_ghost(views, [m.copy() for m in maps], seen_by=(1, 2, 3, 4))
-    strict = replace(OPTIONS, max_contradiction=0.0)
+    strict = replace(CONFIRM, max_contradiction=0.0)
     before, after = check(views, maps, strict), check(views, hidden, strict)
     assert (after.support < before.support).sum() > 50
     enough = before.support >= 6
@@ -573,7 +558,7 @@ def test_a_view_takes_depth_from_pairs_in_which_it_is_left_or_right():
     pairs = exact_pairs(first.surfaces, scene.views, scene, [(0, 1), (1, 2)])
     view = scene.views[1]
     truth, _, _ = syn.exact_geometry(first.surfaces, first.right, origin=0.0)
-    result = estimate_depth(view, pairs, OPTIONS)
+    result = vote_depth(view, pairs, VOTE)
     for field, dtype in (("depth", np.float32), ("sigma", np.float32), ("support", np.uint8)):
         assert getattr(result, field).shape == truth.shape and getattr(result, field).dtype == dtype
     found = result.depth > 0
@@ -581,57 +566,37 @@ def test_a_view_takes_depth_from_pairs_in_which_it_is_left_or_right():
     assert np.median(np.abs(result.depth / truth - 1)[found]) < 1e-4
     assert (np.abs(result.depth / truth - 1)[found] < 0.005).mean() > 0.97
     assert (result.support == 2).mean() > 0.4 and result.support.max() == 2
-    stricter = estimate_depth(view, pairs, replace(OPTIONS, min_support=2))
+    stricter = vote_depth(view, pairs, replace(VOTE, min_support=2))
     np.testing.assert_array_equal(stricter.depth > 0, found & (result.support == 2))
 
 
 def test_a_view_without_pairs_has_no_depth():
     view = wall_views(1)[0][0]
-    result = estimate_depth(view, [], OPTIONS)
+    result = vote_depth(view, [], VOTE)
     assert result.depth.shape == (48, 64)
     assert not result.depth.any() and not result.support.any()
-    assert not check_depth(view, result, [], OPTIONS).depth.any()
+    assert not confirm_depth(view, result, [], CONFIRM).depth.any()
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
+    ("record", "name", "value"),
     [
         *[
-            (name, value)
-            for name in ("disparity_sigma", "max_disparity_step", "vote_tolerance")
+            (VoteOptions, name, value)
+            for name in ("disparity_sigma", "max_disparity_step", "tolerance")
             for value in (0, -1, np.nan)
         ],
-        *[(name, np.nan) for name in ("max_reprojection_error", "consistency_tolerance", "max_contradiction")],
-        *[(name, value) for name in ("min_support", "min_contradicting_support") for value in (0, 256)],
-        *[("min_consistent", value) for value in (-1, 256)],
-        ("max_contradiction", -0.1),
-        ("min_surface", 1.5),
-        ("min_surface", np.nan),
+        *[(VoteOptions, "min_support", value) for value in (0, 256)],
+        *[(ConfirmOptions, name, np.nan) for name in ("max_reprojection_error", "tolerance", "max_contradiction")],
+        *[(ConfirmOptions, "min_contradicting_support", value) for value in (0, 256)],
+        *[(ConfirmOptions, "min_consistent", value) for value in (-1, 256)],
+        (ConfirmOptions, "max_contradiction", -0.1),
+        (ConfirmOptions, "min_surface", 1.5),
+        (ConfirmOptions, "min_surface", np.nan),
     ],
 )
-def test_options_out_of_bounds_are_refused(name, value):
-    DepthOptions().check()
-    with pytest.raises(OptionError, match=name):
-        DepthOptions(**{name: value}).check()
-
-
-# ---- options -----------------------------------------------------------------------------------------------
-
-
-def test_vote_and_check_read_their_own_options():
-    """Their keys hold no others: each works without those of the other."""
-    assert sorted([*VOTE_OPTIONS, *CHECK_OPTIONS]) == sorted(field.name for field in fields(DepthOptions))
-    vote, checked = (
-        SimpleNamespace(**{name: getattr(OPTIONS, name) for name in names})
-        for names in (VOTE_OPTIONS, CHECK_OPTIONS)
-    )
-    synthetic = RENDERED["convergent"]
-    scene, left, right = scene_of_pair(synthetic)
-    pair = rectify_pair(scene, left, right, SPHERE)
-    exact, _ = exact_disparity(synthetic.surfaces, left, right, pair, "left")
-    disparity = PairDisparity(left.name, right.name, pair, exact.astype(np.float32))
-    found, expected = (estimate_depth(left, [disparity], options).depth for options in (vote, OPTIONS))
-    assert expected.any()
-    np.testing.assert_array_equal(found, expected)
-    views, maps = wall_views(3)
-    np.testing.assert_array_equal(check(views, maps, checked).depth, check(views, maps).depth)
+def test_options_out_of_bounds_are_refused(record, name, value):
+    record().check()
+    with pytest.raises(OptionError, match=name) as refused:
+        record(**{name: value}).check()
+    assert refused.value.names == (name,)

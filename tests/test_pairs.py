@@ -32,7 +32,7 @@ def view_at(center: Sequence[float], name: str, indices: Sequence[int] = (), R: 
 
 
 def partners(selection: PairSelection, name: str) -> list[str]:
-    return [pair.partner for pair in selection.pairs[name]]
+    return [partner.name for partner in selection.partners[name]]
 
 
 def without_tracks(scene: Scene, keep_points: bool = False) -> Scene:
@@ -55,11 +55,11 @@ def line() -> Scene:
 def test_ranked_by_shared_points(line: Scene) -> None:
     selection = select_pairs(line, FEW)
     assert selection.source == "tracks"
-    assert [(p.partner, p.shared_points) for p in selection.pairs["0.jpg"]] == [("1.jpg", 20), ("2.jpg", 10)]
+    assert [(p.name, p.shared_points) for p in selection.partners["0.jpg"]] == [("1.jpg", 20), ("2.jpg", 10)]
     # Of two that share the same number the one with more parallax comes first.
     expected = [("3.jpg", 20), ("1.jpg", 20), ("4.jpg", 10), ("0.jpg", 10)]
-    assert {(p.partner, p.shared_points) for p in selection.pairs["2.jpg"]} == set(expected)
-    assert [p.shared_points for p in selection.pairs["2.jpg"]] == [20, 20, 10, 10]
+    assert {(p.name, p.shared_points) for p in selection.partners["2.jpg"]} == set(expected)
+    assert [p.shared_points for p in selection.partners["2.jpg"]] == [20, 20, 10, 10]
     assert selection.without_partner == ()
 
 
@@ -74,7 +74,7 @@ def test_overlapping_views(line: Scene) -> None:
 
 
 def test_angle_is_the_75th_percentile(line: Scene) -> None:
-    (pair,) = (pair for pair in select_pairs(line, FEW).pairs["1.jpg"] if pair.partner == "0.jpg")
+    (pair,) = (pair for pair in select_pairs(line, FEW).partners["1.jpg"] if pair.name == "0.jpg")
     points = line.points[10:30]
     to0, to1 = points - [0, 0, 0], points - [1, 0, 0]
     cosines = (to0 * to1).sum(1) / np.linalg.norm(to0, axis=1) / np.linalg.norm(to1, axis=1)
@@ -179,7 +179,7 @@ def test_wide_angles_come_last(line: Scene) -> None:
     selection = select_pairs(Scene(views, line.points), PairOptions(num_pairs=3))
     # 30.jpg shares all points but under more than 60°, 3.jpg only fifty.
     assert partners(selection, "0.jpg") == ["8.jpg", "3.jpg", "30.jpg"]
-    assert selection.pairs["0.jpg"][2].angle > 60
+    assert selection.partners["0.jpg"][2].angle > 60
     assert partners(select_pairs(Scene(views, line.points), PairOptions(num_pairs=2)), "0.jpg") == [
         "8.jpg",
         "3.jpg",
@@ -195,8 +195,8 @@ def test_values_that_are_not_finite(line: Scene) -> None:
         selection = select_pairs(scene, FEW)
         assert selection.without_partner == ("3.jpg",)
         assert all("3.jpg" not in pair for pair in selection.unique_pairs())
-        assert all(np.isfinite(pair.angle) for pairs in selection.pairs.values() for pair in pairs)
-    assert select_pairs(Scene(tuple(views), points), FEW).pairs["0.jpg"][0].shared_points == 19
+        assert all(np.isfinite(pair.angle) for pairs in selection.partners.values() for pair in pairs)
+    assert select_pairs(Scene(tuple(views), points), FEW).partners["0.jpg"][0].shared_points == 19
 
 
 def test_no_pair_at_all(line: Scene) -> None:
@@ -231,10 +231,10 @@ def test_patch_match_cfg_is_obeyed(line: Scene, caplog: pytest.LogCaptureFixture
     explicit = {"4.jpg": ["0.jpg", "gone.jpg"], "2.jpg": 20, "1.jpg": "__all__", "lost.jpg": 20}
     selection = select_pairs(line, PairOptions(num_pairs=2), explicit=explicit)  # type: ignore[arg-type]
     assert selection.source == "patch-match.cfg"
-    assert list(selection.pairs) == ["1.jpg", "2.jpg", "4.jpg"]
+    assert list(selection.partners) == ["1.jpg", "2.jpg", "4.jpg"]
     # No gate for what the user wrote; "__auto__" means our choice of our number.
-    assert [(p.partner, p.shared_points) for p in selection.pairs["4.jpg"]] == [("0.jpg", 0)]
-    assert np.isnan(selection.pairs["4.jpg"][0].angle)
+    assert [(p.name, p.shared_points) for p in selection.partners["4.jpg"]] == [("0.jpg", 0)]
+    assert np.isnan(selection.partners["4.jpg"][0].angle)
     assert set(partners(selection, "2.jpg")) == {"1.jpg", "3.jpg"}
     assert partners(selection, "1.jpg") == ["0.jpg", "2.jpg", "3.jpg", "4.jpg"]
     assert "gone.jpg" in caplog.text and "lost.jpg" in caplog.text
@@ -265,7 +265,7 @@ def test_database_stands_in_for_tracks(line: Scene, tmp_path: Path, caplog: pyte
     with caplog.at_level(logging.INFO):
         selection = select_pairs(without_tracks(line), PairOptions(), matches=read_verified_matches(path))
     assert selection.source == "database"
-    found = [(p.partner, p.shared_points) for p in selection.pairs["0.jpg"]]
+    found = [(p.name, p.shared_points) for p in selection.partners["0.jpg"]]
     assert sorted(found) == [("1.jpg", 50), ("2.jpg", 60), ("3.jpg", 70)]
     assert partners(selection, "4.jpg") == ["3.jpg"]
     assert "verified matches in the database" in caplog.text
@@ -308,10 +308,8 @@ def test_real_database(data_dir: Path) -> None:
     )
     assert selection.source == "database" and selection.without_partner == ()
     reader = pycolmap.Database.open(database)
-    for pair in selection.pairs["DJI_0024.jpg"]:
-        ids = [
-            image.image_id for image in reader.read_all_images() if image.name in {pair.reference, pair.partner}
-        ]
+    for pair in selection.partners["DJI_0024.jpg"]:
+        ids = [image.image_id for image in reader.read_all_images() if image.name in {"DJI_0024.jpg", pair.name}]
         assert pair.shared_points == len(reader.read_two_view_geometry(ids[0], ids[1]).inlier_matches)
     reader.close()
 
@@ -336,11 +334,11 @@ def test_real_tracks_agree_with_colmap(data_dir: Path) -> None:
     theirs.read_from_colmap(root, "sparse/0", "images")
     radians, index = theirs.compute_triangulation_angles(75), theirs.get_image_idx
     selection = select_pairs(scene, PairOptions())
-    assert all(len(pairs) == 10 for pairs in selection.pairs.values())
-    for name, pairs in selection.pairs.items():
+    assert all(len(pairs) == 10 for pairs in selection.partners.values())
+    for name, pairs in selection.partners.items():
         for pair in pairs:
-            assert pair.shared_points == shared[name, pair.partner]
-            angle = np.degrees(radians[index(name)][index(pair.partner)])
+            assert pair.shared_points == shared[name, pair.name]
+            angle = np.degrees(radians[index(name)][index(pair.name)])
             assert pair.angle == pytest.approx(angle, rel=0.05)
 
 
@@ -350,7 +348,7 @@ def test_frusta_agree_with_tracks(data_dir: Path, keep_points: bool, share: floa
     best = select_pairs(scene, replace(FEW, num_pairs=20))
     selection = select_pairs(without_tracks(scene, keep_points), PairOptions())
     assert selection.source == "frusta"
-    hits = [set(partners(selection, name)) & set(partners(best, name)) for name in selection.pairs]
+    hits = [set(partners(selection, name)) & set(partners(best, name)) for name in selection.partners]
     assert np.mean([len(hit) for hit in hits]) / 10 >= share
 
 

@@ -29,10 +29,10 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
-from colmap_sph.stereo.depth import DepthOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.pairs import PairOptions, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
+from colmap_sph.stereo.vote import VoteOptions
 from colmap_sph.synthetic import DemoBlock
 
 FEW_PAIRS = RunOptions(threads=2, pairs=PairOptions(num_pairs=2))
@@ -350,8 +350,8 @@ def test_images_of_noise_have_no_result(project: Path) -> None:
         noise = rng.integers(0, 255, (240, 320, 3), dtype=np.uint8)
         cv2.imwrite(str(project / "images" / name), noise)
     with pytest.raises(NoResultError, match="No depth was confirmed"):
-        strict = DepthOptions(min_support=3)
-        colmap_sph.run(project / "sparse/0", options=replace(FEW_PAIRS, depth=strict))
+        strict = VoteOptions(min_support=3)
+        colmap_sph.run(project / "sparse/0", options=replace(FEW_PAIRS, vote=strict))
     assert not (project / "dense" / "fused.ply").exists()
 
 
@@ -430,7 +430,7 @@ def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:
         {"model": Path("sparse/0"), "options": RunOptions(fusion_input="depth")},  # type: ignore[arg-type]
         {"model": Path("sparse/0"), "options": RunOptions(pairs=PairOptions(num_pairs=0))},
         {"model": Path("sparse/0"), "options": RunOptions(fusion=FusionOptions(min_num_pixels=0))},
-        {"model": Path("sparse/0"), "options": RunOptions(depth=DepthOptions(min_support=0))},
+        {"model": Path("sparse/0"), "options": RunOptions(vote=VoteOptions(min_support=0))},
     ],
 )
 def test_contradictions_and_bad_values(arguments: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from conftest import SMALL_BLOCK, keep_images
 
 import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
-from colmap_sph.pipeline.reconstruct import stages
+from colmap_sph.pipeline import stages
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
@@ -23,13 +23,14 @@ from colmap_sph.project.claim import claimed
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.normals import NormalOptions
 from colmap_sph.stereo.pairs import PairOptions, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.refinement import RefinementOptions
+from colmap_sph.stereo.vote import VoteOptions
 from colmap_sph.synthetic import make_demo_block
 
 # Four images of one strip, and the pairs among them: all six.
@@ -139,11 +140,11 @@ CHANGES = {
     "matching": ({"matching": MatchingOptions(p1=12)}, EVERYTHING),
     "rectification": ({"rectification": RectificationOptions(near_margin=2.2)}, EVERYTHING),
     "depth": (
-        {"depth": DepthOptions(vote_tolerance=2.5)},
+        {"vote": VoteOptions(tolerance=2.5)},
         expected_files(pairs=0, votes=4, photometric=4, geometric=4, cloud=True),
     ),
     "consistency": (
-        {"depth": DepthOptions(max_contradiction=0.7)},
+        {"confirm": ConfirmOptions(max_contradiction=0.7)},
         expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
     ),
     "normals": (
@@ -335,7 +336,7 @@ def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Fin
     ids = finished.ids
     path = finished.dense / f"colmap_sph/pairs/{ids[NAMES[0]]:06d}-{ids[NAMES[1]]:06d}.npz"
     spoil_disparities(path)
-    changed = {"depth": DepthOptions(vote_tolerance=2.5), "threads": threads}
+    changed = {"vote": VoteOptions(tolerance=2.5), "threads": threads}
     report = finished.rerun(**changed)
     # Whichever of the two read it first removed it; the other finds it missing.
     assert sorted(report.skipped_images) == NAMES[:2]
@@ -351,7 +352,7 @@ def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Fin
 # ---- failures of single items ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", ["match_pair", "estimate_depth", "check_depth", "fit_normals", "refine_maps"])
+@pytest.mark.parametrize("stage", ["match_pair", "vote_depth", "confirm_depth", "fit_normals", "refine_maps"])
 def test_memory_refused_once(stage: str, finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     """One item fails, the rest goes on, and the next run completes the work."""
     original, calls = getattr(stages, stage), []
@@ -380,9 +381,9 @@ def test_memory_refused_for_all(finished: Finished, monkeypatch: pytest.MonkeyPa
     def refused(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(stages, "estimate_depth", refused)
+    monkeypatch.setattr(stages, "vote_depth", refused)
     with pytest.raises(NoResultError, match="not enough memory"):
-        finished.rerun(depth=DepthOptions(vote_tolerance=2.5))
+        finished.rerun(vote=VoteOptions(tolerance=2.5))
 
 
 # ---- starting afresh ---------------------------------------------------------------------------------------

@@ -30,13 +30,14 @@ from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.workers import is_memory_error
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import MapKind, Workspace
-from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.normals import NormalOptions
 from colmap_sph.stereo.pairs import PairOptions
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.refinement import RefinementOptions
+from colmap_sph.stereo.vote import VoteOptions
 
 logger = logging.getLogger(__name__)
 
@@ -83,7 +84,8 @@ class RunCommand:
         default_factory=RectificationOptions
     )
     matching: Annotated[MatchingOptions, tyro.conf.FlagConversionOff] = field(default_factory=MatchingOptions)
-    depth: DepthOptions = field(default_factory=DepthOptions)
+    vote: VoteOptions = field(default_factory=VoteOptions)
+    confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
     fusion: Annotated[FusionOptions, tyro.conf.FlagConversionOff] = field(default_factory=FusionOptions)

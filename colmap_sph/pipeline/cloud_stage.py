@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_sph.errors import InputError, NoResultError, OutputError
-from colmap_sph.pipeline.context import Context, Done, Pair
+from colmap_sph.pipeline.context import Context, Done
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.memory import MemoryGate, format_memory, resident
 from colmap_sph.pipeline.records import forget, vouch, vouched_facts
@@ -21,7 +21,7 @@ from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.staging import scratch_folder
 from colmap_sph.stereo.fusion import MAX_PARTNERS, ViewMaps, fuse_view
 from colmap_sph.stereo.fusion_losses import DepthAndNormals, explain_losses
-from colmap_sph.stereo.pairs import overlapping_views, partners_of
+from colmap_sph.stereo.pairs import Pair, overlapping_views, partners_of
 
 logger = logging.getLogger(__name__)
 

@@ -18,8 +18,6 @@ from colmap_sph.scene import Scene, View
 logger = logging.getLogger(__name__)
 
 T = TypeVar("T")
-# Names of two images.
-Pair = tuple[str, str]
 
 
 @dataclass(frozen=True)

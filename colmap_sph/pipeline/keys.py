@@ -13,7 +13,6 @@ from colmap_sph.pipeline.program import program_digest
 from colmap_sph.project.sparse_model import model_files
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
-from colmap_sph.stereo.depth import CHECK_OPTIONS, VOTE_OPTIONS
 from colmap_sph.stereo.rectified_pair import RectifiedPair
 
 
@@ -46,7 +45,7 @@ class Keys:
 
     def vote(self, view: View, pair_keys: Sequence[str]) -> str:
         """Of a photometric estimate, from the keys of its pairs in the order in which they vote."""
-        mask, options = self._masks.get(view.name), self._depth_options(VOTE_OPTIONS)
+        mask, options = self._masks.get(view.name), self._options.vote
         return digest("vote", self._program, _camera(view), mask, pair_keys, options)
 
     def photometric(self, vote: str) -> str:
@@ -56,7 +55,7 @@ class Keys:
     def geometric(self, vote: str, partner_votes: Sequence[str]) -> str:
         """Of the geometric maps of a view, from its own vote and those of its partners, in their order."""
         # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
-        options = (self._depth_options(CHECK_OPTIONS), self._options.normals, self._options.refinement)
+        options = (self._options.confirm, self._options.normals, self._options.refinement)
         return digest("geometric", vote, partner_votes, *options)
 
     def cloud(
@@ -79,9 +78,6 @@ class Keys:
             [_digest_if_there(path) for path in masks],
             options.fusion_input,
         )
-
-    def _depth_options(self, names: Sequence[str]) -> dict[str, float]:
-        return {name: getattr(self._options.depth, name) for name in names}
 
 
 def _camera(view: View) -> tuple[object, ...]:

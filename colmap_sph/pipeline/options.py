@@ -7,7 +7,7 @@ from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import MapKind
-from colmap_sph.stereo.depth import DepthOptions
+from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import MatchingOptions
@@ -15,6 +15,7 @@ from colmap_sph.stereo.normals import NormalOptions
 from colmap_sph.stereo.pairs import PairOptions
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.refinement import RefinementOptions
+from colmap_sph.stereo.vote import VoteOptions
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class RunOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     rectification: RectificationOptions = field(default_factory=RectificationOptions)
     matching: MatchingOptions = field(default_factory=MatchingOptions)
-    depth: DepthOptions = field(default_factory=DepthOptions)
+    vote: VoteOptions = field(default_factory=VoteOptions)
+    confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)
     refinement: RefinementOptions = field(default_factory=RefinementOptions)
     fusion: FusionOptions = field(default_factory=FusionOptions)
@@ -48,7 +50,8 @@ class RunOptions:
             self.pairs,
             self.rectification,
             self.matching,
-            self.depth,
+            self.vote,
+            self.confirm,
             self.normals,
             self.refinement,
             self.fusion,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from colmap_sph.errors import ColmapSphError
 from colmap_sph.pipeline.cloud_stage import COLMAP_FUSION_BYTES, FUSE_BYTES, MAPS_BYTES, cloud_state
-from colmap_sph.pipeline.context import Context, Pair
+from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import check_arguments, choose_pairs, matches_for, wanted_scene
@@ -24,7 +24,7 @@ from colmap_sph.project.undistortion import foresee_workspace, leave_out_bad_ima
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import MAX_PARTNERS
-from colmap_sph.stereo.pairs import overlapping_views, partners_of, select_pairs
+from colmap_sph.stereo.pairs import Pair, overlapping_views, partners_of, select_pairs
 from colmap_sph.stereo.rectification import rectify_pair
 
 logger = logging.getLogger(__name__)

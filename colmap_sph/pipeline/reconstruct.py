@@ -195,7 +195,7 @@ def matches_for(scene: Scene, database: Path | None) -> dict[tuple[str, str], in
 
 def wanted_scene(scene: Scene, selection: PairSelection) -> Scene:
     """Return the scene without the views that are not asked for."""
-    wanted = {*selection.pairs, *itertools.chain(*selection.unique_pairs())}
+    wanted = {*selection.partners, *itertools.chain(*selection.unique_pairs())}
     return replace(scene, views=tuple(view for view in scene.views if view.name in wanted))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
-from colmap_sph.pipeline.context import Context, Done, Pair
+from colmap_sph.pipeline.context import Context, Done
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.pair_files import (
@@ -32,14 +32,16 @@ from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.workspace import MapKind
 from colmap_sph.scene import View
-from colmap_sph.stereo.depth import DepthEstimate, check_depth, estimate_depth
+from colmap_sph.stereo.confirm import confirm_depth
+from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.matching import RectifiedImage, Scratch, match_pair
 from colmap_sph.stereo.normals import fit_normals
-from colmap_sph.stereo.pairs import partners_of
+from colmap_sph.stereo.pairs import Pair, partners_of
 from colmap_sph.stereo.rectification import rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.refinement import refine_maps
 from colmap_sph.stereo.resampling import resample
+from colmap_sph.stereo.vote import vote_depth
 
 logger = logging.getLogger(__name__)
 
@@ -178,7 +180,7 @@ def estimate_views(context: Context, pair_keys: Mapping[Pair, str]) -> dict[str,
 
     def _vote(view: View, key: str) -> DepthEstimate:
         files = (context.pair_path(*pair) for pair in _pairs_of(pair_keys, view.name))
-        estimate = estimate_depth(view, (read_pair(file) for file in files), context.options.depth)
+        estimate = vote_depth(view, (read_pair(file) for file in files), context.options.vote)
         mask = _read_mask(context, view.name)
         if mask is not None:
             # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
@@ -232,7 +234,7 @@ def check_views(context: Context, pairs: Iterable[Pair], votes: Mapping[str, str
             return Done(state.key, made=False, coverage=state.coverage)
         with gate.reserve(_checking_bytes(context, view, names), view.name):
             others = ((context.scene.view(name), estimates.get(name)) for name in names)
-            checked = check_depth(view, estimates.get(view.name), others, context.options.depth)
+            checked = confirm_depth(view, estimates.get(view.name), others, context.options.confirm)
             planes = fit_normals(view, checked, context.options.normals)
             if context.options.refinement.rounds and checked.depth.any():
                 sources = [(context.scene.view(name), images.get(name)) for name in names]

@@ -21,6 +21,8 @@ from colmap_sph.stereo.partner_choice import choose, triangulation_angles, worth
 
 logger = logging.getLogger(__name__)
 
+Pair = tuple[str, str]
+"""Names of two images, sorted."""
 PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
 # Candidates that a view chooses from, unless it is to have more; points that tell a pair's angle and its worth.
 _MAX_CANDIDATES = 100
@@ -59,13 +61,13 @@ class PairOptions:
 
 
 @dataclass(frozen=True)
-class Pair:
-    """A reference image and one of its partners.
+class Partner:
+    """An image that another, its reference, is matched with.
 
     Attributes
     ----------
-    reference, partner : str
-        Image names.
+    name : str
+        Its image name.
     shared_points : int
         Sparse points which both images observe; verified matches or common samples of the frusta where the
         pair was found by these.
@@ -73,8 +75,7 @@ class Pair:
         75th percentile of the triangulation angle over these points in degrees; NaN where there is none.
     """
 
-    reference: str
-    partner: str
+    name: str
     shared_points: int
     angle: float
 
@@ -85,23 +86,25 @@ class PairSelection:
 
     Attributes
     ----------
-    pairs : mapping of str to tuple of Pair
-        For each reference image, in the order of the scene, its pairs with the best first; may be empty.
+    partners : mapping of str to tuple of Partner
+        For each reference image, in the order of the scene, its partners with the best first; may be empty.
     source : "tracks", "database", "frusta" or "patch-match.cfg"
         What the selection rests on.
     """
 
-    pairs: Mapping[str, tuple[Pair, ...]]
+    partners: Mapping[str, tuple[Partner, ...]]
     source: PairSource
 
     @property
     def without_partner(self) -> tuple[str, ...]:
         """Reference images that have no pair."""
-        return tuple(name for name, pairs in self.pairs.items() if not pairs)
+        return tuple(name for name, partners in self.partners.items() if not partners)
 
-    def unique_pairs(self) -> list[tuple[str, str]]:
-        """Return every unordered pair once, as two sorted names, in sorted order."""
-        names = {tuple(sorted((p.reference, p.partner))) for pairs in self.pairs.values() for p in pairs}
+    def unique_pairs(self) -> list[Pair]:
+        """Return every pair once, in sorted order."""
+        names = {
+            tuple(sorted((reference, p.name))) for reference, partners in self.partners.items() for p in partners
+        }
         return sorted((first, second) for first, second in names)
 
 
@@ -110,7 +113,7 @@ def select_pairs(
     options: PairOptions,
     *,
     explicit: Mapping[str, SourceImages] | None = None,
-    matches: Mapping[tuple[str, str], int] | None = None,
+    matches: Mapping[Pair, int] | None = None,
 ) -> PairSelection:
     """Choose the partners of every image.
 
@@ -136,8 +139,8 @@ def select_pairs(
     options.check()
     graph = _build_graph(scene, options, matches)
     if explicit is None:
-        pairs = {view.name: _best_pairs(graph, options, i) for i, view in enumerate(scene.views)}
-        selection = PairSelection(pairs, graph.source)
+        partners = {view.name: _best_partners(graph, options, i) for i, view in enumerate(scene.views)}
+        selection = PairSelection(partners, graph.source)
     else:
         selection = _explicit_selection(graph, options, explicit)
     _report(selection, options)
@@ -156,7 +159,7 @@ def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
     }
 
 
-def partners_of(pairs: Iterable[tuple[str, str]]) -> dict[str, list[str]]:
+def partners_of(pairs: Iterable[Pair]) -> dict[str, list[str]]:
     """Partners of each image, sorted."""
     partners: dict[str, list[str]] = {}
     for left, right in pairs:
@@ -229,7 +232,7 @@ class _Graph:
         return float(np.percentile(angles, _ANGLE_PERCENTILE))
 
 
-def _build_graph(scene: Scene, options: PairOptions, matches: Mapping[tuple[str, str], int] | None) -> _Graph:
+def _build_graph(scene: Scene, options: PairOptions, matches: Mapping[Pair, int] | None) -> _Graph:
     """Find what views have in common: tracks, else verified matches, else samples of the frusta."""
     finite = np.asarray(np.isfinite(scene.points).all(axis=1))
     posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
@@ -269,7 +272,7 @@ def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_ar
     return sparse.csr_array(kept, shape=counts.shape)
 
 
-def _match_counts(scene: Scene, matches: Mapping[tuple[str, str], int], least: int) -> sparse.csr_array:
+def _match_counts(scene: Scene, matches: Mapping[Pair, int], least: int) -> sparse.csr_array:
     """Numbers of verified matches between views, as a (V, V) matrix of those of at least `least`."""
     index_of = scene.index_of
     known = [(index_of[a], index_of[b], n) for (a, b), n in matches.items() if a in index_of and b in index_of]
@@ -278,10 +281,10 @@ def _match_counts(scene: Scene, matches: Mapping[tuple[str, str], int], least: i
     return _without_self_and_few(sparse.csr_array(both, shape=(len(scene.views),) * 2), least)
 
 
-def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]:
-    """Return the best pairs of view `i`: those that together see most of it, then those under a wide angle."""
-    near: list[Pair] = []
-    wide: list[Pair] = []
+def _best_partners(graph: _Graph, options: PairOptions, i: int) -> tuple[Partner, ...]:
+    """Return the best partners of view `i`: those that together see most of it, then those under a wide angle."""
+    near: list[Partner] = []
+    wide: list[Partner] = []
     worths: list[NDArray[np.float32]] = []
     most = max(_MAX_CANDIDATES, options.num_pairs)
     for j, weight in zip(*graph.candidates(i), strict=True):
@@ -292,11 +295,11 @@ def _best_pairs(graph: _Graph, options: PairOptions, i: int) -> tuple[Pair, ...]
             continue
         if angle < options.min_triangulation_angle:
             continue
-        pair = Pair(graph.scene.views[i].name, graph.scene.views[j].name, int(weight), angle)
+        partner = Partner(graph.scene.views[j].name, int(weight), angle)
         if angle > options.max_triangulation_angle:
-            wide.append(pair)
+            wide.append(partner)
         else:
-            near.append(pair)
+            near.append(partner)
             worths.append(graph.worth(i, int(j)))
     chosen = [near[k] for k in choose(worths, options.num_pairs)]
     return tuple((chosen + wide)[: options.num_pairs])
@@ -307,20 +310,20 @@ def _explicit_selection(
 ) -> PairSelection:
     index_of = graph.scene.index_of
     _warn_unknown(explicit, index_of)
-    pairs: dict[str, tuple[Pair, ...]] = {}
+    partners: dict[str, tuple[Partner, ...]] = {}
     obeyed = set(index_of) - set(explicit) != set()
     for name in sorted(explicit.keys() & index_of.keys(), key=index_of.__getitem__):
         sources, i = explicit[name], index_of[name]
         if isinstance(sources, int):
-            pairs[name] = _best_pairs(graph, options, i)
+            partners[name] = _best_partners(graph, options, i)
             continue
         obeyed = True
-        partners = index_of if sources == "__all__" else sources
-        known = [index_of[partner] for partner in partners if partner in index_of and partner != name]
-        pairs[name] = tuple(
-            Pair(name, graph.scene.views[j].name, graph.weight(i, j), graph.angle(i, j)) for j in known
+        named = index_of if sources == "__all__" else sources
+        known = [index_of[other] for other in named if other in index_of and other != name]
+        partners[name] = tuple(
+            Partner(graph.scene.views[j].name, graph.weight(i, j), graph.angle(i, j)) for j in known
         )
-    return PairSelection(pairs, "patch-match.cfg" if obeyed else graph.source)
+    return PairSelection(partners, "patch-match.cfg" if obeyed else graph.source)
 
 
 def _warn_unknown(explicit: Mapping[str, SourceImages], index_of: Mapping[str, int]) -> None:
@@ -350,6 +353,6 @@ def _report(selection: PairSelection, options: PairOptions) -> None:
             f"{options.min_shared_points} shared points and a triangulation angle of "
             f"{options.min_triangulation_angle} degrees are needed; check the model or lower these bounds."
         )
-    logger.info("%d pairs of %d images, by %s", num_unique, len(selection.pairs), words[selection.source])
+    logger.info("%d pairs of %d images, by %s", num_unique, len(selection.partners), words[selection.source])
     for name in selection.without_partner:
         logger.warning("%s has no partner with enough overlap and parallax; it gets no depth map", name)

@@ -14,8 +14,8 @@ from colmap_sph.evaluation import DepthView, truth_at_pixel_origin, truth_normal
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.pair_files import read_pair
 from colmap_sph.scene import Scene, View
-from colmap_sph.stereo.depth import depth_candidates, right_disparity
 from colmap_sph.stereo.rectified_pair import Model, PairDisparity
+from colmap_sph.stereo.vote import depth_candidates, right_disparity
 from rectification_study.runs import MODELS, Run
 
 CORRECT = 2.0
@@ -73,9 +73,9 @@ def pair_files(run: Run) -> dict[tuple[str, str], Path]:
 
 def pair_depths(left: View, right: View, pair: PairDisparity, options: RunOptions) -> tuple[Map, Map]:
     """Depth of both images' pixels from their pair alone; 0 = none."""
-    carried = right_disparity(pair, options.depth.max_disparity_step)
-    left_depth, _ = depth_candidates(left, pair.disparity, pair.geometry, "left", options.depth)
-    right_depth, _ = depth_candidates(right, carried, pair.geometry, "right", options.depth)
+    carried = right_disparity(pair, options.vote.max_disparity_step)
+    left_depth, _ = depth_candidates(left, pair.disparity, pair.geometry, "left", options.vote)
+    right_depth, _ = depth_candidates(right, carried, pair.geometry, "right", options.vote)
     return left_depth, right_depth
 
 

@@ -1,0 +1,142 @@
+"""Disparities of a view's pairs → its photometric depth map.
+
+Each pair gives one depth candidate per pixel, read along the pixel's ray from the pair's disparity map, with a
+standard deviation from its geometry. The candidates vote: the largest mutually consistent cluster wins, and its
+weighted mean is the *photometric* depth.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.errors import OptionError
+from colmap_sph.scene import View
+from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, rectified_ray_from_pixel
+
+# Candidates of all pairs are voted on in bands of rows of about this size.
+_BAND_BYTES = 8 << 20
+
+
+@dataclass(frozen=True)
+class VoteOptions:
+    """How the pairs of a view vote on its depth."""
+
+    disparity_sigma: float = 0.2
+    """Standard deviation, pixels, of a disparity on a smooth surface; where disparities are rough it is larger.
+    It is the scale of all tolerances, those of the confirmation among them."""
+    max_disparity_step: float = 2.0
+    """Neighbouring disparities that differ by more than this (pixels) belong to different surfaces."""
+    tolerance: float = 3.0
+    """Two candidates agree when they differ by less than this many standard deviations."""
+    min_support: int = 1
+    """Pairs that must agree on a photometric depth."""
+
+    def check(self) -> None:
+        """Raise `OptionError` for a value out of bounds."""
+        for name in ("disparity_sigma", "max_disparity_step", "tolerance"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
+        if not 1 <= self.min_support <= 255:
+            raise OptionError(f"min_support must lie in 1..255, not {self.min_support}.", "min_support")
+
+
+def right_disparity(pair: PairDisparity, max_step: float) -> NDArray[np.float32]:
+    """The disparity map carried to the right image's pixels, (H, W_right) float32, NaN = none."""
+    right = np.empty((pair.geometry.height, pair.geometry.right_width), dtype=np.float32)
+    _native.transfer_disparity(pair.disparity, max_step, right)
+    return right
+
+
+def depth_candidates(
+    view: View,
+    disparity: NDArray[np.float32],
+    geometry: RectifiedPair,
+    side: Side,
+    options: VoteOptions,
+    rows: slice = slice(None),
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Triangulate a pair's disparities along the rays of one of its images.
+
+    On the sphere the distance along the ray is ρ = b cos θ_r / sin δ (left image), on the plane Z = b f / d
+    (Elhashash & Qin, §3.4).
+
+    Parameters
+    ----------
+    view : View
+        The image whose depth is wanted.
+    disparity : (H, W) float32 ndarray
+        Disparity map in the rectified image of that side; NaN = none.
+    geometry : RectifiedPair
+    side : {"left", "right"}
+    options : VoteOptions
+    rows : slice, optional
+        Rows of the view to do, h of them.
+
+    Returns
+    -------
+    depth, sigma : (h, view.width) float32 ndarray
+        z-depth and its standard deviation, model units; 0 = none.
+    """
+    first, end, _ = rows.indices(view.height)
+    depth = np.empty((end - first, view.width), dtype=np.float32)
+    sigma = np.empty_like(depth)
+    _native.depth_candidates(
+        backend(),
+        disparity,
+        np.ascontiguousarray(rectified_ray_from_pixel(view, geometry)),
+        (geometry.columns_per_radian, geometry.rows_per_radian),
+        (geometry.column_origin(side), geometry.row_origin),
+        geometry.disparity_origin,
+        geometry.baseline,
+        options.disparity_sigma,
+        options.max_disparity_step,
+        geometry.model == "spherical",
+        side == "left",
+        first,
+        depth,
+        sigma,
+    )
+    return depth, sigma
+
+
+def vote_depth(view: View, pairs: Iterable[PairDisparity], options: VoteOptions) -> DepthEstimate:
+    """Photometric depth of a view: the vote of all its pairs.
+
+    Parameters
+    ----------
+    view : View
+    pairs : iterable of PairDisparity
+        Pairs in which the view is the left or the right image.
+    options : VoteOptions
+
+    Returns
+    -------
+    DepthEstimate
+    """
+    sources: list[tuple[NDArray[np.float32], RectifiedPair, Side]] = []
+    for pair in pairs:
+        if pair.left == view.name:
+            sources.append((pair.disparity, pair.geometry, "left"))
+        else:
+            sources.append((right_disparity(pair, options.max_disparity_step), pair.geometry, "right"))
+    shape = (view.height, view.width)
+    voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
+    step = max(_BAND_BYTES // (8 * view.width * max(len(sources), 1)), 1)
+    for first in range(0, view.height if sources else 0, step):
+        rows = slice(first, first + step)
+        candidates = [depth_candidates(view, *source, options, rows) for source in sources]
+        _native.vote_depth(
+            np.stack([depth for depth, _ in candidates]),
+            np.stack([sigma for _, sigma in candidates]),
+            options.tolerance,
+            voted.depth[rows],
+            voted.sigma[rows],
+            voted.support[rows],
+        )
+    voted.depth[voted.support < options.min_support] = 0
+    return voted
