@@ -5,7 +5,7 @@ a test or a renderer. Frames are COLMAP's: x right, y down, z forward, ``x_cam =
 the first pixel's centre is at (0.5, 0.5).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -64,6 +64,10 @@ class View:
     def cam_from_world(self) -> NDArray[np.float64]:
         """(3, 4) matrix ``[R | t]``."""
         return np.hstack([self.R, self.t[:, None]])
+
+    def without_points(self) -> "View":
+        """The view as if it observed no sparse point: all that a worker needs of it."""
+        return replace(self, point_indices=self.point_indices[:0])
 
 
 def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:

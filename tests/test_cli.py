@@ -147,7 +147,7 @@ def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "images 3 with depth maps, mean coverage" in words
     assert "pairs 3 matched (tracks)" in words
     assert f"{report['points']:,} points in" in words
-    for stage in ("undistort", "select pairs", "match pairs", "estimate depth", "check consistency", "fuse"):
+    for stage in ("undistort", "select pairs", "match pairs", "vote on depth", "confirm depth", "fuse"):
         assert f"{stage} {report['seconds'][stage]:.1f}" in words
     assert re.search(r"peak memory \d+\.\d\d GiB", words)
     # The log file.

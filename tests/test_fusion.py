@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, OptionError
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.view_maps import read_view_maps
+from colmap_sph.pipeline.view_maps import MapSources, read_view_maps
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import POINT, View
 from colmap_sph.stereo import fusion
@@ -381,9 +381,15 @@ def workspace(tmp_path_factory):
     return make_workspace(tmp_path_factory.mktemp("exact") / "dense")
 
 
+def sources_of(workspace, view, index, masks):
+    depth, normals = (of(view.name, "geometric") for of in (workspace.depth_map_path, workspace.normal_map_path))
+    mask = masks and masks / f"{view.name}.png"
+    return MapSources(view, index, depth, normals, workspace.image_path(view.name), mask)
+
+
 def test_maps_are_read_as_they_were_written(workspace):
     view = read_scene(workspace.sparse_dir).views[2]
-    maps = read_view_maps(workspace, view, 5, "geometric", None)
+    maps = read_view_maps(sources_of(workspace, view, 5, None))
     assert (maps.view, maps.index) == (view, 5)
     assert maps.nbytes == 19 * WIDTH * HEIGHT
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
@@ -401,14 +407,14 @@ def test_masks(workspace, tmp_path):
     view = read_scene(workspace.sparse_dir).views[0]
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, :50] = 0
-    whole = read_view_maps(workspace, view, 0, "geometric", tmp_path)
+    whole = read_view_maps(sources_of(workspace, view, 0, tmp_path))
     cv2.imwrite(str(tmp_path / f"{view.name}.png"), mask)
-    masked = read_view_maps(workspace, view, 0, "geometric", tmp_path)
+    masked = read_view_maps(sources_of(workspace, view, 0, tmp_path))
     assert (whole.depth > 0).all()
     np.testing.assert_array_equal(masked.depth, np.where(mask > 0, whole.depth, 0))
     cv2.imwrite(str(tmp_path / f"{view.name}.png"), mask[:-1])
     with pytest.raises(InputError, match=rf"{view.name}.*{WIDTH} x {HEIGHT}"):
-        read_view_maps(workspace, view, 0, "geometric", tmp_path)
+        read_view_maps(sources_of(workspace, view, 0, tmp_path))
 
 
 @pytest.mark.parametrize("what", ["depth", "normals", "image"])
@@ -431,7 +437,7 @@ def test_what_cannot_be_fused_is_named(what, kind, tmp_path):
         shape = (HEIGHT, WIDTH + 1) if what == "depth" else (HEIGHT, WIDTH + 1, 3)
         write_maps(workspace, view.name, **{what: np.ones(shape)})
     with pytest.raises(InputError, match=view.name if kind == "other size" else str(path)):
-        read_view_maps(workspace, view, 1, "geometric", None)
+        read_view_maps(sources_of(workspace, view, 1, None))
 
 
 def test_unknown_method():

@@ -1,11 +1,13 @@
 """The cache that workers share: each value loaded once, no more kept than allowed."""
 
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
-from colmap_sph.pipeline.load_cache import LoadCache
+from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 
 
 class Loader:
@@ -19,43 +21,49 @@ class Loader:
         return key.encode() * self.size
 
 
+def cache_of(load: Callable[[str], bytes], capacity: int) -> Callable[[str], bytes]:
+    """A cache's `get` that loads by a function of the key."""
+    cache: LoadCache[bytes] = LoadCache(len, capacity)
+    return lambda key: cache.get(key, lambda: load(key))
+
+
 def test_a_kept_value_is_loaded_once() -> None:
     load = Loader()
-    cache = LoadCache(load, len, 100)
-    first = cache.get("a")
-    assert cache.get("a") is first
-    assert cache.get("b") == b"b" * 10
+    cache = cache_of(load, 100)
+    first = cache("a")
+    assert cache("a") is first
+    assert cache("b") == b"b" * 10
     assert load.loaded == ["a", "b"]
 
 
 def test_the_least_recently_used_goes_first() -> None:
     load = Loader()
-    cache = LoadCache(load, len, 30)
+    cache = cache_of(load, 30)
     for key in "abcadabc":
         # a b c; a again; d pushes out b; a; b pushes out c; c pushes out d
-        assert cache.get(key) == key.encode() * 10
+        assert cache(key) == key.encode() * 10
     assert load.loaded == [*"abcd", *"bc"]
 
 
 def test_capacity_counts_what_is_kept_alone() -> None:
     """After many evictions and returns as much fits as at the start."""
     load = Loader()
-    cache = LoadCache(load, len, 30)
+    cache = cache_of(load, 30)
     for _ in range(20):
         for key in "abcdefg":
-            cache.get(key)
+            cache(key)
     load.loaded.clear()
     for key in "efgefg":
-        cache.get(key)
+        cache(key)
     assert load.loaded == []
 
 
 def test_a_value_larger_than_the_capacity() -> None:
     load = Loader(1000)
-    cache = LoadCache(load, len, 30)
-    assert cache.get("a") is cache.get("a")
-    cache.get("b")
-    cache.get("a")
+    cache = cache_of(load, 30)
+    assert cache("a") is cache("a")
+    cache("b")
+    cache("a")
     assert load.loaded == ["a", "b", "a"]
 
 
@@ -68,10 +76,10 @@ def test_a_failure_is_not_kept() -> None:
             raise answer
         return answer
 
-    cache = LoadCache(load, len, 30)
+    cache = cache_of(load, 30)
     with pytest.raises(OSError, match="disk"):
-        cache.get("a")
-    assert cache.get("a") == b"value"
+        cache("a")
+    assert cache("a") == b"value"
 
 
 def test_threads_that_want_one_value_load_it_once() -> None:
@@ -82,11 +90,11 @@ def test_threads_that_want_one_value_load_it_once() -> None:
         loaded.append(key)
         return b"value"
 
-    cache = LoadCache(load, len, 100)
+    cache = cache_of(load, 100)
 
     def work(_: int) -> bytes:
         barrier.wait(5)
-        return cache.get("a")
+        return cache("a")
 
     with ThreadPoolExecutor(8) as pool:
         futures = [pool.submit(work, number) for number in range(8)]
@@ -103,14 +111,34 @@ def test_different_values_load_at_the_same_time() -> None:
         both.wait(5)  # breaks, and raises, unless both loads run at once
         return key.encode()
 
-    cache = LoadCache(load, len, 100)
+    cache = cache_of(load, 100)
     with ThreadPoolExecutor(2) as pool:
-        assert list(pool.map(cache.get, "ab")) == [b"a", b"b"]
+        assert list(pool.map(cache, "ab")) == [b"a", b"b"]
 
 
 def test_many_threads_in_a_small_cache() -> None:
     load = Loader()
-    cache = LoadCache(load, len, 25)
+    cache = cache_of(load, 25)
     keys = [chr(ord("a") + number % 7) for number in range(700)]
     with ThreadPoolExecutor(8) as pool:
-        assert list(pool.map(cache.get, keys)) == [key.encode() * 10 for key in keys]
+        assert list(pool.map(cache, keys)) == [key.encode() * 10 for key in keys]
+
+
+def test_nothing_is_kept_from_one_stage_to_the_next() -> None:
+    load = Loader()
+    cache: LoadCache[bytes] = LoadCache(len)
+    for _ in range(2):
+        with cache.holding(30):
+            for key in "abcabc":
+                cache.get(key, lambda key=key: load(key))
+    assert load.loaded == [*"abc", *"abc"]
+
+
+def test_a_file_made_anew_is_another(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    stamps = [file_stamp(path)]
+    for content in ("a", "ab"):
+        path.write_text(content)
+        stamps.append(file_stamp(path))
+    assert len(set(stamps)) == 3
+    assert file_stamp(path) == stamps[-1]

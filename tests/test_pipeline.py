@@ -17,14 +17,19 @@ from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import compare_depth_map
-from colmap_sph.pipeline.cloud_stage import fuse_views
+from colmap_sph.pipeline.confirm import ConfirmStage
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.fuse import fuse_stage
 from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.match import _MATCH_BYTES, MatchStage
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.reconstruct import find_database, workspace_root
-from colmap_sph.pipeline.stages import _MATCH_BYTES, check_views, estimate_views, match_pairs
+from colmap_sph.pipeline.stage import keys_of
+from colmap_sph.pipeline.vote import VoteStage
+from colmap_sph.project.database import find_database
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_patch_match_cfg
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
@@ -115,7 +120,7 @@ def test_the_report_is_right(block: DemoBlock, finished: FinishedRun) -> None:
     assert workspace.fused_path.with_name("fused.ply.vis").is_file()
     assert workspace.fusion_cfg_path.read_text().split() == sorted(block.names)
     assert report.advice == ""
-    stages = ["undistort", "select pairs", "match pairs", "estimate depth", "check consistency", "fuse"]
+    stages = ["undistort", "select pairs", "match pairs", "vote on depth", "confirm depth", "fuse"]
     assert list(report.seconds) == stages
     assert 50 << 20 < report.peak_memory < 8 << 30
     written = json.loads((workspace.state_dir / "report.json").read_text())
@@ -139,19 +144,24 @@ def test_results_do_not_depend_on_threads_or_kernels(project: Path, monkeypatch:
         assert result == first, which
 
 
+def prepared(project: Path, dense: Path) -> Workspace:
+    """The dense workspace of undistorted images."""
+    return prepare_workspace(Project(project / "sparse/0", output=dense), UndistortionOptions()).workspace
+
+
 def test_stages_one_by_one(project: Path) -> None:
     """The public stages give what `run` gives."""
     keep_images(project, NADIR)
     whole = colmap_sph.run(project / "sparse/0", output=project / "whole", options=FEW_PAIRS)
-    workspace = prepare_workspace(project / "sparse/0", None, project / "stages", UndistortionOptions())
+    workspace = prepared(project, project / "stages")
     scene = anchored(read_scene(workspace.sparse_dir))
     selection = select_pairs(scene, FEW_PAIRS.pairs)
     context = Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS))
-    pairs = match_pairs(context, selection.unique_pairs())
-    assert list(pairs) == selection.unique_pairs()
-    votes = estimate_views(context, pairs)
-    geometric = check_views(context, pairs, votes)
-    fuse_views(context, pairs, geometric)
+    pair_keys = keys_of(execute(MatchStage(context, selection.unique_pairs())))
+    assert list(pair_keys) == selection.unique_pairs()
+    vote_keys = keys_of(execute(VoteStage(context, pair_keys)))
+    maps = execute(ConfirmStage(context, pair_keys, vote_keys))
+    execute(fuse_stage(context, pair_keys, maps))
     report = context.report
     assert results(project / "stages") == results(project / "whole")
     assert report.coverage == whole.coverage
@@ -170,7 +180,7 @@ def test_progress_tells_every_step(project: Path) -> None:
     steps = Steps()
     colmap_sph.run(project / "sparse/0", options=FEW_PAIRS, progress=steps)
     assert all(total == done for _, total, done in steps)
-    assert {stage: total for stage, total, _ in steps}["estimate depth"] == len(NADIR)
+    assert {stage: total for stage, total, _ in steps}["vote on depth"] == len(NADIR)
 
 
 def test_a_run_can_be_repeated(project: Path) -> None:
@@ -203,7 +213,7 @@ def test_workspace_of_colmap(project: Path) -> None:
 
 def test_explicit_patch_match_cfg_is_obeyed(project: Path) -> None:
     dense = project / "dense"
-    workspace = prepare_workspace(project / "sparse/0", None, dense, UndistortionOptions())
+    workspace = prepared(project, dense)
     sources = {"N_0_1.jpg": ["N_0_0.jpg", "N_0_2.jpg"], "N_1_1.jpg": ["N_0_1.jpg"], "R_0.jpg": 1}
     write_patch_match_cfg(workspace.patch_match_cfg_path, sources)
     report = colmap_sph.run(workspace=dense, options=FEW_PAIRS)
@@ -319,7 +329,7 @@ def test_one_unreadable_image_is_skipped(project: Path, caplog: pytest.LogCaptur
 def test_one_unreadable_image_of_a_workspace_is_skipped(project: Path) -> None:
     keep_images(project, NADIR)
     dense = project / "dense"
-    prepare_workspace(project / "sparse/0", None, dense, UndistortionOptions())
+    prepared(project, dense)
     (dense / "images" / NADIR[3]).write_bytes(b"\xff\xd8 not an image")
     report = colmap_sph.run(workspace=dense, options=FEW_PAIRS)
     assert list(report.skipped_images) == [NADIR[3]]
@@ -374,7 +384,7 @@ def test_few_points_are_explained(project: Path) -> None:
 def test_a_map_that_cannot_be_written(project: Path) -> None:
     keep_images(project, NADIR)
     in_the_way = project / f"dense/stereo/normal_maps/{NADIR[1]}.photometric.bin"
-    prepare_workspace(project / "sparse/0", None, project / "dense", UndistortionOptions())
+    prepared(project, project / "dense")
     in_the_way.mkdir()
     with pytest.raises(OutputError, match=in_the_way.name):
         colmap_sph.run(project / "sparse/0", options=FEW_PAIRS)
@@ -406,14 +416,12 @@ def test_the_number_of_opencv_threads_is_restored(project: Path) -> None:
     ],
 )
 def test_default_output(tmp_path: Path, model: str, expected: str) -> None:
-    root = workspace_root(tmp_path / model, images=None, output=None, workspace=None)
-    assert root == tmp_path / expected
+    assert Project(tmp_path / model).root == tmp_path / expected
 
 
 def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:
-    given = dict.fromkeys(("model", "images", "output", "workspace"))
-    assert workspace_root(**(given | {"model": "sparse/0", "output": "x"})) == Path("x")
-    assert workspace_root(**(given | {"workspace": tmp_path})) == tmp_path
+    assert Project(Path("sparse/0"), output=Path("x")).root == Path("x")
+    assert Project(workspace=tmp_path).root == tmp_path
 
 
 @pytest.mark.parametrize(
@@ -427,7 +435,7 @@ def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:
         {"workspace": Path("dense"), "options": RunOptions(undistortion=UndistortionOptions(1000))},
         {"model": Path("sparse/0"), "options": RunOptions(threads=-1)},
         {"model": Path("sparse/0"), "options": RunOptions(threads=2000)},
-        {"model": Path("sparse/0"), "options": RunOptions(fusion_input="depth")},  # type: ignore[arg-type]
+        {"model": Path("sparse/0"), "options": RunOptions(fusion=FusionOptions(input="depth"))},  # type: ignore[arg-type]
         {"model": Path("sparse/0"), "options": RunOptions(pairs=PairOptions(num_pairs=0))},
         {"model": Path("sparse/0"), "options": RunOptions(fusion=FusionOptions(min_num_pixels=0))},
         {"model": Path("sparse/0"), "options": RunOptions(vote=VoteOptions(min_support=0))},

@@ -355,7 +355,7 @@ def test_a_run_refines_its_geometric_maps(block, finished, tmp_path):
     plain = tmp_path / "dense"
     shutil.copytree(finished.dense, plain)
     report = colmap_sph.run(workspace=plain, options=colmap_sph.RunOptions(refinement=RefinementOptions(rounds=0)))
-    assert report.made["match pairs"] == report.made["estimate depth"] == 0
+    assert report.made["match pairs"] == report.made["vote on depth"] == 0
     assert report.coverage == finished.report.coverage
 
     def errors(dense):

@@ -1,6 +1,7 @@
 """A second run redoes what is missing or would differ, nothing else; damage and failures cost what they hit."""
 
 import json
+import pkgutil
 import shutil
 import zipfile
 from collections.abc import Callable, Iterator
@@ -14,12 +15,12 @@ from conftest import SMALL_BLOCK, keep_images
 
 import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
-from colmap_sph.pipeline import stages
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.project.claim import claimed
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
@@ -37,7 +38,7 @@ from colmap_sph.synthetic import make_demo_block
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 WIDTH, HEIGHT = 160, 120
 OPTIONS = RunOptions(threads=2)
-NOTHING = {"match pairs": 0, "estimate depth": 0, "check consistency": 0, "fuse": 0}
+NOTHING = {"match pairs": 0, "vote on depth": 0, "confirm depth": 0, "fuse": 0}
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def counted(files: set[str]) -> dict[str, int]:
 
 def test_a_second_run_redoes_nothing(finished: Finished) -> None:
     first, before = finished.report, results(finished.dense)
-    assert first.made == {"match pairs": 6, "estimate depth": 4, "check consistency": 4, "fuse": 1}
+    assert first.made == {"match pairs": 6, "vote on depth": 4, "confirm depth": 4, "fuse": 1}
     assert first.reused == NOTHING
     second = finished.rerun()
     assert second.made == NOTHING
@@ -160,7 +161,7 @@ CHANGES = {
         expected_files(pairs=0, votes=0, photometric=0, geometric=0, cloud=True),
     ),
     "fusion input": (
-        {"fusion_input": "photometric"},
+        {"fusion": FusionOptions(input="photometric")},
         expected_files(pairs=0, votes=0, photometric=0, geometric=0, cloud=True),
     ),
 }
@@ -169,12 +170,12 @@ CHANGES = {
 @pytest.mark.parametrize("what", CHANGES)
 def test_changed_options_redo_what_depends_on_them(what: str, finished: Finished) -> None:
     changes, expected = CHANGES[what]
-    plan = make_plan(finished.project / "sparse/0", options=replace(OPTIONS, **changes))
+    plan = make_plan(Project(finished.project / "sparse/0"), replace(OPTIONS, **changes))
     before = results(finished.dense)
     report = finished.rerun(**changes)
     assert counted(rewritten(before, finished.dense)) == expected
     assert (plan.pairs - plan.pairs_done, plan.fuse) == (report.made["match pairs"], bool(report.made["fuse"]))
-    assert plan.images - plan.images_done == report.made["check consistency"]
+    assert plan.images - plan.images_done == report.made["confirm depth"]
     # And back: the same files again, made anew.
     finished.rerun()
     after = results(finished.dense)
@@ -189,7 +190,7 @@ def test_fewer_pairs_keep_their_disparity_maps(finished: Finished) -> None:
     assert len(left) < 6
     # An image that keeps its three partners keeps its votes.
     lost = [name for name in NAMES if sum(name in pair for pair in left) < 3]
-    assert report.made["estimate depth"] == len(lost) > 0
+    assert report.made["vote on depth"] == len(lost) > 0
     assert finished.rerun().made["match pairs"] == 0
 
 
@@ -216,7 +217,7 @@ def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> Non
 
     def rerun(*, given: bool = True) -> RunReport:
         cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
-        plan = make_plan(workspace=finished.dense, masks=masks if given else None, options=OPTIONS)
+        plan = make_plan(Project(workspace=finished.dense, masks=masks if given else None), OPTIONS)
         report = colmap_sph.run(workspace=finished.dense, masks=masks if given else None, options=OPTIONS)
         assert plan.pairs - plan.pairs_done == report.made["match pairs"]
         return report
@@ -224,7 +225,7 @@ def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> Non
     for columns in (50, 100):
         state = results(finished.dense)
         mask[:, :columns] = 0
-        assert rerun().made == {"match pairs": 3, "estimate depth": 4, "check consistency": 4, "fuse": 1}
+        assert rerun().made == {"match pairs": 3, "vote on depth": 4, "confirm depth": 4, "fuse": 1}
         assert all(number in name for name in rewritten(state, finished.dense) if "pairs/" in name)
         assert rerun().made == NOTHING
     assert rerun(given=False).made["match pairs"] == 3
@@ -285,12 +286,12 @@ def alter(path: Path) -> None:
 
 DAMAGED = {
     "disparity map": ("colmap_sph/pairs/*.npz", {"match pairs": 1}),
-    "estimate": ("colmap_sph/photometric/*.npz", {"estimate depth": 1}),
-    "photometric map": ("stereo/depth_maps/*.photometric.bin", {"estimate depth": 1}),
-    "geometric map": ("stereo/normal_maps/*.geometric.bin", {"check consistency": 1}),
+    "estimate": ("colmap_sph/photometric/*.npz", {"vote on depth": 1}),
+    "photometric map": ("stereo/depth_maps/*.photometric.bin", {"vote on depth": 1}),
+    "geometric map": ("stereo/normal_maps/*.geometric.bin", {"confirm depth": 1}),
     "cloud": ("fused.ply", {"fuse": 1}),
     "visibility": ("fused.ply.vis", {"fuse": 1}),
-    "record of maps": ("colmap_sph/state/*.geometric.json", {"check consistency": 1}),
+    "record of maps": ("colmap_sph/state/*.geometric.json", {"confirm depth": 1}),
     "record of the cloud": ("colmap_sph/cloud.json", {"fuse": 1}),
 }
 
@@ -352,21 +353,26 @@ def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Fin
 # ---- failures of single items ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stage", ["match_pair", "vote_depth", "confirm_depth", "fit_normals", "refine_maps"])
-def test_memory_refused_once(stage: str, finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    "what",
+    ["match.match_pair", "vote.vote_depth", "confirm.confirm_depth", "vote.fit_normals", "confirm.refine_maps"],
+)
+def test_memory_refused_once(what: str, finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     """One item fails, the rest goes on, and the next run completes the work."""
-    original, calls = getattr(stages, stage), []
+    place = f"colmap_sph.pipeline.{what}"
+    original = pkgutil.resolve_name(place)
+    calls = []
 
     def refused_first(*arguments: object) -> object:
-        calls.append(stage)
+        calls.append(what)
         if len(calls) == 1:
             np.empty(1 << 60, np.uint8)
         return original(*arguments)
 
-    monkeypatch.setattr(stages, stage, refused_first)
+    monkeypatch.setattr(place, refused_first)
     changes = {"matching": MatchingOptions(p1=12)}
     report = colmap_sph.run(finished.project / "sparse/0", options=replace(OPTIONS, threads=1, **changes))
-    failed = report.skipped_pairs if stage == "match_pair" else report.skipped_images
+    failed = report.skipped_pairs if what == "match.match_pair" else report.skipped_images
     assert len(failed) == 1
     assert "not enough memory" in next(iter(failed.values()))
     assert len(report.skipped_pairs) + len(report.skipped_images) == 1
@@ -374,14 +380,14 @@ def test_memory_refused_once(stage: str, finished: Finished, monkeypatch: pytest
     again = finished.rerun(**changes)
     assert again.images == 4
     assert again.skipped_pairs == again.skipped_images == {}
-    assert again.made["match pairs"] == (1 if stage == "match_pair" else 0)
+    assert again.made["match pairs"] == (1 if what == "match.match_pair" else 0)
 
 
 def test_memory_refused_for_all(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(stages, "vote_depth", refused)
+    monkeypatch.setattr("colmap_sph.pipeline.vote.vote_depth", refused)
     with pytest.raises(NoResultError, match="not enough memory"):
         finished.rerun(vote=VoteOptions(tolerance=2.5))
 
@@ -422,7 +428,7 @@ def test_overwrite_with_masks(finished: Finished) -> None:
     cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
     with pytest.raises(InputError, match=r"different masks; .*--overwrite"):
         colmap_sph.run(model, masks=masks, options=OPTIONS)
-    assert make_plan(model, masks=masks, options=OPTIONS, overwrite=True).undistort
+    assert make_plan(Project(model, masks=masks), OPTIONS, overwrite=True).undistort
     colmap_sph.run(model, masks=masks, options=OPTIONS, overwrite=True)
     assert [path.name for path in (finished.dense / "masks").iterdir()] == [f"{NAMES[0]}.png"]
     (finished.dense / "masks/mine.png").write_text("mine")
@@ -514,7 +520,7 @@ def test_plan_of_a_new_workspace(project: Path) -> None:
     """Before undistortion: from the model's cameras, and nothing is written."""
     keep_images(project, NAMES)
     before = sorted(project.rglob("*"))
-    plan = make_plan(project / "sparse/0", options=OPTIONS)
+    plan = make_plan(Project(project / "sparse/0"), OPTIONS)
     assert sorted(project.rglob("*")) == before
     assert plan.undistort and plan.fuse
     assert (plan.pairs_done, plan.images_done) == (0, 0)
@@ -528,10 +534,9 @@ def test_plan_of_a_new_workspace(project: Path) -> None:
 
 def test_plan_of_reduced_images(project: Path) -> None:
     keep_images(project, NAMES)
-    whole = make_plan(project / "sparse/0", options=OPTIONS)
-    half = make_plan(
-        project / "sparse/0", options=replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=160))
-    )
+    whole = make_plan(Project(project / "sparse/0"), OPTIONS)
+    reduced = replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=160))
+    half = make_plan(Project(project / "sparse/0"), reduced)
     assert half.disk == pytest.approx(whole.disk / 4, rel=0.15)
     assert half.pairs == whole.pairs
 
@@ -542,7 +547,7 @@ def test_plan_of_the_fusion(finished: Finished) -> None:
     def plan(**changes: object) -> Plan:
         options = {"min_num_pixels": 3, **changes}
         tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(**options))
-        return make_plan(workspace=finished.dense, options=tight)
+        return make_plan(Project(workspace=finished.dense), tight)
 
     ours, theirs = plan(), plan(method="colmap")
     assert ours.fuse and theirs.fuse
@@ -553,12 +558,12 @@ def test_plan_of_the_fusion(finished: Finished) -> None:
 def test_plan_of_a_finished_workspace(finished: Finished) -> None:
     before, state = results(finished.dense), sorted(finished.dense.rglob("*"))
     for arguments in ({"model": finished.project / "sparse/0"}, {"workspace": finished.dense}):
-        plan = make_plan(**arguments, options=OPTIONS)
+        plan = make_plan(Project(**arguments), OPTIONS)
         assert not plan.undistort and not plan.fuse
         assert plan.pairs == plan.pairs_done == 6
         assert plan.images == plan.images_done == 4
         assert plan.seconds == plan.disk == 0
-        fresh = make_plan(**arguments, options=OPTIONS, overwrite=True)
+        fresh = make_plan(Project(**arguments), OPTIONS, overwrite=True)
         assert fresh.undistort == ("model" in arguments)
         assert fresh.fuse and fresh.pairs_done == fresh.images_done == 0
         assert fresh.disk > 2e6

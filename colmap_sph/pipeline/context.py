@@ -2,44 +2,19 @@
 
 import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.maps import MapFiles
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.workers import for_all
 from colmap_sph.project.workspace import MapKind, Workspace
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Scene
 
 logger = logging.getLogger(__name__)
-
-T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Done:
-    """Outcome of one item of a stage.
-
-    Attributes
-    ----------
-    key : str
-        Key of its result.
-    made : bool
-        Whether this run worked it out; else an earlier run had.
-    coverage : float
-        Share of pixels with a depth, where the stage gives one.
-    points : int
-        Points of the cloud, where the stage gives them.
-    """
-
-    key: str
-    made: bool
-    coverage: float = 0.0
-    points: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,13 +53,13 @@ class Context:
         """Photometric depth of an image with its standard deviation and support."""
         return self.workspace.state_dir / "photometric" / f"{name}.npz"
 
-    def map_paths(self, name: str, kind: MapKind) -> list[Path]:
-        """Depth and normal map of an image."""
-        return [self.workspace.depth_map_path(name, kind), self.workspace.normal_map_path(name, kind)]
-
-    def maps_record(self, name: str, kind: MapKind) -> Path:
-        """Record that vouches for the maps of an image."""
-        return self.workspace.state_dir / "state" / f"{name}.{kind}.json"
+    def map_files(self, name: str, kind: MapKind) -> MapFiles:
+        """Depth and normal map of an image, and the record that vouches for them."""
+        return MapFiles(
+            self.workspace.depth_map_path(name, kind),
+            self.workspace.normal_map_path(name, kind),
+            self.workspace.state_dir / "state" / f"{name}.{kind}.json",
+        )
 
     @property
     def cloud_paths(self) -> list[Path]:
@@ -101,27 +76,10 @@ class Context:
         """Announce a stage of `total` steps, and report its wall time."""
         return timed_stage(name, total, self.progress, self.report)
 
-    def for_all(
-        self, stage: str, work: Callable[[T], Done], items: Sequence[T], skip: Callable[[T, str], None]
-    ) -> dict[T, Done]:
-        """`work` on all items of a stage in worker threads; see `workers.for_all`."""
-        with self.stage(stage, len(items)):
-            results = for_all(work, items, threads=self.options.num_threads, progress=self.progress, skip=skip)
-        self.count(stage, results.values())
-        return results
-
-    def skip_view(self, item: View | str, reason: str) -> None:
+    def skip_view(self, name: str, reason: str) -> None:
         """Report that a view could not be done."""
-        name = item if isinstance(item, str) else item.name
         self.report.skipped_images[name] = reason
         logger.warning("%s skipped: %s", name, reason)
-
-    def count(self, stage: str, results: Iterable[Done]) -> None:
-        """Report how many results of a stage are new, and how many an earlier run had made."""
-        made = [done.made for done in results]
-        self.report.made[stage], self.report.reused[stage] = sum(made), len(made) - sum(made)
-        if self.report.reused[stage]:
-            logger.info("%s: %d were up to date", stage.capitalize(), self.report.reused[stage])
 
 
 @contextmanager

@@ -15,6 +15,12 @@ from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
 from colmap_sph.stereo.rectified_pair import RectifiedPair
 
+# The modules whose code makes each kind of result.
+_MATCH = "colmap_sph.pipeline.match"
+_VOTE = "colmap_sph.pipeline.vote"
+_CONFIRM = "colmap_sph.pipeline.confirm"
+_FUSE = "colmap_sph.pipeline.fuse"
+
 
 class Keys:
     """Makes the keys of one run; may be used by several threads.
@@ -24,29 +30,36 @@ class Keys:
     workspace : Workspace
         Its images and their masks are read once each.
     options : RunOptions
+    foreseen : bool
+        The images are not there yet, so that no result is either: keys do without them.
     """
 
-    def __init__(self, workspace: Workspace, options: RunOptions) -> None:
-        self._workspace, self._options = workspace, options
-        self._program = program_digest("colmap_sph.pipeline.reconstruct")
-        self._images: LoadCache[str] = LoadCache(
-            lambda name: file_digest(workspace.image_path(name)), lambda _: 0, capacity=0
-        )
-        self._masks: LoadCache[str | None] = LoadCache(
-            lambda name: _digest_if_there(workspace.mask_path(name)), lambda _: 0, capacity=0
-        )
+    def __init__(self, workspace: Workspace, options: RunOptions, *, foreseen: bool = False) -> None:
+        self._workspace = workspace
+        self._options = options
+        self._foreseen = foreseen
+        self._images: LoadCache[str | None] = LoadCache(lambda _: 0)
+        self._masks: LoadCache[str | None] = LoadCache(lambda _: 0)
+
+    def _image(self, name: str) -> str | None:
+        path = self._workspace.image_path(name)
+        return self._images.get(name, lambda: None if self._foreseen else file_digest(path))
+
+    def _mask(self, name: str) -> str | None:
+        path = self._workspace.mask_path(name)
+        return self._masks.get(name, lambda: None if self._foreseen else _digest_if_there(path))
 
     def pair(self, left: View, right: View, geometry: RectifiedPair) -> str:
         """Of a disparity map. The sparse points and the options of rectification are in `geometry`."""
-        images = [self._images.get(view.name) for view in (left, right)]
-        masks = [self._masks.get(view.name) for view in (left, right)]
+        images = [self._image(view.name) for view in (left, right)]
+        masks = [self._mask(view.name) for view in (left, right)]
         cameras = [_camera(view) for view in (left, right)]
-        return digest("pair", self._program, images, masks, cameras, geometry, self._options.matching)
+        return digest("pair", program_digest(_MATCH), images, masks, cameras, geometry, self._options.matching)
 
     def vote(self, view: View, pair_keys: Sequence[str]) -> str:
         """Of a photometric estimate, from the keys of its pairs in the order in which they vote."""
-        mask, options = self._masks.get(view.name), self._options.vote
-        return digest("vote", self._program, _camera(view), mask, pair_keys, options)
+        mask = self._mask(view.name)
+        return digest("vote", program_digest(_VOTE), _camera(view), mask, pair_keys, self._options.vote)
 
     def photometric(self, vote: str) -> str:
         """Of the photometric maps of the view with this vote."""
@@ -56,7 +69,7 @@ class Keys:
         """Of the geometric maps of a view, from its own vote and those of its partners, in their order."""
         # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
         options = (self._options.confirm, self._options.normals, self._options.refinement)
-        return digest("geometric", vote, partner_votes, *options)
+        return digest("geometric", program_digest(_CONFIRM), vote, partner_votes, *options)
 
     def cloud(
         self, maps: Mapping[str, str], partners: Mapping[str, Sequence[str]], origin: NDArray[np.float64]
@@ -65,18 +78,18 @@ class Keys:
 
         The photometric maps need none of their own: the key of the geometric ones stands for them, too.
         """
-        options, folder = self._options, self._options.fusion.mask_path
+        folder = self._options.fusion.mask_path
         masks = [folder / f"{name}.png" for name in maps] if folder else []
         return digest(
             "cloud",
+            program_digest(_FUSE),
             maps,
-            [self._images.get(name) for name in maps],
+            [self._image(name) for name in maps],
             partners,
             origin,
-            [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
-            options.fusion,
+            [] if self._foreseen else [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
+            self._options.fusion,
             [_digest_if_there(path) for path in masks],
-            options.fusion_input,
         )
 
 

@@ -1,8 +1,10 @@
-"""A bounded cache of loaded arrays that worker threads share."""
+"""A bounded cache of loaded arrays that the worker threads of a process share."""
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -13,23 +15,31 @@ class LoadCache(Generic[T]):
 
     Parameters
     ----------
-    load : callable
-        Key → value; runs outside the lock, at most once at a time per key.
     size : callable
         Value → bytes.
     capacity : int
         Bytes to keep; a single larger value is kept while nothing newer comes.
     """
 
-    def __init__(self, load: Callable[[str], T], size: Callable[[T], int], capacity: int) -> None:
-        self._load, self._size, self._capacity = load, size, capacity
+    def __init__(self, size: Callable[[T], int], capacity: int = 0) -> None:
+        self._size = size
+        self._capacity = capacity
         self._values: OrderedDict[str, T] = OrderedDict()
         self._loading: dict[str, threading.Lock] = {}
         self._lock = threading.Lock()
         self._bytes = 0
 
-    def get(self, key: str) -> T:
-        """The value of `key`, loaded if need be."""
+    @contextmanager
+    def holding(self, capacity: int) -> Iterator[None]:
+        """Keep up to so many bytes for a while, and nothing afterwards."""
+        self._empty(capacity)
+        try:
+            yield
+        finally:
+            self._empty(0)
+
+    def get(self, key: str, load: Callable[[], T]) -> T:
+        """The value of `key`, loaded if need be: outside the lock, at most once at a time per key."""
         with self._lock:
             loading = self._loading.setdefault(key, threading.Lock())
         with loading:
@@ -37,7 +47,7 @@ class LoadCache(Generic[T]):
                 if key in self._values:
                     self._values.move_to_end(key)
                     return self._values[key]
-            value = self._load(key)
+            value = load()
             with self._lock:
                 self._values[key] = value
                 self._bytes += self._size(value)
@@ -45,3 +55,16 @@ class LoadCache(Generic[T]):
                     _, oldest = self._values.popitem(last=False)
                     self._bytes -= self._size(oldest)
             return value
+
+    def _empty(self, capacity: int) -> None:
+        with self._lock:
+            self._capacity = capacity
+            self._values.clear()
+            self._loading.clear()
+            self._bytes = 0
+
+
+def file_stamp(path: Path) -> str:
+    """A file's key in a cache: its path, size and time, so that a file made anew is loaded anew."""
+    status = path.stat() if path.exists() else None
+    return f"{path} {status and (status.st_size, status.st_mtime_ns)}"

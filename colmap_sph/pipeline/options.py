@@ -1,12 +1,11 @@
 """Options of all stages in one record: what the command line, the Python API and the pipeline share."""
 
 import os
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.project.undistortion import UndistortionOptions
-from colmap_sph.project.workspace import MapKind
 from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.kernels import backend
@@ -26,8 +25,6 @@ class RunOptions:
     """Worker threads; 0: as many as the process may use cores."""
     memory: str = ""
     """Memory the run may use, such as "6GiB"; empty: a safe share of what is free."""
-    fusion_input: MapKind = "geometric"
-    """Maps to fuse: "geometric" (confirmed by other views) or "photometric"."""
     undistortion: UndistortionOptions = field(default_factory=UndistortionOptions)
     pairs: PairOptions = field(default_factory=PairOptions)
     rectification: RectificationOptions = field(default_factory=RectificationOptions)
@@ -39,27 +36,18 @@ class RunOptions:
     fusion: FusionOptions = field(default_factory=FusionOptions)
 
     def check(self) -> None:
-        """Raise `OptionError` for a value out of bounds, in any stage."""
+        """Raise `OptionError` for a value out of bounds, in any stage; it names an option as "pairs.num_pairs"."""
         if not 0 <= self.threads <= 1024:
-            raise OptionError(f"threads must lie in 0..1024, not {self.threads}.")
+            raise OptionError(f"threads must lie in 0..1024, not {self.threads}.", "threads")
         parse_memory(self.memory)
-        if self.fusion_input not in ("geometric", "photometric"):
-            raise OptionError(f"fusion_input must be 'geometric' or 'photometric', not {self.fusion_input!r}.")
-        for stage in (
-            self.undistortion,
-            self.pairs,
-            self.rectification,
-            self.matching,
-            self.vote,
-            self.confirm,
-            self.normals,
-            self.refinement,
-            self.fusion,
-        ):
-            stage.check()
+        for stage in (each.name for each in fields(self) if is_dataclass(getattr(self, each.name))):
+            try:
+                getattr(self, stage).check()
+            except OptionError as error:
+                raise error.spelled(f"{stage}.{{}}".format) from None
         folder = self.fusion.mask_path
         if folder is not None and not folder.is_dir():
-            raise OptionError(f"the fusion mask folder {folder} does not exist.")
+            raise OptionError(f"the folder of fusion.mask_path, {folder}, does not exist.", "fusion.mask_path")
         backend()  # what COLMAP_SPH_KERNELS asks for must be there, too
 
     @property

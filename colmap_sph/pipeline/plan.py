@@ -1,56 +1,41 @@
 """What a run would do and need, found without writing anything: ``colmap_sph run --dry-run``.
 
-Which pairs and images are to do is exact, but for pairs that fail while they are matched. Time, memory and disk
-are estimates, from pixel counts times the constants below.
+The same stages are asked that a run executes. Which pairs and images are to do is exact, but for pairs that fail
+while they are matched. Time, memory and disk are sums of what the jobs say that they cost; the constants stand in
+the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
 """
 
 import logging
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Hashable
+from dataclasses import dataclass, field
+from heapq import nlargest
+from typing import TypeVar
 
 from colmap_sph.errors import ColmapSphError
-from colmap_sph.pipeline.cloud_stage import COLMAP_FUSION_BYTES, FUSE_BYTES, MAPS_BYTES, cloud_state
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.reconstruct import check_arguments, choose_pairs, matches_for, wanted_scene
-from colmap_sph.pipeline.stages import PairState, check_state, pair_state, vote_state
-from colmap_sph.project.database import find_database
+from colmap_sph.pipeline.reconstruct import check_input, choose_pairs, go_through_stages, wanted_scene
+from colmap_sph.pipeline.stage import Cost, Facts, Kept, Result, Stage
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import foresee_workspace, leave_out_bad_images, open_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
-from colmap_sph.stereo.fusion import MAX_PARTNERS
-from colmap_sph.stereo.pairs import Pair, overlapping_views, partners_of, select_pairs
-from colmap_sph.stereo.rectification import rectify_pair
 
 logger = logging.getLogger(__name__)
 
-# Processor seconds per megapixel: measured on one core of a 2.5 GHz server with two scenes of 10 and 11 images of
-# 0.1 to 0.4 megapixels, between which they differed by up to a third.
-_UNDISTORT_SECONDS = 0.12  # of the original image
-_MATCH_SECONDS = 0.14  # of both rectified images
-_VOTE_SECONDS = 0.07  # of the image, per pair
-_CHECK_SECONDS = 0.05  # of the image, per partner
-_NORMALS_SECONDS = 0.25  # of the image, for each of its two kinds of maps
-_REFINE_SECONDS = 0.13  # of the image, per partner in each round
-_COLMAP_FUSE_SECONDS = 0.9
-# With 33 images of 1.1 megapixels, each of which 32 others overlap.
-_FUSE_SECONDS, _FUSE_PARTNER_SECONDS = 0.05, 0.011  # of the image, and per overlapping image
-# Bytes per pixel on disk, measured at the same time.
+Item = TypeVar("Item", bound=Hashable)
+Task = TypeVar("Task")
+
+# Processor seconds and bytes per megapixel and pixel of the original images, while these are undistorted.
+_UNDISTORT_SECONDS = 0.12
 _UNDISTORTED_BYTES = 1.0
-_PAIR_BYTES = 2.0  # of the left rectified image
-_ESTIMATE_BYTES = 9.0
-_MAP_BYTES = 16.0  # depth and normals of one kind
-_CLOUD_BYTES = 12.0
-# Bytes in memory: of the libraries, per left rectified pixel and worker, and in COLMAP's fusion, for a moment,
-# per width times squared height of one image.
+# Bytes that the interpreter and the libraries have in use.
 _BASE_MEMORY = 200e6
-_MATCH_MEMORY = 170.0
-_FUSION_MASK_MEMORY = 0.1
 
 
 @dataclass(frozen=True)
@@ -66,7 +51,7 @@ class Plan:
     pairs, pairs_done : int
         Pairs of images, and those whose disparity map is there.
     images, images_done : int
-        Images, and those whose maps are there.
+        Images, and those whose geometric maps are there.
     fuse : bool
         Whether the cloud is to be made.
     seconds : float
@@ -90,172 +75,123 @@ class Plan:
     free_disk: int
 
 
-def make_plan(
-    model: Path | str | None = None,
-    *,
-    images: Path | str | None = None,
-    masks: Path | str | None = None,
-    output: Path | str | None = None,
-    workspace: Path | str | None = None,
-    options: RunOptions | None = None,
-    overwrite: bool = False,
-) -> Plan:
-    """Find what `pipeline.run` with these arguments would do; raises what it would raise before its first stage.
+def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False) -> Plan:
+    """Find what `reconstruct.run_project` would do; raises what it would raise before its first stage.
 
     Parameters
     ----------
-    model, images, masks, output, workspace, options, overwrite
-        As for `pipeline.run`.
+    project : Project
+    options : RunOptions
+    overwrite : bool
+        Everything would be done again.
 
     Returns
     -------
     Plan
     """
-    options = options or RunOptions()
-    root = check_arguments(model, images=images, output=output, workspace=workspace, options=options)
-    mask_dir, database, foreseen = None if masks is None else Path(masks), None, None
-    if model is None:
-        dense = open_workspace(root, mask_dir)
-    else:
-        dense, database = Workspace(root), find_database(Path(model))
-        image_dir = None if images is None else Path(images)
-        foreseen = foresee_workspace(
-            Path(model), image_dir, root, options.undistortion, mask_dir, overwrite=overwrite
-        )
+    check_input(project, options)
+    foreseen = None
+    dense = open_workspace(project.root, project.masks) if project.model is None else Workspace(project.root)
+    if project.model is not None:
+        foreseen = foresee_workspace(project, options.undistortion, overwrite=overwrite)
     if foreseen is None:
         scene = leave_out_bad_images(anchored(read_scene(dense.sparse_dir)), dense)
-        selection = choose_pairs(dense, scene, options, database)
     else:
         scene = anchored(foreseen.scene)
-        selection = select_pairs(scene, options.pairs, matches=matches_for(scene, database))
-    context = Context(dense, wanted_scene(scene, selection), options, Keys(dense, options))
-    fresh = overwrite or foreseen is not None
-    survey = _survey(context, selection.unique_pairs(), fresh=fresh)
-    pixels = sum(view.width * view.height for view in context.scene.views)
+    selection = choose_pairs(dense if foreseen is None else None, scene, options, project.database())
+    keys = Keys(dense, options, foreseen=foreseen is not None)
+    context = Context(dense, wanted_scene(scene, selection), options, keys)
+    survey = Survey(fresh=overwrite or foreseen is not None)
+    go_through_stages(context, selection.unique_pairs(), survey)
     if foreseen is not None:
         survey.seconds += _UNDISTORT_SECONDS * foreseen.original_pixels / 1e6
-        survey.disk += _UNDISTORTED_BYTES * pixels
-    if survey.fuse:
-        survey.seconds += _fuse_seconds(context)
-        survey.disk += _CLOUD_BYTES * pixels
+        survey.disk += _UNDISTORTED_BYTES * sum(view.width * view.height for view in context.scene.views)
+    pairs, _, images, cloud = survey.stages
     return Plan(
         undistort=foreseen is not None,
         pair_source=selection.source,
-        pairs=survey.pairs,
-        pairs_done=survey.pairs_done,
-        images=len(context.scene.views),
-        images_done=survey.images_done,
-        fuse=survey.fuse,
+        pairs=pairs.total,
+        pairs_done=pairs.done,
+        images=images.total,
+        images_done=images.done,
+        fuse=cloud.done < cloud.total,
         seconds=survey.seconds / min(options.num_threads, len(os.sched_getaffinity(0))),
-        memory=_memory(context, survey),
+        memory=_BASE_MEMORY + survey.memory,
         disk=survey.disk,
-        free_disk=shutil.disk_usage(next(path for path in (root, *root.absolute().parents) if path.exists())).free,
+        free_disk=_free_disk(project),
     )
+
+
+def _free_disk(project: Project) -> int:
+    root = project.root
+    return shutil.disk_usage(next(path for path in (root, *root.absolute().parents) if path.exists())).free
+
+
+@dataclass(frozen=True)
+class _Counts:
+    """Items of a stage, and those whose results are there."""
+
+    total: int
+    done: int
 
 
 @dataclass
-class _Survey:
-    """What is done and to do; processor seconds, and bytes on disk, of what is to do."""
+class Survey:
+    """An executor that asks every stage for what is to do, and does nothing.
 
-    pairs: int = 0
-    pairs_done: int = 0
-    images_done: int = 0
-    fuse: bool = True
+    Parameters
+    ----------
+    fresh : bool
+        Whatever is there will be done again.
+
+    Attributes
+    ----------
+    stages : list
+        What is there, by stage.
+    seconds, disk : float
+        Processor seconds, and bytes on disk, of what is to do.
+    memory : float
+        Most bytes of arrays at a time, in the stage that needs most.
+    """
+
+    fresh: bool
+    stages: list[_Counts] = field(default_factory=list)
     seconds: float = 0.0
     disk: float = 0.0
-    largest_pair: int = 0
+    memory: float = 0.0
 
-
-def _survey(context: Context, pairs: Sequence[Pair], *, fresh: bool) -> _Survey:
-    """Ask for every result whether it is there; `fresh`: nothing is, nor are the images."""
-    survey = _Survey()
-    keys = _survey_pairs(context, pairs, survey, fresh=fresh)
-    votes = _survey_votes(context, keys, survey)
-    maps, coverage = {}, {}
-    partners = partners_of(keys)
-    for view in context.scene.views:
-        names = partners.get(view.name, [])
-        state = check_state(context, names, votes, view)
-        maps[view.name], megapixels = state.key, view.width * view.height / 1e6
-        if state.coverage is None:
-            refined = context.options.refinement.images_used(len(names))
-            seconds = _CHECK_SECONDS * len(names) + _REFINE_SECONDS * refined + _NORMALS_SECONDS
-            survey.seconds += seconds * megapixels
-            survey.disk += _MAP_BYTES * megapixels * 1e6
-        else:
-            coverage[view.name] = state.coverage
-    survey.images_done = len(coverage)
-    if len(coverage) == len(maps):
-        survey.fuse = cloud_state(context, keys, maps, coverage).facts is None
-    return survey
-
-
-def _survey_pairs(context: Context, pairs: Sequence[Pair], survey: _Survey, *, fresh: bool) -> dict[Pair, str]:
-    """Keys of the pairs that can be rectified."""
-    keys: dict[Pair, str] = {}
-    for pair in pairs:
-        left, right = (context.scene.view(name) for name in pair)
-        try:
-            if fresh:  # a key would need the images
-                state = PairState(
-                    rectify_pair(context.scene, left, right, context.options.rectification), "", False
-                )
+    def __call__(self, stage: Stage[Item, Task], /) -> dict[Item, Result]:
+        """Foresee the result of each item; all images that are to do are taken to get some depth."""
+        results: dict[Item, Result] = {}
+        costs: list[Cost] = []
+        for item in stage.items:
+            try:
+                job = stage.job(item)
+            except ColmapSphError as error:
+                logger.info("%s: %s", stage.label(item), error)
+                continue
+            if job.done is not None and not self.fresh:
+                results[item] = Result(job.key, made=False, facts=job.done)
             else:
-                state = pair_state(context, pair)
-        except ColmapSphError as error:
-            logger.info("%s - %s: %s", *pair, error)
-            continue
-        keys[pair], geometry = state.key, state.geometry
-        if state.is_done:
-            survey.pairs_done += 1
-            continue
-        left_pixels = geometry.height * geometry.left_width
-        survey.seconds += _MATCH_SECONDS * (left_pixels + geometry.height * geometry.right_width) / 1e6
-        survey.disk += _PAIR_BYTES * left_pixels
-        survey.largest_pair = max(survey.largest_pair, left_pixels)
-    survey.pairs = len(keys)
-    return keys
+                results[item] = Result(job.key, made=True, facts=Facts(coverage=1.0))
+                costs.append(job.cost)
+        made, there = stage.count(results)
+        self.stages.append(_Counts(made + there, there))
+        self.seconds += sum(cost.seconds for cost in costs)
+        self.disk += sum(cost.disk for cost in costs)
+        self.memory = max(self.memory, _memory_of(stage, costs))
+        return results
 
 
-def _survey_votes(context: Context, keys: Mapping[Pair, str], survey: _Survey) -> dict[str, str]:
-    votes = {}
-    for view in context.scene.views:
-        state = vote_state(context, keys, view)
-        votes[view.name], megapixels = state.key, view.width * view.height / 1e6
-        if not state.is_voted:
-            num_pairs = sum(view.name in pair for pair in keys)
-            survey.seconds += _VOTE_SECONDS * num_pairs * megapixels
-            survey.disk += _ESTIMATE_BYTES * megapixels * 1e6
-        if not state.is_done:
-            survey.seconds += _NORMALS_SECONDS * megapixels
-            survey.disk += _MAP_BYTES * megapixels * 1e6
-    return votes
-
-
-def _fuse_seconds(context: Context) -> float:
-    scene, options = context.scene, context.options.fusion
-    if options.method == "colmap":
-        return _COLMAP_FUSE_SECONDS * sum(view.width * view.height for view in scene.views) / 1e6
-    overlapping = overlapping_views(scene, min(options.check_num_images, MAX_PARTNERS))
-    return sum(
-        (_FUSE_SECONDS + _FUSE_PARTNER_SECONDS * len(overlapping[view.name])) * view.width * view.height / 1e6
-        for view in scene.views
-    )
-
-
-def _memory(context: Context, survey: _Survey) -> float:
-    threads, views = context.options.num_threads, context.scene.views
-    most, options = context.options.memory_budget, context.options.fusion
-    pixels = [view.width * view.height for view in views]
-    matching = _MATCH_MEMORY * survey.largest_pair * min(threads, max(survey.pairs, 1))
-    fusion = FUSE_BYTES * max(pixels) * min(threads, len(pixels)) + MAPS_BYTES * sum(pixels)
-    if not survey.fuse:
-        fusion = 0
-    elif options.method == "colmap":
-        fusion = COLMAP_FUSION_BYTES * sum(pixels)
-        if options.use_cache:
-            fusion = min(fusion, options.cache_size * 1e9)
-        fusion += _FUSION_MASK_MEMORY * max(view.width * view.height**2 for view in views)
-        # The budget bounds all but COLMAP's fusion.
-        most = max(most, int(_BASE_MEMORY + fusion))
-    return min(_BASE_MEMORY + max(matching, fusion), most)
+def _memory_of(stage: Stage[Item, Task], costs: list[Cost]) -> float:
+    """Bytes of arrays at a time while a stage works: of as many of the costliest jobs as work side by side."""
+    if not costs:
+        return 0.0
+    threads = stage.context.options.num_threads
+    working = sum(nlargest(threads, (cost.memory for cost in costs)))
+    if stage.whole:
+        return working
+    budget = stage.context.options.memory_budget
+    kept: Kept = stage.kept_memory(MemoryGate(budget))
+    held = min(threads, len(costs)) * kept.scratch + min(kept.caches * kept.cache, kept.filled)
+    return min(working + held, budget)

@@ -1,4 +1,4 @@
-"""The whole main job: order of the stages, and the report.
+"""The whole main job: what a run works on, its stages in their order, and the report.
 
 Stages talk through files in the workspace: disparity maps of pairs, photometric maps with their standard
 deviations, geometric maps, the cloud. What an earlier run finished with the same input is used as it is.
@@ -8,24 +8,29 @@ import itertools
 import json
 import resource
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any, Protocol
 
 from colmap_sph.errors import NoResultError, OptionError
-from colmap_sph.pipeline.cloud_stage import fuse_views
+from colmap_sph.pipeline.confirm import ConfirmStage
 from colmap_sph.pipeline.context import Context, timed_stage
+from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.fuse import fuse_stage
 from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.match import MatchStage
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.stages import check_views, estimate_views, match_pairs
+from colmap_sph.pipeline.stage import Result, Stage, keys_of
+from colmap_sph.pipeline.vote import VoteStage
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import claimed
-from colmap_sph.project.database import find_database, read_verified_matches
+from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.sparse_model import image_names, load_model, model_files
 from colmap_sph.project.staging import discard_results
 from colmap_sph.project.undistortion import (
     UndistortionOptions,
@@ -34,8 +39,9 @@ from colmap_sph.project.undistortion import (
     prepare_workspace,
 )
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import Scene, SourceImages
+from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.pairing import Pair
 from colmap_sph.stereo.pairs import PairSelection, select_pairs
 
 
@@ -56,17 +62,8 @@ def run(
 
     Parameters
     ----------
-    model : Path, optional
-        COLMAP sparse model; its images are undistorted into `output`.
-    images : Path, optional
-        Original images; found by COLMAP's usual layouts if not given.
-    masks : Path, optional
-        Folder of masks ``NAME.png``, black where image NAME is to be ignored: of the original images, or with
-        `workspace` of the undistorted ones.
-    output : Path, optional
-        Dense workspace to create; "dense" beside the model's project if not given.
-    workspace : Path, optional
-        An existing dense workspace, instead of `model`, `images` and `output`.
+    model, images, masks, output, workspace : Path, optional
+        What to work on, see `Project`.
     options : RunOptions, optional
     progress : Progress, optional
     overwrite : bool
@@ -81,67 +78,57 @@ def run(
     ------
     ColmapSphError
         Bad input or options, unwritable output, or nothing to reconstruct.
+
+    Examples
+    --------
+    >>> report = run("sparse/0", options=RunOptions(memory="6GiB"))  # doctest: +SKIP
+    >>> print(report.points, report.coverage)  # doctest: +SKIP
     """
-    options, report = options or RunOptions(), RunReport()
+    paths = (None if path is None else Path(path) for path in (model, images, masks, output, workspace))
+    return run_project(Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite)
+
+
+def run_project(
+    project: Project, options: RunOptions, *, progress: Progress | None = None, overwrite: bool = False
+) -> RunReport:
+    """Do what `run` does, for what is in one record.
+
+    Parameters
+    ----------
+    project : Project
+    options : RunOptions
+    progress, overwrite
+        See `run`.
+    """
+    check_input(project, options)
     progress = Silent() if progress is None else progress
-    root = check_arguments(model, images=images, output=output, workspace=workspace, options=options)
-    masks = None if masks is None else Path(masks)
-    if model is None:
-        dense = open_workspace(root, masks)
+    report = RunReport()
+    if project.model is None:
+        dense = open_workspace(project.root, project.masks)
         with claimed(dense):
             if overwrite:
                 discard_results(dense)
             return reconstruct(dense, options, progress=progress, report=report)
-    model, images = Path(model), None if images is None else Path(images)
-    with claimed(Workspace(root)):
+    with claimed(Workspace(project.root)):
         with timed_stage("undistort", 1, progress, report):
-            dense = prepare_workspace(model, images, root, options.undistortion, masks, overwrite=overwrite)
+            prepared = prepare_workspace(project, options.undistortion, overwrite=overwrite)
             progress.advance()
-        database, names = find_database(model), image_names(load_model(model))
-        return reconstruct(dense, options, progress=progress, report=report, database=database, expected=names)
+        return reconstruct(
+            prepared.workspace,
+            options,
+            progress=progress,
+            report=report,
+            database=project.database(),
+            expected=prepared.expected,
+        )
 
 
-def check_arguments(
-    model: Path | str | None,
-    *,
-    images: Path | str | None,
-    output: Path | str | None,
-    workspace: Path | str | None,
-    options: RunOptions,
-) -> Path:
-    """Return the workspace's folder, see `workspace_root`; raise for what is wrong before anything is touched."""
+def check_input(project: Project, options: RunOptions) -> None:
+    """Raise `ColmapSphError` for what is wrong before anything is touched."""
     options.check()
-    root = workspace_root(model, images=images, output=output, workspace=workspace)
-    if model is not None:
-        model_files(Path(model))
-    elif options.undistortion != UndistortionOptions():
+    project.check()
+    if project.model is None and options.undistortion != UndistortionOptions():
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
-    return root
-
-
-def workspace_root(
-    model: Path | str | None,
-    *,
-    images: Path | str | None,
-    output: Path | str | None,
-    workspace: Path | str | None,
-) -> Path:
-    """Folder of the dense workspace that `run` with these arguments works in; `OptionError` for contradictions."""
-    if (model is None) == (workspace is None):
-        raise OptionError("give either --model (a sparse model) or --workspace (a dense workspace), not both.")
-    if workspace is not None:
-        if output is not None or images is not None:
-            raise OptionError("--workspace is complete in itself; leave out --images and --output.")
-        return Path(workspace)
-    assert model is not None
-    if output is not None:
-        return Path(output)
-    project = Path(model).resolve()
-    if project.name.isdigit():  # sparse/0, but not a project that is called 2024
-        project = project.parent
-    if project.name == "sparse":
-        project = project.parent
-    return project / "dense"
 
 
 def reconstruct(
@@ -153,11 +140,26 @@ def reconstruct(
     database: Path | None = None,
     expected: Iterable[str] = (),
 ) -> RunReport:
-    """Match, fuse and check everything in a dense workspace; see `run`.
+    """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
-    Images whose names are `expected` and which the workspace does not have are reported as skipped.
+    Parameters
+    ----------
+    workspace : Workspace
+    options : RunOptions
+    progress : Progress, optional
+    report : RunReport, optional
+        What is known of the run so far.
+    database : Path, optional
+        COLMAP's database, whose verified matches serve where the model has no tracks.
+    expected : iterable of str
+        Names of images that are reported as skipped where the workspace does not have them.
+
+    Returns
+    -------
+    RunReport
     """
-    progress, report = Silent() if progress is None else progress, report or RunReport()
+    progress = Silent() if progress is None else progress
+    report = report or RunReport()
     make_dir(workspace.state_dir)
     with one_opencv_thread():
         whole = anchored(read_scene(workspace.sparse_dir))
@@ -171,26 +173,50 @@ def reconstruct(
             progress.advance()
         scene = wanted_scene(scene, selection)
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
-        pairs = match_pairs(context, selection.unique_pairs())
-        votes = estimate_views(context, pairs)
-        maps = check_views(context, pairs, votes)
-        fuse_views(context, pairs, maps)
+        go_through_stages(context, selection.unique_pairs(), execute)
     _write_report(context)
     if not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
 
 
-def choose_pairs(workspace: Workspace, scene: Scene, options: RunOptions, database: Path | None) -> PairSelection:
-    """Select the pairs of a scene, as the user's ``patch-match.cfg`` says where there is one."""
-    path = workspace.patch_match_cfg_path
-    written: dict[str, SourceImages] | None = read_patch_match_cfg(path) if path.exists() else None
-    return select_pairs(scene, options.pairs, explicit=written, matches=matches_for(scene, database))
+class Executor(Protocol):
+    """What is done with each stage: all of its jobs, or a plan of them."""
+
+    def __call__(self, stage: Stage[Any, Any], /) -> dict[Any, Result]:
+        """Return the result of each item; those that fail are left out."""
 
 
-def matches_for(scene: Scene, database: Path | None) -> dict[tuple[str, str], int] | None:
-    """The verified matches that stand in for a scene's tracks where it has none."""
-    return None if database is None or scene.has_tracks else read_verified_matches(database)
+def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executor) -> None:
+    """The stages in their order: each begins where all results of the one before are known."""
+    pair_keys = keys_of(executor(MatchStage(context, pairs)))
+    vote_keys = keys_of(executor(VoteStage(context, pair_keys)))
+    maps = executor(ConfirmStage(context, pair_keys, vote_keys))
+    executor(fuse_stage(context, pair_keys, maps))
+
+
+def choose_pairs(
+    workspace: Workspace | None, scene: Scene, options: RunOptions, database: Path | None
+) -> PairSelection:
+    """Select the pairs of a scene, as the user's ``patch-match.cfg`` says where there is one.
+
+    Parameters
+    ----------
+    workspace : Workspace or None
+        None: it is not there yet, and so no such file.
+    scene : Scene
+    options : RunOptions
+    database : Path, optional
+        See `reconstruct`.
+
+    Returns
+    -------
+    PairSelection
+    """
+    path = None if workspace is None else workspace.patch_match_cfg_path
+    written = read_patch_match_cfg(path) if path is not None and path.exists() else None
+    matches = None if database is None or scene.has_tracks else read_verified_matches(database)
+    return select_pairs(scene, options.pairs, explicit=written, matches=matches)
 
 
 def wanted_scene(scene: Scene, selection: PairSelection) -> Scene:

@@ -1,5 +1,6 @@
 """What is fused of a view, read from its workspace."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -8,38 +9,52 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.images import read_undistorted
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_mask
-from colmap_sph.project.workspace import MapKind, Workspace, mask_path
 from colmap_sph.scene import View
 from colmap_sph.stereo.fusion import ViewMaps
 
 
-def read_view_maps(workspace: Workspace, view: View, index: int, kind: MapKind, masks: Path | None) -> ViewMaps:
-    """Read what is fused of a view; see `ViewMaps`.
+@dataclass(frozen=True, eq=False)
+class MapSources:
+    """Where what is fused of a view lies.
 
-    Parameters
+    Attributes
     ----------
-    workspace : Workspace
     view : View
     index : int
-    kind : {"geometric", "photometric"}
-    masks : Path, optional
-        Folder of ``NAME.png`` masks of the undistorted images, black = excluded.
+        Its place among the images of the model: what ``fused.ply.vis`` calls it by.
+    depth, normals, image : Path
+        Its maps, and its undistorted image for the colours.
+    mask : Path or None
+        Where its mask would be, black = excluded.
+    """
+
+    view: View
+    index: int
+    depth: Path
+    normals: Path
+    image: Path
+    mask: Path | None
+
+
+def read_view_maps(sources: MapSources) -> ViewMaps:
+    """Read what is fused of a view.
 
     Raises
     ------
     InputError
         A map, the image or the mask is missing, damaged or not of the camera's size.
     """
-    depth = read_depth_map(workspace.depth_map_path(view.name, kind))
-    normals = read_normal_planes(workspace.normal_map_path(view.name, kind))
-    image = read_undistorted(workspace.image_path(view.name), cv2.IMREAD_COLOR)
+    view = sources.view
+    depth = read_depth_map(sources.depth)
+    normals = read_normal_planes(sources.normals)
+    image = read_undistorted(sources.image, cv2.IMREAD_COLOR)
     shape = (view.height, view.width)
     if depth.shape != shape or normals.shape[1:] != shape or image.shape[:2] != shape:
         raise InputError(
             f"The maps or the image of {view.name} are not of its camera's {shape[1]} x {shape[0]} pixels; "
             "delete the maps and compute them again."
         )
-    mask = None if masks is None else read_mask(mask_path(masks, view.name), view.width, view.height)
+    mask = None if sources.mask is None else read_mask(sources.mask, view.width, view.height)
     if mask is not None:
         depth[mask == 0] = 0
-    return ViewMaps(view, index, depth, normals, image)
+    return ViewMaps(view, sources.index, depth, normals, image)

@@ -20,8 +20,16 @@ from colmap_sph.project.image_check import image_problem
 from colmap_sph.project.masks import check_masks, undistort_mask
 from colmap_sph.project.originals import Originals, read_originals
 from colmap_sph.project.pair_lists import write_fusion_cfg, write_patch_match_cfg
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import scene_of_model
-from colmap_sph.project.sparse_model import cameras_of_images, is_pinhole, load_model, make_pinhole, model_files
+from colmap_sph.project.sparse_model import (
+    cameras_of_images,
+    image_names,
+    is_pinhole,
+    load_model,
+    make_pinhole,
+    model_files,
+)
 from colmap_sph.project.staging import (
     check_discardable,
     discard_workspace,
@@ -56,15 +64,7 @@ class UndistortionOptions:
             )
 
 
-def prepare_workspace(
-    model_dir: Path,
-    image_dir: Path | None,
-    output: Path,
-    options: UndistortionOptions,
-    masks: Path | None = None,
-    *,
-    overwrite: bool = False,
-) -> Workspace:
+def prepare_workspace(project: Project, options: UndistortionOptions, *, overwrite: bool = False) -> "Prepared":
     """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
 
     Everything is made inside ``output/colmap_sph`` and moved to its place when complete, so that an
@@ -99,11 +99,14 @@ def prepare_workspace(
         `output` cannot be written.
     """
     options.check()
-    originals = read_originals(model_dir, image_dir, masks)
+    assert project.model is not None
+    output = project.root
+    originals = read_originals(project.model, project.images, project.masks)
+    expected = tuple(image_names(originals.model))
     marker, workspace = _marker(originals, options), Workspace(output)
     scratch = workspace.state_dir / "undistorting"
     if not overwrite and _is_made(workspace, scratch, marker):
-        return workspace
+        return Prepared(workspace, expected)
     usable = originals.usable()
     if overwrite:
         discard_workspace(workspace)
@@ -116,7 +119,15 @@ def prepare_workspace(
         write_marker(scratch, marker)
         move_into_place(scratch, workspace)
     logger.info("Undistorted %d of %d images into %s", len(kept), originals.model.num_reg_images(), output)
-    return workspace
+    return Prepared(workspace, expected)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A workspace that is ready, and the names of all images that its model had before undistortion."""
+
+    workspace: Workspace
+    expected: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -128,11 +139,8 @@ class Foreseen:
 
 
 def foresee_workspace(
-    model_dir: Path,
-    image_dir: Path | None,
-    output: Path,
+    project: Project,
     options: UndistortionOptions,
-    masks: Path | None = None,
     *,
     overwrite: bool,
 ) -> Foreseen | None:
@@ -146,10 +154,11 @@ def foresee_workspace(
         The workspace that is there will be discarded first.
     """
     options.check()
-    originals = read_originals(model_dir, image_dir, masks)
+    assert project.model is not None
+    originals = read_originals(project.model, project.images, project.masks)
     if overwrite:
-        check_discardable(Workspace(output))
-    elif is_finished(Workspace(output), _marker(originals, options)):
+        check_discardable(Workspace(project.root))
+    elif is_finished(Workspace(project.root), _marker(originals, options)):
         return None
     model = _submodel(originals.model, set(originals.usable().images))
     cameras = [model.camera(image.camera_id) for image in model.images.values()]
@@ -159,7 +168,7 @@ def foresee_workspace(
         undistorted = pycolmap.undistort_camera(_camera_options(options), camera)
         camera.model, camera.params = undistorted.model, undistorted.params
         camera.width, camera.height = undistorted.width, undistorted.height
-    return Foreseen(scene_of_model(model, model_dir), pixels)
+    return Foreseen(scene_of_model(model, project.model), pixels)
 
 
 def open_workspace(root: Path, masks: Path | None = None) -> Workspace:

@@ -31,6 +31,8 @@ class FusionOptions:
 
     method: Literal["best-pixel", "colmap"] = "best-pixel"
     """Our own, a point from the pixel that sees a piece of surface best; or COLMAP's stereo_fusion."""
+    input: Literal["geometric", "photometric"] = "geometric"
+    """Maps to fuse: those that other views confirm, or the unchecked ones, fuller and with more outliers."""
     min_num_pixels: int = 2
     """Pixels, of different images, that must agree on a point (COLMAP: 5)."""
     max_reproj_error: float = 0.5
@@ -56,6 +58,8 @@ class FusionOptions:
         """Raise `OptionError` for a value out of bounds."""
         if self.method not in ("best-pixel", "colmap"):
             raise OptionError(f"fusion method must be 'best-pixel' or 'colmap', not {self.method!r}.")
+        if self.input not in ("geometric", "photometric"):
+            raise OptionError(f"input must be 'geometric' or 'photometric', not {self.input!r}.", "input")
         for name in ("min_num_pixels", "max_num_pixels", "max_traversal_depth", "check_num_images"):
             if getattr(self, name) < 1:
                 raise OptionError(f"fusion {name} must be at least 1, not {getattr(self, name)}.")
@@ -70,7 +74,11 @@ class FusionOptions:
 
     def for_colmap(self) -> dict[str, Any]:
         """The options that COLMAP's fusion has, too, under its names."""
-        values = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "method"}
+        values = {
+            field.name: getattr(self, field.name)
+            for field in fields(self)
+            if field.name not in ("method", "input")
+        }
         return {name: value for name, value in values.items() if value is not None}
 
 

@@ -6,7 +6,7 @@ without these the overlap of the viewing frusta. A ``patch-match.cfg`` that the 
 """
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,12 +17,11 @@ from scipy import sparse
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.scene import Scene, SourceImages
 from colmap_sph.stereo.frusta import observe_frusta, observe_points
+from colmap_sph.stereo.pairing import Pair
 from colmap_sph.stereo.partner_choice import choose, triangulation_angles, worth_of
 
 logger = logging.getLogger(__name__)
 
-Pair = tuple[str, str]
-"""Names of two images, sorted."""
 PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
 # Candidates that a view chooses from, unless it is to have more; points that tell a pair's angle and its worth.
 _MAX_CANDIDATES = 100
@@ -157,15 +156,6 @@ def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
         view.name: [scene.views[j].name for j in graph.candidates(i)[0][:most]]
         for i, view in enumerate(scene.views)
     }
-
-
-def partners_of(pairs: Iterable[Pair]) -> dict[str, list[str]]:
-    """Partners of each image, sorted."""
-    partners: dict[str, list[str]] = {}
-    for left, right in pairs:
-        partners.setdefault(left, []).append(right)
-        partners.setdefault(right, []).append(left)
-    return {name: sorted(others) for name, others in partners.items()}
 
 
 class _Graph:

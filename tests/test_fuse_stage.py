@@ -15,12 +15,15 @@ from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_
 
 from colmap_sph.errors import NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import read_geometry
-from colmap_sph.pipeline import cloud_stage, memory
-from colmap_sph.pipeline.cloud_stage import cloud_state, fuse_views
+from colmap_sph.pipeline import fuse as fuse_module
+from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.fuse import fuse_stage
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import parse_memory
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.stage import Facts, Result
 from colmap_sph.project.cloud_files import join_parts, write_part
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
@@ -50,8 +53,15 @@ def context_of(workspace, scene=None, **options):
 def fuse(workspace, pairs=(), scene=None, **options):
     """Run the stage; its report."""
     context = context_of(workspace, scene, **options)
-    fuse_views(context, pairs, {view.name: "key" for view in context.scene.views})
+    execute(stage_of(context, pairs))
     return context.report
+
+
+def stage_of(context, pairs=()):
+    """The stage, after one that gave every image the coverage in the report."""
+    coverage = context.report.coverage
+    maps = {view.name: Result("key", False, Facts(coverage[view.name])) for view in context.scene.views}
+    return fuse_stage(context, dict.fromkeys(pairs, "key"), maps)
 
 
 def cloud_bytes(workspace):
@@ -200,7 +210,7 @@ NEEDED = int(1.15 * 60 * WIDTH * HEIGHT)
 @contextmanager
 def counted(monkeypatch):
     """Largest number of images in work at a time."""
-    original, lock, counts = cloud_stage.write_part, threading.Lock(), [0, 0]
+    original, lock, counts = fuse_module.write_part, threading.Lock(), [0, 0]
 
     def write(stem, bands):
         with lock:
@@ -213,7 +223,7 @@ def counted(monkeypatch):
                 counts[0] -= 1
 
     with monkeypatch.context() as patch:
-        patch.setattr(cloud_stage, "write_part", write)
+        patch.setattr(fuse_module, "write_part", write)
         patch.setattr(memory, "resident", lambda: 100 << 20)
         yield counts
 
@@ -242,11 +252,10 @@ def test_memory_is_what_is_reserved(workspace, monkeypatch):
     options = {"memory": f"{(100 << 20) + NEEDED + 1000}B", "fusion": FusionOptions(min_num_pixels=1)}
     fuse(workspace, **options)
     shutil.rmtree(workspace.state_dir)
-    context = context_of(workspace, **options)
-    state = cloud_state(context, (), dict.fromkeys(NAMES, "key"), context.report.coverage)
+    stage = stage_of(context_of(workspace, **options))
     tracemalloc.start()
     try:
-        cloud_stage._fuse_by_pixel(context, state)
+        execute(stage)
         _, peak = tracemalloc.get_traced_memory()
     finally:
         tracemalloc.stop()
@@ -259,7 +268,7 @@ def test_memory_is_what_is_reserved(workspace, monkeypatch):
 def test_photometric_maps(workspace, tmp_path):
     fuse(workspace)
     other = make_workspace(tmp_path / "photometric", kind="photometric")
-    fuse(other, fusion_input="photometric")
+    fuse(other, fusion=FusionOptions(input="photometric"))
     assert cloud_bytes(other) == cloud_bytes(workspace)
 
 
@@ -346,7 +355,7 @@ def test_an_image_that_fails_is_left_out_and_done_again(workspace):
     path.write_bytes(path.read_bytes()[:-100])
     context = context_of(workspace, fusion=FusionOptions(max_depth_error=0.011))
     for made in (1, 1):  # again, and again in vain
-        fuse_views(context, (), dict.fromkeys(NAMES, "key"))
+        execute(stage_of(context))
         assert list(context.report.skipped_images) == ["c.png"]
         assert str(path) in context.report.skipped_images["c.png"]
         assert context.report.made["fuse"] == made
@@ -381,7 +390,7 @@ def test_no_point(workspace):
 
 def test_thin_clouds_of_many_images_are_no_reason_for_advice(workspace, monkeypatch):
     """Where most pixels are confirmed, few points only mean that many images see the same."""
-    monkeypatch.setattr(cloud_stage, "_FEW_POINTS", 2.0)
+    monkeypatch.setattr("colmap_sph.pipeline.cloud._FEW_POINTS", 2.0)
     assert fuse(workspace).advice == ""
     rng = np.random.default_rng(0)
     for name in NAMES[2:]:
@@ -398,7 +407,7 @@ def test_a_skipped_image_has_no_say_in_the_advice(workspace, coverage):
     workspace.depth_map_path("b.png", "geometric").unlink()
     context = context_of(workspace, fusion=FusionOptions(min_num_pixels=6))
     context.report.coverage["b.png"] = coverage
-    fuse_views(context, (), dict.fromkeys(NAMES, "key"))
+    execute(stage_of(context))
     assert context.report.points == 0
     assert context.report.advice
 
@@ -411,7 +420,7 @@ def test_unwritable_output(workspace, blocked, monkeypatch):
         def refuse(*_):
             raise PermissionError(13, "Permission denied")
 
-        monkeypatch.setattr(cloud_stage, "move_into_place", refuse)
+        monkeypatch.setattr(fuse_module, "move_into_place", refuse)
     else:
         path.mkdir()
     before = sorted(workspace.root.rglob("*"))
@@ -421,7 +430,7 @@ def test_unwritable_output(workspace, blocked, monkeypatch):
 
 
 def test_colmaps_fusion_still_warns_of_its_memory(workspace, caplog, monkeypatch):
-    monkeypatch.setattr(cloud_stage, "resident", lambda: 10**12)
+    monkeypatch.setattr(fuse_module, "resident", lambda: 10**12)
     fuse(workspace, fusion=FusionOptions(method="colmap"))
     assert "COLMAP's fusion will take about" in caplog.text
     caplog.clear()

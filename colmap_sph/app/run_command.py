@@ -1,0 +1,158 @@
+"""`colmap_sph run`: its options, its help, the plan of a dry run, and the closing summary."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+from rich.filesize import decimal
+from rich.table import Table
+from rich.text import Text
+
+import colmap_sph
+from colmap_sph.app.display import Display, escaped
+from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.option_list import Option, option_groups
+from colmap_sph.app.spelling import EVERYDAY
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.plan import Plan, make_plan
+from colmap_sph.pipeline.reconstruct import check_input, run_project
+from colmap_sph.pipeline.report import RunReport
+from colmap_sph.project.project import Project
+from colmap_sph.project.workspace import Workspace
+
+PARTIAL_EXIT_CODE = 5
+"""The run finished, but some images of the model have no depth map, or are not in the cloud."""
+
+_MAX_LISTED_IMAGES = 60
+
+
+@dataclass(frozen=True)
+class RunCommand:
+    """From a COLMAP sparse model to depth maps, normal maps and a fused cloud, without a GPU.
+
+    Give --model after standard structure from motion, or --workspace for a dense workspace that COLMAP's
+    image_undistorter made. The result is an ordinary COLMAP dense workspace with fused.ply in it.
+    """
+
+    project: Annotated[Project, tyro.conf.arg(name="")] = field(default_factory=Project)
+    options: Annotated[RunOptions, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = field(
+        default_factory=RunOptions
+    )
+    dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only say what is to do, and about how much time, memory and disk it takes. Nothing is written."""
+    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Do everything again, also what an earlier run in this workspace has finished."""
+
+
+def run_command(command: RunCommand, console: Console) -> int:
+    """`colmap_sph run`."""
+    project = command.project
+    options = command.options
+    check_input(project, options)
+    workspace = Workspace(project.root)
+    if command.dry_run:
+        print_plan(make_plan(project, options, overwrite=command.overwrite), workspace, console)
+        return 0
+    with workspace_log(workspace, header(command)), Display(console) as display:
+        report = run_project(project, options, progress=display, overwrite=command.overwrite)
+    print_summary(report, workspace, console)
+    return PARTIAL_EXIT_CODE if report.skipped_images else 0
+
+
+def header(command: object) -> str:
+    """First line of a command in the workspace's log."""
+    return f"colmap_sph {colmap_sph.__version__}: {command}"
+
+
+# ---- help --------------------------------------------------------------------------------------------------
+
+
+def print_help(console: Console, *, everything: bool) -> None:
+    """The everyday options of `run` on one screen, or all of them."""
+    plain, *stages = option_groups(RunCommand)
+    console.print("usage: colmap_sph run --model SPARSE [OPTIONS]", highlight=False, markup=False)
+    console.print("       colmap_sph run --workspace DENSE [OPTIONS]\n", highlight=False, markup=False)
+    console.print(plain.text, highlight=False, markup=False)
+    known = {option.flag: option for group in (plain, *stages) for option in group.options}
+    _print_options([known[flag] for flag in EVERYDAY], console)
+    if not everything:
+        console.print(
+            "\nAll other options, stage by stage: colmap_sph run --help-all", highlight=False, markup=False
+        )
+        return
+    for group in stages:
+        rest = [option for option in group.options if option.flag not in EVERYDAY]
+        if rest:
+            console.print(f"\n{group.name}: {group.text}", highlight=False, markup=False)
+            _print_options(rest, console)
+
+
+def _print_options(options: Sequence[Option], console: Console) -> None:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column()
+    for option in options:
+        table.add_row(Text(f"  {option.flag} {option.values}".rstrip()), Text(option.text_with_default))
+    console.print(table)
+
+
+# ---- plan and summary --------------------------------------------------------------------------------------
+
+
+def print_plan(plan: Plan, workspace: Workspace, console: Console) -> None:
+    """What a run would do and need."""
+    facts = Table.grid(padding=(0, 2))
+    facts.add_row("undistort", "to do" if plan.undistort else "done")
+    for what, number, done in (
+        ("pairs", plan.pairs, plan.pairs_done),
+        ("images", plan.images, plan.images_done),
+        ("cloud", 1, int(not plan.fuse)),
+    ):
+        facts.add_row(what, f"{number - done} to do, {done} done")
+    facts.add_row("time", f"about {_duration(plan.seconds)}")
+    facts.add_row("memory", f"about {decimal(round(plan.memory))}")
+    facts.add_row("disk", f"about {decimal(round(plan.disk))} more, of {decimal(plan.free_disk)} free")
+    console.print(facts, highlight=False)
+    console.print(
+        "Time, memory and disk are estimates from the numbers of pixels; the time is that of a 2.5 GHz server. "
+        f"Nothing was written to {escaped(workspace.root)}.",
+        highlight=False,
+        soft_wrap=True,
+    )
+
+
+def _duration(seconds: float) -> str:
+    """Such as "40 s", "12 min" or "3.5 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def print_summary(report: RunReport, workspace: Workspace, console: Console) -> None:
+    """The closing summary of a run."""
+    listed = sorted(report.coverage.items(), key=lambda item: item[1])
+    table = Table("image", "coverage", title="Depth maps", title_justify="left")
+    for name, share in sorted(listed[:_MAX_LISTED_IMAGES]):
+        table.add_row(escaped(name), f"{share:.1%}")
+    if len(listed) > _MAX_LISTED_IMAGES:
+        table.caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images"
+    console.print(table)
+    mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
+    facts = Table.grid(padding=(0, 2))
+    facts.add_row("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")
+    facts.add_row("pairs", f"{report.pairs} matched ({report.pair_source})")
+    facts.add_row("cloud", f"{report.points:,} points in {escaped(workspace.fused_path)}")
+    if any(report.reused.values()):
+        kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
+        facts.add_row("up to date", kept)
+    times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
+    facts.add_row("seconds", f"{sum(report.seconds.values()):.1f} ({times})")
+    facts.add_row("peak memory", f"{report.peak_memory / 2**30:.2f} GiB")
+    console.print(facts, highlight=False)
+    for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
+        for name, reason in skipped.items():
+            console.print(f"[yellow]{what} skipped:[/] {escaped(name)}: {escaped(reason)}", soft_wrap=True)
+    if report.advice:
+        console.print(f"[yellow]few points:[/] {escaped(report.advice)}", soft_wrap=True)

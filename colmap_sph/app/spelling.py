@@ -1,0 +1,67 @@
+"""How options are spelled on the command line: everyday ones short, all others behind the name of their stage."""
+
+from collections.abc import Sequence
+
+SHORT = {"undistortion.max_image_size": "--max-image-size", "pairs.num_pairs": "--num-pairs"}
+"""Options of stages which everybody uses, by their place in the records."""
+
+EVERYDAY = (
+    "--model",
+    "--images",
+    "--masks",
+    "--output",
+    "--workspace",
+    "--max-image-size",
+    "--num-pairs",
+    "--threads",
+    "--memory",
+    "--dry-run",
+    "--overwrite",
+)
+"""What `run --help` shows."""
+
+# Spellings of earlier versions, and what they are called now.
+_RENAMED = {
+    "--min-triangulation-angle": "--pairs.min-triangulation-angle",
+    "--max-triangulation-angle": "--pairs.max-triangulation-angle",
+    "--min-shared-points": "--pairs.min-shared-points",
+    "--rectification": "--rectification.surface",
+    "--sampling": "--rectification.sampling",
+    "--min-cosine": "--rectification.min-cosine",
+    "--near-margin": "--rectification.near-margin",
+    "--far-margin": "--rectification.far-margin",
+    "--max-pixels-ratio": "--rectification.max-pixels-ratio",
+    "--depth.disparity-sigma": "--vote.disparity-sigma",
+    "--depth.max-disparity-step": "--vote.max-disparity-step",
+    "--depth.vote-tolerance": "--vote.tolerance",
+    "--depth.min-support": "--vote.min-support",
+    "--depth.max-reprojection-error": "--confirm.max-reprojection-error",
+    "--depth.consistency-tolerance": "--confirm.tolerance",
+    "--depth.min-consistent": "--confirm.min-consistent",
+    "--depth.max-contradiction": "--confirm.max-contradiction",
+    "--depth.min-contradicting-support": "--confirm.min-contradicting-support",
+    "--depth.min-surface": "--confirm.min-surface",
+    "--fusion-input": "--fusion.input",
+}
+
+
+def flag_of(place: str) -> str:
+    """An option as the user types it, from its place in the records, such as "vote.min_support"."""
+    return SHORT.get(place, f"--{place.replace('_', '-')}")
+
+
+def in_full(arguments: Sequence[str]) -> list[str]:
+    """The arguments of `run` with every option in the spelling that the records give it.
+
+    Short and earlier spellings are replaced, and a first argument that is no option is the model.
+    """
+    full = {flag: f"--{place.replace('_', '-')}" for place, flag in SHORT.items()} | _RENAMED
+    spelled = []
+    for argument in arguments:
+        flag, equals, value = argument.partition("=")
+        if flag.startswith("--"):
+            flag = flag.replace("_", "-")
+            argument = full.get(flag, flag) + equals + value
+        spelled.append(argument)
+    named = bool(spelled) and not spelled[0].startswith("-")
+    return ["--model", *spelled] if named else spelled

@@ -1,0 +1,175 @@
+"""Third stage: every image's depth is confirmed by its partners' and refined on their images: geometric maps."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.maps import MAP_BYTES, MapFiles
+from colmap_sph.pipeline.stage import Cost, Facts, Job, Kept, Result, Stage
+from colmap_sph.pipeline.vote import NORMALS_SECONDS, read_estimate
+from colmap_sph.project.images import read_undistorted
+from colmap_sph.scene import View
+from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
+from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.normals import NormalOptions, fit_normals
+from colmap_sph.stereo.pairing import Pair, partners_of
+from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+    from colmap_sph.pipeline.memory import MemoryGate
+
+# Processor seconds per megapixel of the image: per partner, and per partner's image that is matched in.
+_CONFIRM_SECONDS = 0.05
+_REFINE_SECONDS = 0.13
+# Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
+_CONFIRM_BYTES = 40.0
+_REFINE_BYTES = 55.0
+# Per pixel: of an image and of an estimate in a cache; and bytes of a cache: more is no faster.
+_IMAGE_BYTES = 1
+_ESTIMATE_BYTES = 9
+_CACHE_BYTES = 512 << 20
+# Caches take what the costliest image leaves, with some room to spare.
+_ROOM = 1.2
+
+_images: LoadCache[NDArray[np.uint8]] = LoadCache(lambda image: image.nbytes)
+_estimates: LoadCache[DepthEstimate] = LoadCache(lambda estimate: _ESTIMATE_BYTES * estimate.depth.size)
+
+
+@dataclass(frozen=True, eq=False)
+class EstimateFile:
+    """A view without its sparse points, its image, and its photometric depth."""
+
+    view: View
+    image: Path
+    estimate: Path
+
+
+@dataclass(frozen=True, eq=False)
+class ConfirmTask:
+    """A view and its partners, and where its geometric maps go."""
+
+    reference: EstimateFile
+    partners: tuple[EstimateFile, ...]
+    confirm_options: ConfirmOptions
+    normal_options: NormalOptions
+    refinement_options: RefinementOptions
+    maps: MapFiles
+    key: str
+
+
+def make_geometric_maps(task: ConfirmTask) -> Facts:
+    """Confirm a view's depth by its partners' and refine it on their images; writes its geometric maps."""
+    view = task.reference.view
+    others = ((partner.view, _estimate(partner)) for partner in task.partners)
+    confirmed = confirm_depth(view, _estimate(task.reference), others, task.confirm_options)
+    planes = fit_normals(view, confirmed, task.normal_options)
+    if task.refinement_options.rounds and confirmed.depth.any():
+        sources = [(partner.view, _image(partner)) for partner in task.partners]
+        planes = refine_maps(view, _image(task.reference), confirmed, *planes, sources, task.refinement_options)
+    return task.maps.write(*planes, task.key)
+
+
+def _estimate(file: EstimateFile) -> DepthEstimate:
+    return _estimates.get(file_stamp(file.estimate), lambda: read_estimate(file.estimate))
+
+
+def _image(file: EstimateFile) -> NDArray[np.uint8]:
+    return _images.get(file_stamp(file.image), lambda: read_undistorted(file.image, cv2.IMREAD_GRAYSCALE))
+
+
+class ConfirmStage(Stage[str, ConfirmTask]):
+    """Confirms and refines the depth of every image with a vote."""
+
+    name = "confirm depth"
+    make = staticmethod(make_geometric_maps)
+
+    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], vote_keys: Mapping[str, str]) -> None:
+        super().__init__(context, [view.name for view in context.scene.views if view.name in vote_keys])
+        self._vote_keys = vote_keys
+        self._all_partners = partners_of(pair_keys)
+
+    def job(self, item: str) -> Job[ConfirmTask]:
+        """See `Stage.job`."""
+        options = self.context.options
+        partners = self._partners(item)
+        key = self.context.keys.geometric(self._vote_keys[item], [self._vote_keys[name] for name in partners])
+        maps = self.context.map_files(item, "geometric")
+        task = ConfirmTask(
+            self._estimate_file(item),
+            tuple(map(self._estimate_file, partners)),
+            options.confirm,
+            options.normals,
+            options.refinement,
+            maps,
+            key,
+        )
+        return Job(key, maps.facts(key), self._cost(item), task)
+
+    def _partners(self, name: str) -> list[str]:
+        return [other for other in self._all_partners.get(name, []) if other in self._vote_keys]
+
+    def _estimate_file(self, name: str) -> EstimateFile:
+        context = self.context
+        view = context.scene.view(name).without_points()
+        return EstimateFile(view, context.workspace.image_path(name), context.estimate_path(name))
+
+    def _cost(self, name: str) -> Cost:
+        pixels = self._pixels(name)
+        partners = self._partners(name)
+        refinement = self.context.options.refinement
+        seconds = NORMALS_SECONDS + _CONFIRM_SECONDS * len(partners)
+        seconds += _REFINE_SECONDS * refinement.images_used(len(partners))
+        memory = _CONFIRM_BYTES * pixels
+        if refinement.rounds:
+            memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + _IMAGE_BYTES * sum(map(self._pixels, partners))
+        return Cost(seconds * pixels / 1e6, memory, MAP_BYTES * pixels)
+
+    def _pixels(self, name: str) -> int:
+        view = self.context.scene.view(name)
+        return view.width * view.height
+
+    def label(self, item: str) -> str:
+        """See `Stage.label`."""
+        return item
+
+    def kept_memory(self, gate: "MemoryGate") -> Kept:
+        """See `Stage.kept_memory`."""
+        most = max((self._cost(name).memory for name in self.items), default=0.0)
+        cache = int(min(_CACHE_BYTES, gate.spare(_ROOM * most) / 2))
+        filled = (_IMAGE_BYTES + _ESTIMATE_BYTES) * sum(map(self._pixels, self.items))
+        return Kept(cache=cache, caches=2, filled=filled)
+
+    @contextmanager
+    def opened(self, kept: Kept) -> Iterator[None]:
+        """See `Stage.opened`."""
+        with _images.holding(kept.cache), _estimates.holding(kept.cache):
+            yield
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """See `Stage.close`."""
+        report = self.context.report
+        names = [view.name for view in self.context.scene.views]
+        report.coverage = {name: results[name].facts.coverage if name in results else 0.0 for name in names}
+        report.images = sum(share > 0 for share in report.coverage.values())
+        failures = [report.skipped_images[name] for name in names if name in report.skipped_images]
+        if failures and not report.images:
+            raise NoResultError(f"No image has a depth map ({failures[0]})")
+        for name in (name for name, share in report.coverage.items() if share == 0):
+            paired = "no depth of it is confirmed by another image"
+            reason = paired if name in self._all_partners else "no pair of it could be matched"
+            report.skipped_images.setdefault(name, reason)
+        if not report.images:
+            masked = self.context.workspace.masks_dir.is_dir()
+            raise NoResultError(
+                "No depth was confirmed by a second image; are the model's poses right for these images"
+                + (", and is black in the masks what is to be ignored?" if masked else "?")
+            )

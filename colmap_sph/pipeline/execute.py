@@ -1,0 +1,64 @@
+"""A stage's jobs, executed: what is there is left alone, the rest is made by worker threads within the memory."""
+
+import logging
+from collections.abc import Hashable
+from typing import TypeVar
+
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.memory import MemoryGate
+from colmap_sph.pipeline.stage import Result, Stage
+from colmap_sph.pipeline.workers import for_all
+
+logger = logging.getLogger(__name__)
+
+Item = TypeVar("Item", bound=Hashable)
+Task = TypeVar("Task")
+
+
+def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
+    """Make all results of a stage that are not there.
+
+    Returns
+    -------
+    dict
+        Result of each item, in the items' order, without those that failed.
+
+    Raises
+    ------
+    ColmapSphError
+        A wrong option, an output that cannot be written, or nothing to go on with.
+    """
+    context = stage.context
+    gate = MemoryGate(context.options.memory_budget)
+    kept = stage.kept_memory(gate)
+    gate.keep(kept.total(context.options.num_threads))
+
+    def work(item: Item) -> Result:
+        job = stage.job(item)
+        if job.done is not None:
+            return Result(job.key, made=False, facts=job.done)
+        if stage.whole:
+            return Result(job.key, made=True, facts=stage.make(job.task))
+        with gate.reserve(job.cost.memory, stage.label(item)):
+            return Result(job.key, made=True, facts=stage.make(job.task))
+
+    with stage.opened(kept):
+        with context.stage(stage.name, len(stage.items)):
+            results = for_all(
+                work,
+                stage.items,
+                threads=context.options.num_threads,
+                progress=context.progress,
+                skip=None if stage.whole else stage.skip,
+            )
+            stage.close(results)
+        _count(context, stage, results)
+    return results
+
+
+def _count(context: Context, stage: Stage[Item, Task], results: dict[Item, Result]) -> None:
+    made, reused = stage.count(results)
+    context.report.made[stage.name] = made
+    context.report.reused[stage.name] = reused
+    if reused:
+        logger.info("%s: %d were up to date", stage.name.capitalize(), reused)

@@ -1,0 +1,296 @@
+"""Last stage: the maps of all images → the cloud.
+
+Every image is fused into a part of the cloud, and the parts are joined; or COLMAP's fusion does it all at once.
+"""
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError, NoResultError, OutputError
+from colmap_sph.pipeline.cloud import facts_of_cloud, known_cloud, report_cloud, vouch_for_cloud
+from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.memory import format_memory, resident
+from colmap_sph.pipeline.records import forget
+from colmap_sph.pipeline.stage import Cost, Facts, Job, Kept, Result, Stage
+from colmap_sph.pipeline.view_maps import MapSources, read_view_maps
+from colmap_sph.project.cloud_files import check_places, join_parts, link_workspace, move_into_place, write_part
+from colmap_sph.project.colmap_fusion import fuse_by_colmap
+from colmap_sph.project.pair_lists import write_fusion_cfg
+from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.staging import scratch_folder
+from colmap_sph.project.workspace import Workspace, mask_path
+from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.pairing import Pair, partners_of
+from colmap_sph.stereo.pairs import overlapping_views
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+    from colmap_sph.pipeline.memory import MemoryGate
+
+logger = logging.getLogger(__name__)
+
+# Processor seconds per megapixel of the image, and per image that overlaps it; per megapixel in COLMAP's fusion.
+_SECONDS = 0.05
+_PARTNER_SECONDS = 0.011
+_COLMAP_SECONDS = 0.9
+# Bytes on disk per pixel, of the cloud.
+_CLOUD_BYTES = 12.0
+# Bytes per pixel: of the maps of a view with its image; largest in use while a view is fused.
+_MAPS_BYTES = 19.0
+_FUSE_BYTES = 60.0
+# Bytes in COLMAP's fusion: per pixel of all images together; and for a moment, per width times squared height.
+_COLMAP_BYTES = 80.0
+_COLMAP_MASK_BYTES = 0.1
+
+_maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
+
+
+@dataclass(frozen=True, eq=False)
+class FuseTask:
+    """A view to fuse, those that overlap it, what to add to its points, and the path of its part less suffixes."""
+
+    reference: MapSources
+    partners: tuple[MapSources, ...]
+    options: FusionOptions
+    offset: NDArray[np.float64]
+    stem: Path
+
+
+def make_cloud_part(task: FuseTask) -> Facts:
+    """Fuse a view; writes the points of the cloud which it sees better than any other."""
+    bands = fuse_view(_view_maps(task.reference), _partner_maps(task.partners), task.options, task.offset)
+    return Facts(points=write_part(task.stem, bands))
+
+
+def _view_maps(sources: MapSources) -> ViewMaps:
+    return _maps.get(file_stamp(sources.depth), lambda: read_view_maps(sources))
+
+
+def _partner_maps(partners: Sequence[MapSources]) -> Iterator[ViewMaps]:
+    for sources in partners:
+        with suppress(InputError):  # reported where it is the reference
+            yield _view_maps(sources)
+
+
+@dataclass(frozen=True, eq=False)
+class ColmapFuseTask:
+    """A workspace to fuse by COLMAP; see `fuse_by_colmap`."""
+
+    workspace: Workspace
+    options: FusionOptions
+    threads: int
+    partners: Mapping[str, Sequence[str]] | None
+
+
+def make_cloud_by_colmap(task: ColmapFuseTask) -> Facts:
+    """Fuse all images by COLMAP's own fusion; writes the cloud."""
+    points = fuse_by_colmap(
+        task.workspace,
+        task.options.for_colmap(),
+        threads=task.threads,
+        kind=task.options.input,
+        partners=task.partners,
+    )
+    return Facts(points=points)
+
+
+def fuse_stage(
+    context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]
+) -> "FuseStage | ColmapFuseStage":
+    """The last stage, by the method that the options name; `maps` are the results of the stage before."""
+    stage = ColmapFuseStage if context.options.fusion.method == "colmap" else FuseStage
+    return stage(context, pair_keys, {name: result for name, result in maps.items() if result.facts.coverage > 0})
+
+
+class FuseStage(Stage[str, FuseTask]):
+    """Fuses the maps of every image with any depth into its part of the cloud, and joins these."""
+
+    name = "fuse"
+    make = staticmethod(make_cloud_part)
+
+    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
+        super().__init__(context, list(maps))
+        self._partners = _partners_in_fusion(context, pair_keys, self.items)
+        self._key = context.keys.cloud(
+            {name: maps[name].key for name in maps}, self._partners, context.scene.origin
+        )
+        self._known = known_cloud(context, self._key)
+        self._index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
+        self._scratch = context.workspace.state_dir / "fusion"
+
+    def job(self, item: str) -> Job[FuseTask]:
+        """See `Stage.job`; all parts are done where the cloud is."""
+        scene = self.context.scene
+        view = scene.view(item)
+        pixels = view.width * view.height
+        partners = self._partners[item]
+        seconds = _SECONDS + _PARTNER_SECONDS * len(partners)
+        cost = Cost(seconds * pixels / 1e6, _FUSE_BYTES * pixels, _CLOUD_BYTES * pixels)
+        task = FuseTask(
+            self._sources(item),
+            tuple(map(self._sources, partners)),
+            self.context.options.fusion,
+            scene.anchor,
+            self._stem(item),
+        )
+        return Job(self._key, None if self._known is None else Facts(), cost, task)
+
+    def _sources(self, name: str) -> MapSources:
+        view = self.context.scene.view(name)
+        options = self.context.options.fusion
+        maps = self.context.map_files(name, options.input)
+        return MapSources(
+            view.without_points(),
+            self._index_of[view.image_id],
+            maps.depth,
+            maps.normals,
+            self.context.workspace.image_path(name),
+            None if options.mask_path is None else mask_path(options.mask_path, name),
+        )
+
+    def _stem(self, name: str) -> Path:
+        return self._scratch / f"{self.context.scene.view(name).image_id}"
+
+    def label(self, item: str) -> str:
+        """See `Stage.label`."""
+        return item
+
+    def kept_memory(self, gate: "MemoryGate") -> Kept:
+        """See `Stage.kept_memory`."""
+        pixels = [view.width * view.height for view in map(self.context.scene.view, self.items)]
+        filled = _MAPS_BYTES * sum(pixels)
+        spare = gate.spare(2 * _FUSE_BYTES * max(pixels, default=0)) / 2
+        return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
+
+    @contextmanager
+    def opened(self, kept: Kept) -> Iterator[None]:
+        """Begin the cloud anew where it must be made; its parts are there until this ends."""
+        write_fusion_cfg(self.context.workspace.fusion_cfg_path, self.items)
+        if self._known is not None:
+            yield
+            return
+        check_places(self.context.workspace)
+        forget(self.context.cloud_record)
+        with scratch_folder(self._scratch), _maps.holding(kept.cache):
+            yield
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """Join the parts to the cloud."""
+        context = self.context
+        if self._known is None:
+            if not results:
+                raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
+            points = sum(result.facts.points for result in results.values())
+            self._put_together([self._stem(name) for name in results], points)
+            self._known = facts_of_cloud(context, list(results), points)
+            if len(results) == len(self.items):
+                vouch_for_cloud(context, self._key, self._known)
+        report_cloud(context, self._known)
+
+    def _put_together(self, stems: list[Path], points: int) -> None:
+        """Make the cloud of its parts, and move it to its place."""
+        workspace = self.context.workspace
+        origin = self.context.scene.origin
+        try:
+            join_parts(stems, self._scratch, points)
+            if origin.any():
+                link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
+            move_into_place(self._scratch, workspace, origin)
+        except (OSError, RuntimeError) as error:
+            reason = getattr(error, "strerror", None) or error
+            raise OutputError(
+                f"{workspace.fused_path} cannot be written ({reason}); check space and permissions."
+            ) from error
+
+    def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
+        """One cloud."""
+        made = any(result.made for result in results.values())
+        return int(made), int(not made)
+
+
+def _partners_in_fusion(
+    context: "Context", pair_keys: Mapping[Pair, str], names: Sequence[str]
+) -> dict[str, list[str]]:
+    """For each image to fuse the others that may see the same: those that share most points, and its pairs'."""
+    most = min(context.options.fusion.check_num_images, MAX_PARTNERS)
+    overlapping = overlapping_views(context.scene, most)
+    matched = partners_of(pair_keys)  # a pair that the user asked for may share no point
+    fused = set(names)
+    return {
+        name: [o for o in dict.fromkeys([*overlapping[name], *matched.get(name, [])]) if o in fused][:most]
+        for name in names
+    }
+
+
+class ColmapFuseStage(Stage[str, ColmapFuseTask]):
+    """Fuses all maps at once by COLMAP's fusion, which holds them in memory whatever the budget."""
+
+    name = "fuse"
+    whole = True
+    make = staticmethod(make_cloud_by_colmap)
+
+    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
+        super().__init__(context, ["the cloud"])
+        self._names = list(maps)
+        # Without tracks COLMAP would find no images that overlap.
+        self._partners = None if context.scene.has_tracks else partners_of(pair_keys)
+        self._key = context.keys.cloud(
+            {name: maps[name].key for name in maps}, self._partners or {}, context.scene.origin
+        )
+        self._known = known_cloud(context, self._key)
+
+    def job(self, item: str) -> Job[ColmapFuseTask]:
+        """See `Stage.job`."""
+        context = self.context
+        options = context.options
+        views = [context.scene.view(name) for name in self._names]
+        pixels = sum(view.width * view.height for view in views)
+        memory = _COLMAP_BYTES * pixels
+        if options.fusion.use_cache:
+            memory = min(memory, options.fusion.cache_size * 1e9)
+        memory += _COLMAP_MASK_BYTES * max(view.width * view.height**2 for view in views)
+        cost = Cost(_COLMAP_SECONDS * pixels / 1e6, memory, _CLOUD_BYTES * pixels)
+        task = ColmapFuseTask(context.workspace, options.fusion, options.num_threads, self._partners)
+        return Job(self._key, None if self._known is None else Facts(), cost, task)
+
+    def label(self, item: str) -> str:
+        """See `Stage.label`."""
+        return item
+
+    @contextmanager
+    def opened(self, kept: Kept) -> Iterator[None]:
+        """Begin the cloud anew where it must be made."""
+        write_fusion_cfg(self.context.workspace.fusion_cfg_path, self._names)
+        if self._known is None:
+            forget(self.context.cloud_record)
+            self._warn_of_memory()
+        yield
+
+    def _warn_of_memory(self) -> None:
+        """COLMAP's cache bounds its memory, but makes it many times slower."""
+        context = self.context
+        total = context.options.memory_budget
+        pixels = sum(view.width * view.height for view in map(context.scene.view, self._names))
+        needed = resident() + _COLMAP_BYTES * pixels
+        if needed > total and not context.options.fusion.use_cache:
+            logger.warning(
+                "COLMAP's fusion will take about %s of memory, more than the %s allowed; "
+                "--fusion.use-cache True bounds it, but takes hours.",
+                format_memory(needed),
+                format_memory(total),
+            )
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """See `Stage.close`."""
+        if self._known is None:
+            points = sum(result.facts.points for result in results.values())
+            self._known = facts_of_cloud(self.context, self._names, points)
+            vouch_for_cloud(self.context, self._key, self._known)
+        report_cloud(self.context, self._known)

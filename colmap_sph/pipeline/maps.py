@@ -1,0 +1,37 @@
+"""A view's depth and normal map on disk, vouched for by a record."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.pipeline.records import forget, vouch, vouched_facts
+from colmap_sph.pipeline.stage import Facts
+from colmap_sph.project.map_files import write_depth_map, write_normal_map
+
+MAP_BYTES = 16.0
+"""Bytes on disk per pixel, of a depth and a normal map."""
+
+
+@dataclass(frozen=True)
+class MapFiles:
+    """Where both maps of a view lie, and the record that vouches for them."""
+
+    depth: Path
+    normals: Path
+    record: Path
+
+    def write(self, normals: NDArray[np.float32], depth: NDArray[np.float32], key: str) -> Facts:
+        """Write both maps: (H, W, 3) normals and (H, W) depth, under a key."""
+        forget(self.record)
+        write_depth_map(self.depth, depth)
+        write_normal_map(self.normals, normals)
+        coverage = float((depth > 0).mean())
+        vouch(self.record, key, [self.depth, self.normals], coverage=coverage)
+        return Facts(coverage=coverage)
+
+    def facts(self, key: str) -> Facts | None:
+        """What is known of the maps, or None where they must be made."""
+        known = vouched_facts(self.record, key, [self.depth, self.normals])
+        return None if known is None else Facts(coverage=known["coverage"])

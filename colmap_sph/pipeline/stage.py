@@ -1,0 +1,170 @@
+"""What a stage of a run is: its items, and for each of them a job that can be asked, planned, or done.
+
+A stage knows for every item the key of its result, whether that is there, what it would cost, and a task: a record
+of paths, cameras and options that can be pickled. `Stage.make` turns a task into files, and is a plain function of
+that task. So the same job runs in a thread, in a process or on another machine, and a dry run asks the same stages
+that a run executes.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+
+if TYPE_CHECKING:  # what the code of a stage's results depends on is in its key, see `program`; these have no part
+    from colmap_sph.pipeline.context import Context
+    from colmap_sph.pipeline.memory import MemoryGate
+
+Item = TypeVar("Item", bound=Hashable)
+Task = TypeVar("Task")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """What making one result takes.
+
+    Attributes
+    ----------
+    seconds : float
+        Of one processor core; an estimate.
+    memory : float
+        Largest bytes of arrays at a time, beside what the stage keeps; reserved before the work begins.
+    disk : float
+        Bytes of the files; an estimate.
+    """
+
+    seconds: float
+    memory: float
+    disk: float
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What is known of a result without reading it.
+
+    Attributes
+    ----------
+    coverage : float
+        Share of pixels with a depth, 0 to 1, where the stage makes maps.
+    points : int
+        Points of the cloud, where the stage makes them.
+    """
+
+    coverage: float = 0.0
+    points: int = 0
+
+
+@dataclass(frozen=True)
+class Job(Generic[Task]):
+    """What there is to know about one item.
+
+    Attributes
+    ----------
+    key : str
+        Digest of all that its result depends on.
+    done : Facts or None
+        What is known of the result where it is there under this key; None where it must be made.
+    cost : Cost
+        Of making it.
+    task : Task
+        What `Stage.make` needs; can be pickled.
+    """
+
+    key: str
+    done: Facts | None
+    cost: Cost
+    task: Task
+
+
+@dataclass(frozen=True)
+class Result:
+    """Outcome of one item: its key, whether this run made it, and what is known of it."""
+
+    key: str
+    made: bool
+    facts: Facts
+
+
+class Stage(ABC, Generic[Item, Task]):
+    """One stage of one run.
+
+    Parameters
+    ----------
+    context : Context
+    items : sequence
+        What it works on, each once: hashable.
+    """
+
+    name: ClassVar[str]
+    whole: ClassVar[bool] = False
+    """Whether one item is all there is: its failure ends the run, and the budget does not bound its memory."""
+
+    def __init__(self, context: "Context", items: Sequence[Item]) -> None:
+        self.context = context
+        self.items = items
+
+    @abstractmethod
+    def job(self, item: Item) -> Job[Task]:
+        """Ask for an item; `ColmapSphError` where it cannot be done."""
+
+    @staticmethod
+    @abstractmethod
+    def make(task: Task) -> Facts:
+        """Make one result: a plain function of its task, for any thread, process or machine."""
+
+    @abstractmethod
+    def label(self, item: Item) -> str:
+        """What an item is called in messages."""
+
+    def skip(self, item: Item, reason: str) -> None:
+        """Report that an item failed."""
+        self.context.skip_view(self.label(item), reason)
+
+    def kept_memory(self, gate: "MemoryGate") -> "Kept":
+        """What the stage keeps in memory from item to item, of what the gate has free."""
+        return Kept()
+
+    @contextmanager
+    def opened(self, kept: "Kept") -> Iterator[None]:
+        """Hold what the stage keeps from item to item."""
+        yield
+
+    def close(self, results: Mapping[Item, Result]) -> None:
+        """Report the results, and raise `NoResultError` where there is nothing to go on with."""
+
+    def count(self, results: Mapping[Item, Result]) -> tuple[int, int]:
+        """How many results this run made, and how many were there."""
+        made = sum(result.made for result in results.values())
+        return made, len(results) - made
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Memory that a stage keeps from item to item.
+
+    Attributes
+    ----------
+    scratch : int
+        Bytes of each worker.
+    cache : int
+        Most bytes of each of the stage's caches.
+    caches : int
+        Number of caches.
+    filled : float
+        Bytes with which the caches would be full of all that there is to load; they never hold more.
+    """
+
+    scratch: int = 0
+    cache: int = 0
+    caches: int = 0
+    filled: float = 0.0
+
+    def total(self, threads: int) -> int:
+        """Bytes to keep free for all of it."""
+        return threads * self.scratch + self.caches * self.cache
+
+
+def keys_of(results: Mapping[Item, Result]) -> dict[Item, str]:
+    """Key of each result, by item."""
+    return {item: result.key for item, result in results.items()}

@@ -1,0 +1,124 @@
+"""Second stage: the disparity maps of every image's pairs vote on its photometric depth."""
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_sph.pipeline.maps import MAP_BYTES, MapFiles
+from colmap_sph.pipeline.pair_files import disparity_bytes, read_arrays, read_pair, stored_key, write_arrays
+from colmap_sph.pipeline.stage import Cost, Facts, Job, Kept, Stage
+from colmap_sph.project.files import make_dir
+from colmap_sph.project.masks import read_mask
+from colmap_sph.scene import View
+from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.normals import NormalOptions, fit_normals
+from colmap_sph.stereo.pairing import Pair, pairs_by_image
+from colmap_sph.stereo.vote import VoteOptions, vote_depth
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+
+# Processor seconds per megapixel of the image: per pair that votes, and of the normals of one kind of maps.
+_SECONDS = 0.07
+NORMALS_SECONDS = 0.25
+# Bytes on disk per pixel: of the estimate.
+_ESTIMATE_BYTES = 9.0
+# Largest bytes in use at a time, per pixel: beside the pairs' disparity maps, and of one that is not made yet.
+_VOTE_BYTES = 45.0
+_DISPARITY_BYTES = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class VoteTask:
+    """A view's pairs, or its estimate where only the maps are to be made from it, and where the results go."""
+
+    view: View
+    pairs: tuple[Path, ...]
+    mask: Path
+    estimate: Path
+    is_voted: bool
+    vote_options: VoteOptions
+    normal_options: NormalOptions
+    maps: MapFiles
+    vote_key: str
+    maps_key: str
+
+
+def make_photometric_maps(task: VoteTask) -> Facts:
+    """Vote on the depth of a view; writes it with its standard deviation and support, and the photometric maps."""
+    estimate = read_estimate(task.estimate) if task.is_voted else _vote(task)
+    planes = fit_normals(task.view, estimate, task.normal_options)
+    return task.maps.write(*planes, task.maps_key)
+
+
+def _vote(task: VoteTask) -> DepthEstimate:
+    estimate = vote_depth(task.view, (read_pair(file) for file in task.pairs), task.vote_options)
+    mask = read_mask(task.mask, task.view.width, task.view.height)
+    if mask is not None:
+        # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
+        estimate.depth[mask == 0] = 0
+    arrays = {"depth": estimate.depth, "sigma": estimate.sigma, "support": estimate.support}
+    write_arrays(task.estimate, arrays, task.vote_key)
+    return estimate
+
+
+def read_estimate(path: Path) -> DepthEstimate:
+    """Read what a vote has written; `InputError` where it is missing or damaged."""
+    return DepthEstimate(**read_arrays(path, ("depth", "sigma", "support")))
+
+
+class VoteStage(Stage[str, VoteTask]):
+    """Votes on the depth of every image of the scene. Its results have the keys of the votes."""
+
+    name = "vote on depth"
+    make = staticmethod(make_photometric_maps)
+
+    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str]) -> None:
+        super().__init__(context, [view.name for view in context.scene.views])
+        self._pair_keys = pair_keys
+        self._pairs = pairs_by_image(pair_keys)
+
+    def job(self, item: str) -> Job[VoteTask]:
+        """See `Stage.job`."""
+        context = self.context
+        view = context.scene.view(item)
+        pairs = self._pairs.get(item, [])
+        files = tuple(context.pair_path(*pair) for pair in pairs)
+        key = context.keys.vote(view, [self._pair_keys[pair] for pair in pairs])
+        maps_key = context.keys.photometric(key)
+        estimate = context.estimate_path(item)
+        maps = context.map_files(item, "photometric")
+        is_voted = stored_key(estimate) == key
+        task = VoteTask(
+            view.without_points(),
+            files,
+            context.workspace.mask_path(item),
+            estimate,
+            is_voted,
+            context.options.vote,
+            context.options.normals,
+            maps,
+            key,
+            maps_key,
+        )
+        return Job(key, maps.facts(maps_key) if is_voted else None, self._cost(view, files, is_voted), task)
+
+    def _cost(self, view: View, files: tuple[Path, ...], is_voted: bool) -> Cost:
+        pixels = view.width * view.height
+        disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
+        seconds = NORMALS_SECONDS + (0 if is_voted else _SECONDS * len(files))
+        disk = MAP_BYTES + (0 if is_voted else _ESTIMATE_BYTES)
+        return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities, disk * pixels)
+
+    def label(self, item: str) -> str:
+        """See `Stage.label`."""
+        return item
+
+    @contextmanager
+    def opened(self, kept: Kept) -> Iterator[None]:
+        """See `Stage.opened`."""
+        for name in self.items:
+            make_dir(self.context.estimate_path(name).parent)
+        yield
