@@ -21,16 +21,11 @@ from clouds import read_visibility
 from conftest import keep_images
 
 import colmap_sph
-from colmap_sph.app import cli
-from colmap_sph.project.undistortion import UndistortionOptions
-from colmap_sph.stereo.confirm import ConfirmOptions
-from colmap_sph.stereo.fusion import FusionOptions
-from colmap_sph.stereo.matching import MatchingOptions
-from colmap_sph.stereo.normals import NormalOptions
-from colmap_sph.stereo.pairs import PairOptions
-from colmap_sph.stereo.rectification import RectificationOptions
-from colmap_sph.stereo.refinement import RefinementOptions
-from colmap_sph.stereo.vote import VoteOptions
+from colmap_sph.app import cli, run_command, spelling
+from colmap_sph.app.option_list import option_groups
+from colmap_sph.app.run_command import RunCommand
+from colmap_sph.app.spelling import in_full
+from colmap_sph.pipeline.options import RunOptions
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
 FAST = ["--threads", "2", "--num-pairs", "2"]
@@ -79,43 +74,81 @@ def test_help_of_the_command(capsys: pytest.CaptureFixture[str]) -> None:
         assert re.search(rf"• {subcommand} +\w", output), output
 
 
+EVERYDAY = [
+    "model",
+    "images",
+    "masks",
+    "output",
+    "workspace",
+    "max-image-size",
+    "num-pairs",
+    "threads",
+    "memory",
+    "dry-run",
+    "overwrite",
+]
+
+
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_help_of_run_is_one_screen_of_everyday_options(flag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = command(capsys, "run", flag)
+    assert code == 0
+    assert re.findall(r"^  (--[a-z-]+)", output, re.MULTILINE) == [f"--{name}" for name in EVERYDAY]
+    assert len(output.splitlines()) <= 40
+    assert max(map(len, output.splitlines())) <= 80
+    assert "colmap_sph run --help-all" in output
+
+
+def test_help_of_run_explains_every_option(capsys: pytest.CaptureFixture[str]) -> None:
+    """With what it takes, some words about it, and its default."""
+    code, output = command(capsys, "run", "--help-all")
+    assert code == 0
+    words = " ".join(output.split())
+    places = [f"{stage.name}.{field.name}" for stage in fields(RunOptions) for field in STAGES.get(stage.name, ())]
+    assert len(places) > 50
+    for place in places:
+        short = {"pairs.num_pairs": "num-pairs", "undistortion.max_image_size": "max-image-size"}
+        name = f"--{short.get(place, place.replace('_', '-'))}"
+        words_of_option = r"(\S+ ){3,}?"
+        default = "" if place == "fusion.mask_path" else "Default: "
+        assert re.search(rf" {re.escape(name)} \S+ {words_of_option}{default}", words), name
+
+
+STAGES = {field.name: fields(getattr(RunOptions(), field.name)) for field in fields(RunOptions)[2:]}
+
+
+def test_every_text_of_the_help_is_a_sentence() -> None:
+    for group in option_groups(RunCommand):
+        for text in (group.text, *(option.text for option in group.options)):
+            assert text[0].isupper() and text[-1] in ".)", text
+
+
 @pytest.mark.parametrize(
-    ("prefix", "options"),
+    ("typed", "parsed"),
     [
-        ("", cli.RunCommand),
-        ("", UndistortionOptions),
-        ("", PairOptions),
-        ("", RectificationOptions),
-        ("matching.", MatchingOptions),
-        ("vote.", VoteOptions),
-        ("confirm.", ConfirmOptions),
-        ("normals.", NormalOptions),
-        ("refinement.", RefinementOptions),
-        ("fusion.", FusionOptions),
+        (["--num-pairs", "3"], ["--pairs.num-pairs", "3"]),
+        (["--num_pairs=3"], ["--pairs.num-pairs=3"]),
+        (["--max-image-size", "-1"], ["--undistortion.max-image-size", "-1"]),
+        (
+            ["--sampling", "1.2", "--rectification=frame"],
+            ["--rectification.sampling", "1.2", "--rectification.surface=frame"],
+        ),
+        (["--depth.vote-tolerance", "2"], ["--vote.tolerance", "2"]),
+        (["--depth.consistency_tolerance", "2"], ["--confirm.tolerance", "2"]),
+        (["--fusion-input", "photometric"], ["--fusion.input", "photometric"]),
+        (["sparse/0", "--masks", "m"], ["--model", "sparse/0", "--masks", "m"]),
+        (["--vote.min-support", "2", "--dry-run"], ["--vote.min-support", "2", "--dry-run"]),
     ],
 )
-def test_help_of_run_explains_every_option(prefix: str, options: type, capsys: pytest.CaptureFixture[str]) -> None:
-    code, output = command(capsys, "run", "--help")
-    assert code == 0
-    words = " ".join(output.replace("│", " ").split())
-    assert "--workspace for a dense workspace" in words
-    stages = {
-        "undistortion",
-        "pairs",
-        "rectification",
-        "matching",
-        "vote",
-        "confirm",
-        "normals",
-        "refinement",
-        "fusion",
-    }
-    for field in fields(options):
-        if options is cli.RunCommand and field.name in stages:
-            continue
-        name = f"--{prefix}{field.name.replace('_', '-')}"
-        # The option, what it takes, and some words about it.
-        assert re.search(rf" {re.escape(name)} \S+ (\S+ ){{3,}}?\(default: ", words), name
+def test_short_and_earlier_spellings(typed: list[str], parsed: list[str]) -> None:
+    assert in_full(typed) == parsed
+
+
+def test_every_earlier_spelling_leads_to_an_option() -> None:
+    flags = {option.flag for group in option_groups(RunCommand) for option in group.options}
+    assert set(spelling._RENAMED.values()) <= flags
+    assert set(spelling.EVERYDAY) <= flags
+    assert not spelling._RENAMED.keys() & flags
 
 
 def test_help_of_demo(capsys: pytest.CaptureFixture[str]) -> None:
@@ -209,7 +242,7 @@ def test_interruption(small: Path, capsys: pytest.CaptureFixture[str], monkeypat
         signal.raise_signal(signal.SIGTERM)
 
     before = signal.getsignal(signal.SIGTERM)
-    monkeypatch.setattr(cli, "run", interrupted)
+    monkeypatch.setattr(run_command, "run_project", interrupted)
     code, output = command(capsys, "run", "--model", "sparse/0")
     assert code == 143
     assert output.splitlines()[-1].startswith("interrupted; ")
@@ -252,7 +285,7 @@ def test_unusable_images(
     code, output = command(capsys, "run", "--model", "sparse/0", "--images", "images", *FAST)
     assert f"{IMAGES[0]} {words}; left out" in " ".join(output.split())
     if one:
-        assert code == cli.PARTIAL_EXIT_CODE == 5
+        assert code == run_command.PARTIAL_EXIT_CODE == 5
         assert f"image skipped: {IMAGES[0]}: " in output
         report = json.loads((small / "dense/colmap_sph/report.json").read_text())
         assert list(report["skipped_images"]) == IMAGES[:1]
@@ -304,16 +337,16 @@ BAD = {
     "file in the way": ([*RUN, "--output", "sparse/0/cameras.bin"], 3, "cameras.bin"),
     "file as parent": ([*RUN, "--output", "sparse/0/cameras.bin/dense"], 3, "cameras.bin"),
     "unwritable": ([*RUN, "--output", "/proc/dense"], 3, "/proc/dense"),
-    "threads": ([*RUN, "--threads", "-1"], 2, "threads must lie in 0..1024, not -1"),
-    "pairs": ([*RUN, "--num-pairs", "0"], 2, "num_pairs must be at least 1, not 0"),
-    "p1": ([*RUN, "--matching.p1", "500"], 2, "not 500, "),
-    "sampling": ([*RUN, "--sampling", "nan"], 2, "sampling"),
-    "vote": ([*RUN, "--vote.tolerance", "0"], 2, "tolerance"),
-    "normals": ([*RUN, "--normals.radius", "0"], 2, "radius"),
-    "fusion": ([*RUN, "--fusion.min-num-pixels", "0"], 2, "min_num_pixels"),
+    "threads": ([*RUN, "--threads", "-1"], 2, "--threads must lie in 0..1024, not -1"),
+    "pairs": ([*RUN, "--num-pairs", "0"], 2, "--num-pairs must be at least 1, not 0"),
+    "p1": ([*RUN, "--matching.p1", "500"], 2, "--matching.p1"),
+    "sampling": ([*RUN, "--sampling", "nan"], 2, "--rectification.sampling must"),
+    "vote": ([*RUN, "--vote.tolerance", "0"], 2, "--vote.tolerance must be positive"),
+    "normals": ([*RUN, "--normals.radius", "0"], 2, "--normals.radius must"),
+    "fusion": ([*RUN, "--fusion.min-num-pixels", "0"], 2, "--fusion.min-num-pixels must"),
     "masks": ([*RUN, "--fusion.mask-path", "none"], 2, "none does not exist"),
-    "size": ([*RUN, "--max-image-size", "3"], 2, "max_image_size"),
-    "demo threads": (["demo", "--threads", "-1"], 2, "threads"),
+    "size": ([*RUN, "--max-image-size", "3"], 2, "--max-image-size must"),
+    "demo threads": (["demo", "--threads", "-1"], 2, "--threads must lie"),
     "demo in a project": (["demo", "--output", "."], 3, "already holds other files"),
     "demo in a file": (["demo", "--output", "sparse/0/cameras.bin"], 3, "cameras.bin"),
     "demo unwritable": (["demo", "--output", "/proc/demo"], 3, "/proc/demo"),
@@ -451,7 +484,7 @@ def test_an_image_that_cannot_be_fused_is_left_out(small: Path, capsys: pytest.C
     cv2.imwrite(str(mask), np.full((24, 32), 255, np.uint8))
     for _ in range(2):
         code, output = command(capsys, *RUN, *FAST, *wanted)
-        assert code == cli.PARTIAL_EXIT_CODE
+        assert code == run_command.PARTIAL_EXIT_CODE
         assert "Traceback" not in output
         words = " ".join(output.split())
         assert f"image skipped: {IMAGES[1]}: The mask masks/{IMAGES[1]}.png has 32 x 24 pixels" in words
@@ -477,7 +510,7 @@ def test_a_second_run_says_what_was_up_to_date(small: Path, capsys: pytest.Captu
     code, output = command(capsys, *RUN, *FAST)
     assert code == 0
     words = " ".join(output.split())
-    assert "up to date match pairs 3, estimate depth 3, check consistency 3, fuse 1" in words
+    assert "up to date match pairs 3, vote on depth 3, confirm depth 3, fuse 1" in words
     code, output = command(capsys, *RUN, *FAST, "--overwrite")
     assert code == 0
     assert "up to date" not in output
@@ -506,7 +539,7 @@ def test_what_the_system_refuses(
     def refused(*_: object, **__: object) -> None:
         raise error
 
-    monkeypatch.setattr(cli, "run", refused)
+    monkeypatch.setattr(run_command, "run_project", refused)
     code, output = command(capsys, *RUN)
     assert words in error_sentence(code, output)
     assert code == expected

@@ -307,7 +307,9 @@ def test_two_images(project: Path, block: DemoBlock) -> None:
 
 def test_photometric_maps_can_be_fused(project: Path) -> None:
     keep_images(project, NADIR)
-    report = colmap_sph.run(project / "sparse/0", options=replace(FEW_PAIRS, fusion_input="photometric"))
+    report = colmap_sph.run(
+        project / "sparse/0", options=replace(FEW_PAIRS, fusion=FusionOptions(input="photometric"))
+    )
     assert report.points > 10_000
 
 

@@ -16,7 +16,7 @@ from colmap_sph.app.display import Display, console_logging, escaped
 from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
-from colmap_sph.app.run_command import RunCommand, header, print_help, print_summary, run_command
+from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, in_full
 from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError
 from colmap_sph.evaluation import format_clouds, format_depth_maps
@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"colmap_sph {colmap_sph.__version__}")
         return 0
     if arguments[:1] == ["run"] and not {"-h", "--help", "--help-all"}.isdisjoint(arguments):
-        print_help(Console(), everything="--help-all" in arguments)
+        print(help_text(everything="--help-all" in arguments), flush=True)
         return 0
     command = _parsed(arguments)
 

@@ -69,8 +69,15 @@ def header(command: object) -> str:
 # ---- help --------------------------------------------------------------------------------------------------
 
 
-def print_help(console: Console, *, everything: bool) -> None:
-    """The everyday options of `run` on one screen, or all of them."""
+def help_text(*, everything: bool) -> str:
+    """The everyday options of `run` for one screen, or all of them."""
+    console = Console()
+    with console.capture() as captured:
+        _print_help(console, everything=everything)
+    return captured.get().rstrip()
+
+
+def _print_help(console: Console, *, everything: bool) -> None:
     plain, *stages = option_groups(RunCommand)
     console.print("usage: colmap_sph run --model SPARSE [OPTIONS]", highlight=False, markup=False)
     console.print("       colmap_sph run --workspace DENSE [OPTIONS]\n", highlight=False, markup=False)

@@ -17,6 +17,11 @@ from colmap_sph.stereo.refinement import RefinementOptions
 from colmap_sph.stereo.vote import VoteOptions
 
 
+def num_cores() -> int:
+    """Cores that this process may use, which can be fewer than the machine has."""
+    return len(os.sched_getaffinity(0))
+
+
 @dataclass(frozen=True)
 class RunOptions:
     """Options of all stages and of the run itself."""
@@ -47,13 +52,13 @@ class RunOptions:
                 raise error.spelled(f"{stage}.{{}}".format) from None
         folder = self.fusion.mask_path
         if folder is not None and not folder.is_dir():
-            raise OptionError(f"the folder of fusion.mask_path, {folder}, does not exist.", "fusion.mask_path")
+            raise OptionError(f"fusion.mask_path: the folder {folder} does not exist.", "fusion.mask_path")
         backend()  # what COLMAP_SPH_KERNELS asks for must be there, too
 
     @property
     def num_threads(self) -> int:
         """Worker threads to use."""
-        return self.threads or len(os.sched_getaffinity(0))
+        return self.threads or num_cores()
 
     @property
     def memory_budget(self) -> int:

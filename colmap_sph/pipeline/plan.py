@@ -6,7 +6,6 @@ the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
 """
 
 import logging
-import os
 import shutil
 from collections.abc import Hashable
 from dataclasses import dataclass, field
@@ -17,7 +16,7 @@ from colmap_sph.errors import ColmapSphError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
-from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.options import RunOptions, num_cores
 from colmap_sph.pipeline.reconstruct import check_input, choose_pairs, go_through_stages, wanted_scene
 from colmap_sph.pipeline.stage import Cost, Facts, Kept, Result, Stage
 from colmap_sph.project.project import Project
@@ -36,6 +35,30 @@ _UNDISTORT_SECONDS = 0.12
 _UNDISTORTED_BYTES = 1.0
 # Bytes that the interpreter and the libraries have in use.
 _BASE_MEMORY = 200e6
+
+
+@dataclass(frozen=True)
+class StagePlan:
+    """What is there of a stage's results, and what the rest takes.
+
+    Attributes
+    ----------
+    name : str
+        As in the report of a run.
+    total, done : int
+        Results, and those that are there.
+    seconds : float
+        Estimated processor seconds of what is to do.
+    memory, disk : float
+        Bytes of arrays at a time, and of files to be made.
+    """
+
+    name: str
+    total: int
+    done: int
+    seconds: float
+    memory: float
+    disk: float
 
 
 @dataclass(frozen=True)
@@ -60,6 +83,8 @@ class Plan:
         Estimated largest memory in use, and space for files to be made, in bytes.
     free_disk : int
         Free space where these go, bytes.
+    stages : tuple of StagePlan
+        Of each stage, in their order; the undistortion, where it is to do, before them.
     """
 
     undistort: bool
@@ -73,6 +98,7 @@ class Plan:
     memory: float
     disk: float
     free_disk: int
+    stages: tuple[StagePlan, ...]
 
 
 def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False) -> Plan:
@@ -103,10 +129,12 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     context = Context(dense, wanted_scene(scene, selection), options, keys)
     survey = Survey(fresh=overwrite or foreseen is not None)
     go_through_stages(context, selection.unique_pairs(), survey)
+    stages = survey.stages
+    pairs, _, images, cloud = stages
     if foreseen is not None:
-        survey.seconds += _UNDISTORT_SECONDS * foreseen.original_pixels / 1e6
-        survey.disk += _UNDISTORTED_BYTES * sum(view.width * view.height for view in context.scene.views)
-    pairs, _, images, cloud = survey.stages
+        pixels = sum(view.width * view.height for view in context.scene.views)
+        seconds = _UNDISTORT_SECONDS * foreseen.original_pixels / 1e6
+        stages = [StagePlan("undistort", 1, 0, seconds, 0.0, _UNDISTORTED_BYTES * pixels), *stages]
     return Plan(
         undistort=foreseen is not None,
         pair_source=selection.source,
@@ -115,24 +143,17 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         images=images.total,
         images_done=images.done,
         fuse=cloud.done < cloud.total,
-        seconds=survey.seconds / min(options.num_threads, len(os.sched_getaffinity(0))),
-        memory=_BASE_MEMORY + survey.memory,
-        disk=survey.disk,
+        seconds=sum(stage.seconds for stage in stages) / min(options.num_threads, num_cores()),
+        memory=_BASE_MEMORY + max(stage.memory for stage in stages),
+        disk=sum(stage.disk for stage in stages),
         free_disk=_free_disk(project),
+        stages=tuple(stages),
     )
 
 
 def _free_disk(project: Project) -> int:
     root = project.root
     return shutil.disk_usage(next(path for path in (root, *root.absolute().parents) if path.exists())).free
-
-
-@dataclass(frozen=True)
-class _Counts:
-    """Items of a stage, and those whose results are there."""
-
-    total: int
-    done: int
 
 
 @dataclass
@@ -146,19 +167,12 @@ class Survey:
 
     Attributes
     ----------
-    stages : list
-        What is there, by stage.
-    seconds, disk : float
-        Processor seconds, and bytes on disk, of what is to do.
-    memory : float
-        Most bytes of arrays at a time, in the stage that needs most.
+    stages : list of StagePlan
+        What the stages said, in their order.
     """
 
     fresh: bool
-    stages: list[_Counts] = field(default_factory=list)
-    seconds: float = 0.0
-    disk: float = 0.0
-    memory: float = 0.0
+    stages: list[StagePlan] = field(default_factory=list)
 
     def __call__(self, stage: Stage[Item, Task], /) -> dict[Item, Result]:
         """Foresee the result of each item; all images that are to do are taken to get some depth."""
@@ -176,10 +190,16 @@ class Survey:
                 results[item] = Result(job.key, made=True, facts=Facts(coverage=1.0))
                 costs.append(job.cost)
         made, there = stage.count(results)
-        self.stages.append(_Counts(made + there, there))
-        self.seconds += sum(cost.seconds for cost in costs)
-        self.disk += sum(cost.disk for cost in costs)
-        self.memory = max(self.memory, _memory_of(stage, costs))
+        self.stages.append(
+            StagePlan(
+                stage.name,
+                made + there,
+                there,
+                sum(cost.seconds for cost in costs),
+                _memory_of(stage, costs),
+                sum(cost.disk for cost in costs),
+            )
+        )
         return results
 
 

@@ -1,0 +1,49 @@
+"""Write docs/options.md: every option of `colmap_sph run`, from the records that hold them.
+
+python scripts/make_option_docs.py
+"""
+
+from pathlib import Path
+
+from colmap_sph.app.option_list import Option, option_groups
+from colmap_sph.app.run_command import RunCommand
+from colmap_sph.app.spelling import EVERYDAY
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "options.md"
+
+_HEAD = """# Options of `colmap_sph run`
+
+Made by `scripts/make_option_docs.py` from the records in the code; `colmap_sph run --help-all` shows the same.
+In Python the records are the fields of `colmap_sph.RunOptions`: `--vote.min-support 2` is
+`RunOptions(vote=VoteOptions(min_support=2))`, with `VoteOptions` of `colmap_sph.stereo.vote`.
+What the stages do is told in [algorithm.md](algorithm.md).
+"""
+
+
+def page() -> str:
+    """The whole text of the page."""
+    plain, *stages = option_groups(RunCommand)
+    known = {option.flag: option for group in (plain, *stages) for option in group.options}
+    parts = [_HEAD, "## Everyday options", _table([known[flag] for flag in EVERYDAY])]
+    for group in stages:
+        rest = [option for option in group.options if option.flag not in EVERYDAY]
+        if rest:
+            parts += [f"## {group.name.capitalize()}", f"{group.text}", _table(rest)]
+    return "\n\n".join(part.rstrip() for part in parts) + "\n"
+
+
+def _table(options: list[Option]) -> str:
+    rows = ["| option | default | |", "|---|---|---|"]
+    for option in options:
+        flag = f"{option.flag} {option.values}".rstrip()
+        default = f"`{option.default}`" if option.default else ""
+        rows.append(f"| `{_cell(flag)}` | {_cell(default)} | {_cell(option.text)} |")
+    return "\n".join(rows)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")

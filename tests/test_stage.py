@@ -1,0 +1,129 @@
+"""The contract of the stages: a task can be pickled, and what it makes does not depend on where it is made."""
+
+import pickle
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+from conftest import SMALL_BLOCK, keep_images
+
+import colmap_sph
+from colmap_sph.pipeline.confirm import ConfirmStage
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.fuse import ColmapFuseStage, fuse_stage
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.match import MatchStage
+from colmap_sph.pipeline.memory import MemoryGate
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.stage import Facts, Result, Stage, keys_of
+from colmap_sph.pipeline.vote import VoteStage
+from colmap_sph.project.project import Project
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.pairs import select_pairs
+from colmap_sph.synthetic import make_demo_block
+
+NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
+OPTIONS = RunOptions(threads=2)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four images, and what a run makes of them; not to be changed."""
+    folder = tmp_path_factory.mktemp("stages")
+    small = replace(SMALL_BLOCK, width=160, height=120, nadir_gsd=0.4, oblique_gsd=0.44)
+    make_demo_block(folder, small, threads=2)
+    keep_images(folder, NAMES)
+    colmap_sph.run(folder / "sparse/0", options=OPTIONS)
+    return folder
+
+
+def context_of(project: Path, dense: Path) -> Context:
+    """A run whose workspace is prepared."""
+    undistorted = prepare_workspace(Project(project / "sparse/0", output=dense), UndistortionOptions())
+    workspace = undistorted.workspace
+    scene = anchored(read_scene(workspace.sparse_dir))
+    return Context(workspace, scene, OPTIONS, Keys(workspace, OPTIONS))
+
+
+def made(dense: Path) -> dict[str, bytes]:
+    files = [*dense.glob("stereo/*_maps/*.bin"), *dense.glob("fused*")]
+    return {str(path.relative_to(dense)): path.read_bytes() for path in files}
+
+
+def make_elsewhere(stage: Stage, pool: ProcessPoolExecutor) -> dict[object, Result]:
+    """All jobs of a stage, made by another process from their pickled tasks."""
+    kept = stage.kept_memory(MemoryGate(OPTIONS.memory_budget))
+    with stage.opened(kept):
+        jobs = {item: stage.job(item) for item in stage.items}
+        assert all(job.done is None for job in jobs.values())
+        facts = pool.map(type(stage).make, [job.task for job in jobs.values()])
+        results = {
+            item: Result(job.key, made=True, facts=found)
+            for (item, job), found in zip(jobs.items(), facts, strict=True)
+        }
+        stage.close(results)
+    assert all(stage.job(item).done is not None for item in stage.items)
+    return results
+
+
+def test_another_process_makes_the_same(project: Path, tmp_path: Path) -> None:
+    """Every stage's tasks, sent to a process that knows nothing of the run."""
+    context = context_of(project, tmp_path / "dense")
+    context.workspace.create_stereo_dirs(NAMES)
+    pairs = select_pairs(context.scene, OPTIONS.pairs).unique_pairs()
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        pair_keys = keys_of(make_elsewhere(MatchStage(context, pairs), pool))
+        vote_keys = keys_of(make_elsewhere(VoteStage(context, pair_keys), pool))
+        maps = make_elsewhere(ConfirmStage(context, pair_keys, vote_keys), pool)
+        make_elsewhere(fuse_stage(context, pair_keys, maps), pool)
+    assert made(tmp_path / "dense") == made(project / "dense")
+    assert len(made(project / "dense")) == 4 * len(NAMES) + 2
+    # And a run that finds these results takes them for its own.
+    report = colmap_sph.run(project / "sparse/0", output=tmp_path / "dense", options=OPTIONS)
+    assert not any(report.made.values())
+
+
+def finished_stages(project: Path) -> list[Stage]:
+    context = context_of(project, project / "dense")
+    pairs = select_pairs(context.scene, OPTIONS.pairs).unique_pairs()
+    stages: list[Stage] = [MatchStage(context, pairs)]
+    pair_keys = keys_of(execute(stages[-1]))
+    stages.append(VoteStage(context, pair_keys))
+    stages.append(ConfirmStage(context, pair_keys, keys_of(execute(stages[-1]))))
+    stages.append(fuse_stage(context, pair_keys, execute(stages[-1])))
+    return stages
+
+
+def test_a_task_is_small(project: Path) -> None:
+    """It carries no sparse points and no pixels: a few kilobytes for every image it names."""
+    for stage in finished_stages(project):
+        assert len(pickle.dumps(stage.job(stage.items[0]).task)) < 6000
+
+
+def test_finished_jobs_are_done_and_cost_something_all_the_same(project: Path) -> None:
+    for stage in finished_stages(project):
+        for item in stage.items:
+            job = stage.job(item)
+            assert job.done is not None
+            assert min(job.cost.seconds, job.cost.memory, job.cost.disk) > 0
+
+
+def test_fusion_by_colmap_is_one_job(project: Path) -> None:
+    options = replace(OPTIONS, fusion=FusionOptions(method="colmap"))
+    context = replace(context_of(project, project / "dense"), options=options)
+    maps = {name: Result("key", False, Facts(coverage=float(name != NAMES[0]))) for name in NAMES}
+    stage = fuse_stage(context, {}, maps)
+    assert isinstance(stage, ColmapFuseStage)
+    (item,) = stage.items
+    job = stage.job(item)
+    assert job.done is None
+    assert job.task.workspace == Workspace(project / "dense")
+    pixels = 160 * 120
+    assert job.cost.memory == 3 * 80 * pixels + 0.1 * 160 * 120**2
