@@ -3,8 +3,8 @@
 >>> import colmap_sph
 >>> report = colmap_sph.run("sparse/0")  # doctest: +SKIP
 
-The rooms: `project` is what the user brought and what lies on disk, `stereo` the method, `pipeline` a run of it, and
-`app` the commands. Here are the names that a program needs first; docs/usage.md shows them at work.
+The rooms: `project` is what the user brought and what lies on disk, `stereo` the method, `pipeline` a run of it,
+and `app` the commands. Here are the names that a program needs first; docs/usage.md shows them at work.
 """
 
 # pycolmap brings a zlib of its own; the first one loaded serves every module of the process, and with
@@ -14,39 +14,67 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from colmap_sph.errors import ColmapSphError
-    from colmap_sph.pipeline.options import RunOptions
-    from colmap_sph.pipeline.reconstruct import reconstruct, run, run_project
-    from colmap_sph.pipeline.report import Progress, RunReport
-    from colmap_sph.project.images import read_grey
-    from colmap_sph.project.map_files import read_depth_map, read_normal_map, write_depth_map, write_normal_map
-    from colmap_sph.project.project import Project
-    from colmap_sph.project.scene_reader import read_scene
-    from colmap_sph.project.workspace import Workspace
-    from colmap_sph.scene import Scene, View
-    from colmap_sph.stereo.confirm import confirm_depth
-    from colmap_sph.stereo.matching import RectifiedImage, match_pair
-    from colmap_sph.stereo.normals import fit_normals
-    from colmap_sph.stereo.pairs import select_pairs
-    from colmap_sph.stereo.rectification import rectify_pair
-    from colmap_sph.stereo.rectified_pair import PairDisparity
-    from colmap_sph.stereo.refinement import refine_maps
-    from colmap_sph.stereo.resampling import resample
-    from colmap_sph.stereo.vote import vote_depth
+    from colmap_sph.errors import ColmapSphError as ColmapSphError
+    from colmap_sph.pipeline.options import RunOptions as RunOptions
+    from colmap_sph.pipeline.reconstruct import reconstruct as reconstruct
+    from colmap_sph.pipeline.reconstruct import run as run
+    from colmap_sph.pipeline.reconstruct import run_project as run_project
+    from colmap_sph.pipeline.report import Progress as Progress
+    from colmap_sph.pipeline.report import RunReport as RunReport
+    from colmap_sph.project.images import read_grey as read_grey
+    from colmap_sph.project.map_files import read_depth_map as read_depth_map
+    from colmap_sph.project.map_files import read_normal_map as read_normal_map
+    from colmap_sph.project.map_files import write_depth_map as write_depth_map
+    from colmap_sph.project.map_files import write_normal_map as write_normal_map
+    from colmap_sph.project.project import Project as Project
+    from colmap_sph.project.scene_reader import read_scene as read_scene
+    from colmap_sph.project.undistortion import UndistortionOptions as UndistortionOptions
+    from colmap_sph.project.workspace import Workspace as Workspace
+    from colmap_sph.scene import Scene as Scene
+    from colmap_sph.scene import View as View
+    from colmap_sph.stereo.anchor import anchored as anchored
+    from colmap_sph.stereo.confirm import ConfirmOptions as ConfirmOptions
+    from colmap_sph.stereo.confirm import confirm_depth as confirm_depth
+    from colmap_sph.stereo.fusion import FusionOptions as FusionOptions
+    from colmap_sph.stereo.matching import MatchingOptions as MatchingOptions
+    from colmap_sph.stereo.matching import RectifiedImage as RectifiedImage
+    from colmap_sph.stereo.matching import match_pair as match_pair
+    from colmap_sph.stereo.normals import NormalOptions as NormalOptions
+    from colmap_sph.stereo.normals import fit_normals as fit_normals
+    from colmap_sph.stereo.pairs import PairOptions as PairOptions
+    from colmap_sph.stereo.pairs import select_pairs as select_pairs
+    from colmap_sph.stereo.rectification import RectificationOptions as RectificationOptions
+    from colmap_sph.stereo.rectification import rectify_pair as rectify_pair
+    from colmap_sph.stereo.rectified_pair import PairDisparity as PairDisparity
+    from colmap_sph.stereo.refinement import RefinementOptions as RefinementOptions
+    from colmap_sph.stereo.refinement import refine_maps as refine_maps
+    from colmap_sph.stereo.resampling import resample as resample
+    from colmap_sph.stereo.vote import VoteOptions as VoteOptions
+    from colmap_sph.stereo.vote import vote_depth as vote_depth
 
 __version__ = "0.1.0"
 
 _MODULE_OF = {
     "ColmapSphError": "errors",
+    "ConfirmOptions": "stereo.confirm",
+    "FusionOptions": "stereo.fusion",
+    "MatchingOptions": "stereo.matching",
+    "NormalOptions": "stereo.normals",
     "PairDisparity": "stereo.rectified_pair",
+    "PairOptions": "stereo.pairs",
     "Progress": "pipeline.report",
     "Project": "project.project",
+    "RectificationOptions": "stereo.rectification",
     "RectifiedImage": "stereo.matching",
+    "RefinementOptions": "stereo.refinement",
     "RunOptions": "pipeline.options",
     "RunReport": "pipeline.report",
     "Scene": "scene",
+    "UndistortionOptions": "project.undistortion",
     "View": "scene",
+    "VoteOptions": "stereo.vote",
     "Workspace": "project.workspace",
+    "anchored": "stereo.anchor",
     "confirm_depth": "stereo.confirm",
     "fit_normals": "stereo.normals",
     "match_pair": "stereo.matching",
