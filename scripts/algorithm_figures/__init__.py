@@ -1,0 +1,1 @@
+"""The figures of docs/algorithm.md, a module for each group of stages."""

@@ -1,0 +1,194 @@
+"""Figures of the matching of one rectified pair."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import numpy as np
+from matplotlib import pyplot as plt
+from numpy.typing import NDArray
+
+from algorithm_figures.demo import Demo, MatchedPair
+from algorithm_figures.drawing import save, show
+from colmap_sph import _native
+from colmap_sph.stereo.kernels import backend
+
+NEAR, WIDE = ("N_0_1.jpg", "N_0_2.jpg"), ("N_0_2.jpg", "R_1.jpg")
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """What the matcher's kernel was given and found at one level of the pyramid.
+
+    Attributes
+    ----------
+    left, right : census words
+    base : first offset that each pixel searches, pixels of the level
+    image, p1, p2, max_slant : what aggregation takes
+    depth : offsets searched per pixel
+    offset : what came out, 1/256 pixel
+    """
+
+    left: NDArray[np.uint64]
+    right: NDArray[np.uint64]
+    base: NDArray[np.int32]
+    image: NDArray[np.uint8]
+    p1: int
+    p2: NDArray[np.uint8]
+    max_slant: int
+    depth: int
+    offset: NDArray[np.int32]
+
+
+@contextmanager
+def recorded() -> Iterator[list[Level]]:
+    """Record every level that is matched meanwhile, the coarsest first."""
+    levels: list[Level] = []
+    match = _native.match
+
+    def match_and_record(*arguments: Any) -> None:
+        match(*arguments)
+        _, left, right, base, image, p1, p2, max_slant, _, _, scratch, offset = arguments
+        copies = (left.copy(), right.copy(), base.copy(), image.copy(), p1, p2.copy(), max_slant)
+        levels.append(Level(*copies, scratch.shape[-1], offset.copy()))
+
+    with mock.patch.object(_native, "match", match_and_record):
+        yield levels
+
+
+def matched(demo: Demo, names: tuple[str, str]) -> tuple[MatchedPair, list[Level]]:
+    """A pair, and how it was matched."""
+    pair = demo.rectified(*names)
+    with recorded() as levels:
+        assert pair.disparity.size
+    return pair, levels
+
+
+def _costs(level: Level) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Raw and aggregated costs (H, W, depth)."""
+    cost = np.empty((*level.base.shape, level.depth), np.uint8)
+    aggregated = np.empty_like(cost)
+    _native.matching_cost(backend(), level.left, level.right, level.base, cost)
+    arguments = (level.base, level.image, level.p1, level.p2, level.max_slant)
+    _native.aggregation(backend(), cost, *arguments, np.empty_like(cost), aggregated)
+    return cost, aggregated
+
+
+def _telling_pixel(cost: NDArray[np.uint8], wrong: NDArray[np.float64]) -> tuple[int, int]:
+    """A pixel that is right although other disparities cost less: (row, column)."""
+    best = cost.min(axis=2).astype(int)
+    at = np.clip(np.rint(wrong).astype(int), 0, cost.shape[2] - 1)
+    excess = np.take_along_axis(cost, at[..., None], axis=2)[..., 0] - best
+    rivals = (cost <= best[..., None] + 2).sum(axis=2)
+    score = np.where((at > 6) & (at < cost.shape[2] - 7), 10 * excess + rivals, -1)
+    row, column = np.unravel_index(int(np.argmax(score)), score.shape)
+    return int(row), int(column)
+
+
+def matching(demo: Demo, path: Path) -> None:
+    """Left image, disparity and its error; the costs of one pixel."""
+    pair, levels = matched(demo, NEAR)
+    finest, disparity, exact = levels[-1], pair.disparity, demo.exact_disparity(pair)
+    error = np.abs(disparity - exact)
+    figure = plt.figure(figsize=(9.6, 5.4), layout="constrained")
+    above, below = figure.subfigures(2, 1, height_ratios=(1.1, 1))
+    panels = above.subplots(1, 3)
+    grey = np.where(pair.left_image.valid > 0, pair.left_image.image, 255)
+    show(panels[0], grey, "left, rectified", cmap="gray", vmin=0, vmax=255)
+    drawn = show(panels[1], disparity, "disparity, white = none", cmap="turbo")
+    above.colorbar(drawn, ax=panels[1], shrink=0.7, label="[pixels]")
+    drawn = show(panels[2], error, "difference from exact disparity", cmap="magma_r", vmin=0, vmax=2)
+    above.colorbar(drawn, ax=panels[2], shrink=0.7, label="[pixels]", extend="max")
+
+    cost, aggregated = _costs(finest)
+    slot = -exact - finest.base
+    good = (error < 0.1) & np.isfinite(exact)
+    good[:, : good.shape[1] // 4] = good[:, -good.shape[1] // 4 :] = False
+    row, column = _telling_pixel(cost, np.where(good, slot, -1))
+    for panel in panels:
+        panel.plot(
+            column, row, "o", markersize=9, markerfacecolor="none", markeredgecolor="tab:red", markeredgewidth=2
+        )
+    searched = -(finest.base[row, column] + np.arange(finest.depth))
+    truth, found = exact[row, column], disparity[row, column]
+    panels = below.subplots(1, 3)
+    for axes, values, title in (
+        (panels[0], cost[row, column], "raw costs of the marked pixel"),
+        (panels[1], aggregated[row, column], "after aggregation along 8 paths"),
+    ):
+        axes.plot(searched, values, ".-", color="0.35", linewidth=0.8)
+        axes.plot(searched[values.argmin()], values.min(), "o", color="tab:red", label="least")
+        axes.axvline(truth, color="tab:green", linewidth=1, label="exact")
+        axes.set(xlabel="disparity [pixels]", ylabel="cost [bits]")
+        axes.set_title(title)
+    panels[1].set_ylabel("half of the sum [bits]")
+    panels[0].legend(loc="upper left", bbox_to_anchor=(0, 1.02), handlelength=1)
+    panels[0].set_ylim(0, 80)
+    _draw_fit(panels[2], finest, row, column, truth, found)
+    save(figure, path)
+
+
+def _draw_fit(axes: Any, level: Level, row: int, column: int, truth: float, found: float) -> None:
+    """The V of raw costs, summed over 5 x 5 pixels around each whole disparity beside the plane."""
+    whole = -int(np.rint(level.offset[row, column] / 256))
+    shifts, sums = np.arange(-2, 3), []
+    for shift in shifts:
+        total = 0
+        for y in range(row - 2, row + 3):
+            for x in range(column - 2, column + 3):
+                offset = level.offset[y, x]
+                # Along the surface: each pixel from its own whole offset.
+                own = round(offset / 256) if offset > -(1 << 24) else -whole
+                own = own if abs(own + whole) <= 2 else -whole
+                total += (int(level.left[y, x]) ^ int(level.right[y, x + own - shift])).bit_count()
+        sums.append(total)
+    axes.plot(whole + shifts, sums, ".-", color="0.35", linewidth=0.8)
+    axes.axvline(truth, color="tab:green", linewidth=1, label=f"exact {truth:.2f}")
+    axes.axvline(found, color="tab:red", linewidth=1, linestyle="--", label=f"fitted {found:.2f}")
+    axes.set(xlabel="disparity [pixels]", ylabel="sum of 25 raw costs [bits]")
+    axes.set_title("raw costs of 5 x 5 pixels on the plane")
+    axes.legend(loc="upper center")
+    axes.set_ylim(0, 1.5 * max(sums))
+
+
+def search_ranges(demo: Demo, path: Path) -> None:
+    """What one row searches at each level of the pyramid."""
+    pair, levels = matched(demo, WIDE)
+    exact = demo.exact_disparity(pair)
+    row = int(0.34 * pair.geometry.height)
+    figure = plt.figure(figsize=(9.6, 4.8), layout="constrained")
+    grid = figure.add_gridspec(2, 1, height_ratios=(1, 4.2))
+    strip, axes = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    width = pair.geometry.left_width
+    part = slice(row - 40, row + 40)
+    grey = np.where(pair.left_image.valid[part] > 0, pair.left_image.image[part], 255)
+    show(strip, grey, f"80 rows of the left rectified image around row {row} (red)", cmap="gray", aspect="auto")
+    strip.axhline(40, color="tab:red", linewidth=1.5)
+    colours = ("#dbe9f6", "#a5cde3", "#5ba3cf", "#2171b5", "#08306b")
+    for number, level in enumerate(levels):
+        step = 2 ** (len(levels) - 1 - number)
+        base = level.base[row // step].astype(float)
+        columns = (np.arange(len(base)) + 0.5) * step
+        low, high = -(base + level.depth - 1) * step, -base * step
+        axes.fill_between(
+            columns,
+            low,
+            high,
+            step="mid",
+            color=colours[number * (len(colours) - 1) // max(len(levels) - 1, 1)] if number else colours[0],
+            alpha=0.75,
+            linewidth=0,
+            label=f"level {len(levels) - 1 - number}: {level.depth} disparities of {step} pixel{'s' * (step > 1)}",
+        )
+    axes.plot(np.arange(width), exact[row], color="#ffd21f", linewidth=2.2, label="exact")
+    axes.plot(np.arange(width), pair.disparity[row], ".", color="tab:red", markersize=2.5, label="found")
+    axes.set(xlabel="column of the left rectified image", ylabel="disparity [pixels]", xlim=(0, width))
+    axes.set_ylim(-300, 700)
+    step, first, last = 2 ** (len(levels) - 1), levels[0].base[0, 0], levels[0].base[0, 0] + levels[0].depth - 1
+    axes.annotate(f"level {len(levels) - 1} reaches from {-last * step} to {-first * step}", (12, 650))
+    axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+    strip.set_xlim(0, width)
+    save(figure, path)

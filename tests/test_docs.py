@@ -1,0 +1,120 @@
+"""The documents: links lead somewhere, named modules exist, the README is short."""
+
+import re
+from collections import Counter
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = ROOT / "colmap_sph"
+# Made or written elsewhere, may be missing.
+OPTIONAL = {ROOT / "CHANGELOG.md", ROOT / "docs" / "options.md"}
+DOCUMENTS = [
+    path for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md") if path.exists()
+]
+DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
+# Modules that the documents name ahead of them; to be taken out as they come.
+ANNOUNCED = {
+    "app/spelling.py",
+    "pipeline/confirm.py",
+    "pipeline/execute.py",
+    "pipeline/fuse.py",
+    "pipeline/match.py",
+    "pipeline/stage.py",
+    "pipeline/vote.py",
+    "project/cameras.py",
+    "stereo/covisibility.py",
+    "stereo/disparity_range.py",
+    "stereo/extent.py",
+    "stereo/offsets.py",
+    "stereo/search_ranges.py",
+}
+
+_FENCE = re.compile(r"^(```|~~~).*?^\1", re.MULTILINE | re.DOTALL)
+_LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+_CODE = re.compile(r"`([^`\n]+)`")
+_PATH = re.compile(r"(?<![\w./-])[\w/-]+\.(?:py|sh)\b")
+
+
+def prose(document: Path) -> str:
+    """The text without its blocks of code."""
+    return _FENCE.sub("", document.read_text(encoding="utf-8"))
+
+
+def anchors(document: Path) -> set[str]:
+    """Anchors of a document's headings, as GitHub makes them."""
+    found: Counter[str] = Counter()
+    names = set()
+    for heading in re.findall(r"^#+ (.+)$", prose(document), re.MULTILINE):
+        words = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", heading).replace("`", "").strip().lower()
+        name = re.sub(r"[^\w\- ]", "", words).replace(" ", "-")
+        names.add(f"{name}-{found[name]}" if found[name] else name)
+        found[name] += 1
+    return names
+
+
+def links(document: Path) -> list[str]:
+    """Targets of relative links and images."""
+    return [target for target in _LINK.findall(prose(document)) if not re.match(r"[a-z]+:", target)]
+
+
+def links_of_all() -> list[tuple[Path, str]]:
+    return [(document, target) for document in DOCUMENTS for target in links(document)]
+
+
+@pytest.mark.parametrize(("document", "target"), links_of_all(), ids=lambda each: getattr(each, "name", each))
+def test_links_lead_somewhere(document: Path, target: str) -> None:
+    path, _, anchor = target.partition("#")
+    there = (document.parent / path).resolve() if path else document
+    if there in OPTIONAL and not there.exists():
+        pytest.skip(f"{there.name} is not there")
+    assert there.is_relative_to(ROOT) and there.exists()
+    if anchor:
+        assert anchor in anchors(there)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_named_files_exist(document: Path) -> None:
+    """A path in backticks is one of the repository, its scripts, the package, or one of its rooms."""
+    rooms = [ROOT, ROOT / "scripts", PACKAGE, *(folder for folder in PACKAGE.iterdir() if folder.is_dir())]
+    named = {name for code in _CODE.findall(prose(document)) for name in _PATH.findall(code)}
+    missing = {name for name in named if not any((room / name).exists() for room in rooms)}
+    assert missing <= ANNOUNCED
+
+
+def test_every_figure_is_shown() -> None:
+    shown = {(document.parent / target).resolve() for document, target in links_of_all()}
+    assert set((ROOT / "docs").rglob("*.png")) <= shown
+
+
+def test_figures_are_small() -> None:
+    for figure in (ROOT / "docs" / "figures").glob("*.png"):
+        assert figure.stat().st_size <= 250 * 1024, figure
+
+
+def test_the_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_headings_are_nested(document: Path) -> None:
+    levels = [len(marks) for marks in re.findall(r"^(#+) ", prose(document), re.MULTILINE)]
+    assert levels[0] == 1 and levels.count(1) == 1
+    assert all(deeper - level <= 1 for level, deeper in pairwise(levels))
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_formulas_are_closed(document: Path) -> None:
+    """GitHub reads a formula within one line, or between lines of `$$`."""
+    blocks = re.split(r"^\$\$$", prose(document), flags=re.MULTILINE)
+    assert len(blocks) % 2 == 1
+    for text in blocks[::2]:
+        plain = _CODE.sub("", text)
+        assert all(line.count("$") % 2 == 0 for line in plain.splitlines())
+
+
+def test_ci_finds_its_command() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert next(line for line in lines if ".[test]" in line).endswith(".venv/bin/pytest")
