@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from rendered import exact_disparity, grey, scene_of_pair
 from scipy import ndimage
 
@@ -384,10 +385,9 @@ def test_an_unknown_backend_is_refused(monkeypatch):
     "wrong",
     [
         {"p1": -1},
-        {"p1": 31, "p2_min": 30},
-        {"p2_min": 130, "p2": 120},
         {"p1": 64, "p2_min": 64},
         {"p2": 128},
+        {"p2": -1},
         {"p2_contrast": 0},
         *[{"disparities": value} for value in (0, 16, 33, 1056, -32)],
         *[{"coarse_disparities": value} for value in (0, 48)],
@@ -407,5 +407,9 @@ def test_an_unknown_backend_is_refused(monkeypatch):
 )
 def test_options_out_of_bounds_are_refused(wrong):
     OPTIONS.check()
-    with pytest.raises(OptionError):
-        MatchingOptions(**wrong).check()
+    assert_refused(MatchingOptions(**wrong), next(iter(wrong)))
+
+
+@pytest.mark.parametrize("wrong", [{"p1": 31, "p2_min": 30}, {"p2_min": 130, "p2": 120}, {"p2_min": -1}], ids=str)
+def test_penalties_out_of_order_are_refused(wrong):
+    assert_refused(MatchingOptions(**wrong), "p2_min", "p1", "p2")

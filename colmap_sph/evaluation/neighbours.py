@@ -77,7 +77,8 @@ def voxel_keys(points: Points, size: float, *, offset: float = 0.0) -> npt.NDArr
     if counts[0] * counts[1] * counts[2] >= 2**63:
         raise OptionError(
             f"voxels of {size:g} m are too small for points spread over {(high - low).max():g} m: "
-            "use a larger tau, or remove far outliers from the cloud"
+            "use a larger tau, or remove far outliers from the cloud",
+            "tau",
         )
     keys = np.zeros(len(points), np.int64)
     for axis in range(3):

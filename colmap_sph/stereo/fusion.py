@@ -55,18 +55,20 @@ class FusionOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
         if self.method not in ("best-pixel", "colmap"):
-            raise OptionError(f"fusion method must be 'best-pixel' or 'colmap', not {self.method!r}.")
+            raise OptionError(f"method must be 'best-pixel' or 'colmap', not {self.method!r}.", "method")
         for name in ("min_num_pixels", "max_num_pixels", "max_traversal_depth", "check_num_images"):
             if getattr(self, name) < 1:
-                raise OptionError(f"fusion {name} must be at least 1, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}.", name)
         if self.max_num_pixels < self.min_num_pixels:
             raise OptionError(
-                f"fusion max_num_pixels ({self.max_num_pixels}) must not be less than "
-                f"min_num_pixels ({self.min_num_pixels})."
+                f"max_num_pixels must not be less than min_num_pixels ({self.min_num_pixels}), "
+                f"not {self.max_num_pixels}.",
+                "max_num_pixels",
+                "min_num_pixels",
             )
         for name in ("max_reproj_error", "max_depth_error", "max_normal_error", "cache_size"):
             if not getattr(self, name) > 0:
-                raise OptionError(f"fusion {name} must be positive, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
 
     def for_colmap(self) -> dict[str, Any]:
         """The options that COLMAP's fusion has, too, under its names."""

@@ -81,17 +81,23 @@ class MatchingOptions:
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
-        if not (0 <= self.p1 <= 63 and self.p1 <= self.p2_min <= self.p2 <= 127):
+        for name, most in (("p1", 63), ("p2", 127)):
+            if not 0 <= getattr(self, name) <= most:
+                raise OptionError(f"{name} must lie in 0..{most}, not {getattr(self, name)}.", name)
+        if not self.p1 <= self.p2_min <= self.p2:
             raise OptionError(
-                "penalties must keep 0 <= p1 <= 63 and p1 <= p2_min <= p2 <= 127, not "
-                f"{self.p1}, {self.p2_min}, {self.p2}."
+                f"p2_min must lie between p1 ({self.p1}) and p2 ({self.p2}), not {self.p2_min}.",
+                "p2_min",
+                "p1",
+                "p2",
             )
         if self.p2_contrast < 1:
-            raise OptionError(f"p2_contrast must be at least 1, not {self.p2_contrast}.")
+            raise OptionError(f"p2_contrast must be at least 1, not {self.p2_contrast}.", "p2_contrast")
         for name in ("disparities", "coarse_disparities", "max_coarsest_disparities"):
             value = getattr(self, name)
             if not _STEP <= value <= _MAX_DEPTH or value % _STEP:
-                raise OptionError(f"{name} must be a multiple of {_STEP} up to {_MAX_DEPTH}, not {value}.")
+                message = f"{name} must be a multiple of {_STEP} up to {_MAX_DEPTH}, not {value}."
+                raise OptionError(message, name)
         limits = {
             "range_radius": 50,
             "max_left_right_difference": 100,
@@ -100,10 +106,10 @@ class MatchingOptions:
         }
         for name, most in limits.items():
             if not 0 <= getattr(self, name) <= most:
-                raise OptionError(f"{name} must lie in 0..{most}, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must lie in 0..{most}, not {getattr(self, name)}.", name)
         for name in ("max_slant", "min_segment"):
             if getattr(self, name) < 0:
-                raise OptionError(f"{name} must not be negative, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must not be negative, not {getattr(self, name)}.", name)
 
 
 SINGLE_PAIR = MatchingOptions(max_left_right_excess=56, min_segment=150, median_filter=True)

@@ -41,13 +41,13 @@ class NormalOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
         if not 1 <= self.radius <= 16:
-            raise OptionError(f"the normals' radius must lie in 1..16, not {self.radius}.")
-        if not self.tolerance > 0:
-            raise OptionError(f"the normals' tolerance must be positive, not {self.tolerance}.")
-        if not self.max_shift > 0:
-            raise OptionError(f"the normals' max_shift must be positive, not {self.max_shift}.")
+            raise OptionError(f"radius must lie in 1..16, not {self.radius}.", "radius")
+        for name in ("tolerance", "max_shift"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
         if not 0 < self.max_incidence <= 90:
-            raise OptionError(f"the normals' max_incidence must lie in 0..90 degrees, not {self.max_incidence}.")
+            message = f"max_incidence must lie above 0 and up to 90 degrees, not {self.max_incidence}."
+            raise OptionError(message, "max_incidence")
 
 
 def fit_normals(

@@ -50,14 +50,17 @@ class PairOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of its bounds."""
         if self.num_pairs < 1:
-            raise OptionError(f"num_pairs must be at least 1, not {self.num_pairs}.")
+            raise OptionError(f"num_pairs must be at least 1, not {self.num_pairs}.", "num_pairs")
         if not 0 <= self.min_triangulation_angle < self.max_triangulation_angle <= 180:
             raise OptionError(
-                "0 <= min_triangulation_angle < max_triangulation_angle <= 180 degrees must hold, not "
-                f"{self.min_triangulation_angle} and {self.max_triangulation_angle}."
+                "min_triangulation_angle must be less than max_triangulation_angle, both in 0..180 degrees, not "
+                f"{self.min_triangulation_angle} and {self.max_triangulation_angle}.",
+                "min_triangulation_angle",
+                "max_triangulation_angle",
             )
         if self.min_shared_points < 1:
-            raise OptionError(f"min_shared_points must be at least 1, not {self.min_shared_points}.")
+            message = f"min_shared_points must be at least 1, not {self.min_shared_points}."
+            raise OptionError(message, "min_shared_points")
 
 
 @dataclass(frozen=True)

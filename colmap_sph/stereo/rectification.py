@@ -53,16 +53,20 @@ class RectificationOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
         if self.rectification not in ("spherical", "frame"):
-            raise OptionError(f"rectification must be 'spherical' or 'frame', not {self.rectification!r}.")
+            raise OptionError(
+                f"rectification must be 'spherical' or 'frame', not {self.rectification!r}.", "rectification"
+            )
         if not 0.05 <= self.sampling <= 4:
-            raise OptionError(f"sampling must lie in 0.05..4, not {self.sampling}.")
+            raise OptionError(f"sampling must lie in 0.05..4, not {self.sampling}.", "sampling")
         if not 0.01 <= self.min_cosine <= 0.9:
-            raise OptionError(f"min_cosine must lie in 0.01..0.9, not {self.min_cosine}.")
+            raise OptionError(f"min_cosine must lie in 0.01..0.9, not {self.min_cosine}.", "min_cosine")
         for name in ("near_margin", "far_margin"):
             if not 1 <= getattr(self, name) <= 20:
-                raise OptionError(f"{name} must lie in 1..20, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must lie in 1..20, not {getattr(self, name)}.", name)
         if not 1 <= self.max_pixels_ratio <= 100:
-            raise OptionError(f"max_pixels_ratio must lie in 1..100, not {self.max_pixels_ratio}.")
+            raise OptionError(
+                f"max_pixels_ratio must lie in 1..100, not {self.max_pixels_ratio}.", "max_pixels_ratio"
+            )
 
 
 def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOptions) -> RectifiedPair:

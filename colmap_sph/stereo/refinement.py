@@ -54,18 +54,21 @@ class RefinementOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
         if not 0 <= self.rounds <= 16:
-            raise OptionError(f"the refinement's rounds must lie in 0..16, not {self.rounds}.")
+            raise OptionError(f"rounds must lie in 0..16, not {self.rounds}.", "rounds")
         if not self.max_partners >= 1:
-            raise OptionError(f"max_partners must be at least 1, not {self.max_partners}.")
+            raise OptionError(f"max_partners must be at least 1, not {self.max_partners}.", "max_partners")
         for name in ("depth_freedom", "contrast"):
             if not getattr(self, name) > 0:
-                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
         if not 0 < self.slope_freedom < 90:
-            raise OptionError(f"slope_freedom must lie between 0 and 90 degrees, not {self.slope_freedom}.")
+            message = f"slope_freedom must lie between 0 and 90 degrees, not {self.slope_freedom}."
+            raise OptionError(message, "slope_freedom")
         if not -1 <= self.min_score < 1:
-            raise OptionError(f"min_score must lie in -1..1, not {self.min_score}.")
+            raise OptionError(f"min_score must lie in -1..1, not {self.min_score}.", "min_score")
         if not 1 <= self.smoothing_radius <= 16:
-            raise OptionError(f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.")
+            raise OptionError(
+                f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.", "smoothing_radius"
+            )
 
     def images_used(self, partners: int) -> int:
         """How often a partner's image is matched in, all rounds together, where there are so many partners."""
