@@ -28,7 +28,7 @@ from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
 from colmap_sph.stereo.vote import VoteOptions, depth_candidates, right_disparity, vote_depth
 
-SPHERE, FRAME = RectificationOptions(), RectificationOptions(rectification="frame")
+SPHERE, FRAME = RectificationOptions(), RectificationOptions(surface="frame")
 VOTE = VoteOptions(disparity_sigma=0.3, max_disparity_step=2.0, tolerance=3.0, min_support=1)
 CONFIRM = ConfirmOptions(
     max_reprojection_error=1.0, tolerance=4.0, min_consistent=2, max_contradiction=1.0, min_surface=0.0
@@ -42,7 +42,7 @@ RENDERED = {
 }
 CASES = [*((name, SPHERE) for name in RENDERED), ("convergent", FRAME)]
 every_case = pytest.mark.parametrize(
-    ("name", "options"), CASES, ids=[f"{name} {options.rectification}" for name, options in CASES]
+    ("name", "options"), CASES, ids=[f"{name} {options.surface}" for name, options in CASES]
 )
 both_sides = pytest.mark.parametrize("side", ["left", "right"])
 property_test = settings(max_examples=30, deadline=None, derandomize=True)

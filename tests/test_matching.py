@@ -32,9 +32,9 @@ def rectified_images(synthetic, pair, left, right):
 class Matched:
     """A synthetic pair's disparity map and its truth."""
 
-    def __init__(self, synthetic, rectification="spherical", options=OPTIONS):
+    def __init__(self, synthetic, surface="spherical", options=OPTIONS):
         scene, left, right = scene_of_pair(synthetic)
-        self.pair = rectify_pair(scene, left, right, RectificationOptions(rectification=rectification))
+        self.pair = rectify_pair(scene, left, right, RectificationOptions(surface=surface))
         self.images = rectified_images(synthetic, self.pair, left, right)
         self.disparity = self.match(options)
         self.truth, self.seen = exact_disparity(synthetic.surfaces, left, right, self.pair, "left")
@@ -73,14 +73,14 @@ PLANES = [(0, 0), (25, 120), (45, 0), (45, 90), (60, 0), (60, 30), (60, 90)]
 
 
 @pytest.mark.parametrize(
-    ("slant", "tilt", "rectification"),
+    ("slant", "tilt", "surface"),
     [*((*plane, "spherical") for plane in PLANES), (25, 120, "frame"), (45, 0, "frame"), (60, 30, "frame")],
 )
-def test_planes_are_matched_to_a_fraction_of_a_pixel(slant, tilt, rectification):
-    matched = Matched(syn.slanted_plane_pair(slant, tilt, focal_length=FOCAL, size=SIZE), rectification)
+def test_planes_are_matched_to_a_fraction_of_a_pixel(slant, tilt, surface):
+    matched = Matched(syn.slanted_plane_pair(slant, tilt, focal_length=FOCAL, size=SIZE), surface)
     assert matched.completeness > 0.98
     # Unsharp masking costs 2 % of the precision on these clean pictures, and gives more at edges and in real ones.
-    bound = 0.08 if slant == 60 else 0.055 if rectification == "frame" else 0.05
+    bound = 0.08 if slant == 60 else 0.055 if surface == "frame" else 0.05
     assert np.median(np.abs(matched.error)) < bound
     assert abs(np.median(matched.error)) < 0.03
     assert (np.abs(matched.error) > 1).mean() < 0.01

@@ -5,7 +5,7 @@ Rectified frame: x along the baseline from the left to the right centre, z towar
 
     (sin θ, cos θ sin λ, cos θ cos λ),   λ = row angle about the baseline, θ = angle inside the epipolar plane
 
-and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. On the plane ("frame" model, §3.1) the
+and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. On the plane ("frame", §3.1) the
 ray is (x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described by one record, `RectifiedPair`:
 array coordinate = (angle or tangent) · scale − origin, with pixel centres at whole array coordinates.
 """
@@ -17,7 +17,7 @@ import numpy as np
 
 from colmap_sph.errors import OptionError, RectificationError
 from colmap_sph.scene import Scene, View
-from colmap_sph.stereo.rectified_pair import Float, Model, RectifiedPair
+from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Surface
 
 # Rows repeated on both sides of the seam where a whole circle of epipolar planes is in view.
 _SEAM_ROWS = 32
@@ -36,7 +36,7 @@ _MAX_SIDE = 32766
 class RectificationOptions:
     """How pairs are rectified."""
 
-    rectification: Model = "spherical"
+    surface: Surface = "spherical"
     """Surface the images are resampled to: a sphere around the baseline, or a plane (the classic "frame")."""
     sampling: float = 1.0
     """Rectified pixels per pixel of the finer image."""
@@ -52,10 +52,8 @@ class RectificationOptions:
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
-        if self.rectification not in ("spherical", "frame"):
-            raise OptionError(
-                f"rectification must be 'spherical' or 'frame', not {self.rectification!r}.", "rectification"
-            )
+        if self.surface not in ("spherical", "frame"):
+            raise OptionError(f"surface must be 'spherical' or 'frame', not {self.surface!r}.", "surface")
         if not 0.05 <= self.sampling <= 4:
             raise OptionError(f"sampling must lie in 0.05..4, not {self.sampling}.", "sampling")
         if not 0.01 <= self.min_cosine <= 0.9:
@@ -87,7 +85,7 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
     Raises
     ------
     RectificationError
-        The centres coincide, the images do not overlap, or the chosen model cannot hold the pair.
+        The centres coincide, the images do not overlap, or the chosen surface cannot hold the pair.
     """
     baseline = float(np.linalg.norm(right.center - left.center))
     depths = (scene.points[left.point_indices] - left.center) @ left.viewing_direction
@@ -96,7 +94,7 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
         raise RectificationError("the two images have the same projection centre")
     rotation = _rectifying_rotation(left, right)
     points = _points_in_both(scene, left, right)
-    if options.rectification == "spherical":
+    if options.surface == "spherical":
         return _lay_out_sphere(rotation, baseline, left, right, points, options)
     return _lay_out_plane(rotation, baseline, left, right, points, options)
 
@@ -242,7 +240,7 @@ def _lay_out_sphere(
     seam = _SEAM_ROWS if half >= np.pi else 0
     return _checked_size(
         RectifiedPair(
-            model="spherical",
+            surface="spherical",
             rectified_from_world=rotation,
             baseline=baseline,
             columns_per_radian=scale,
@@ -283,7 +281,7 @@ def _lay_out_plane(
     scale = _finest_scale(left, right, points) * options.sampling
     return _checked_size(
         RectifiedPair(
-            model="frame",
+            surface="frame",
             rectified_from_world=rotation,
             baseline=baseline,
             columns_per_radian=scale,

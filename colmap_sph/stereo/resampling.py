@@ -70,7 +70,7 @@ def _ray_tables(view: View, pair: RectifiedPair, side: Side) -> _RayTables:
     A = pixel_from_rectified_ray(view, pair)
     along = (np.arange(pair.width(side)) + pair.column_origin(side)) / pair.columns_per_radian
     across = (np.arange(pair.height) + pair.row_origin) / pair.rows_per_radian
-    if pair.model == "spherical":
+    if pair.surface == "spherical":
         column_table, column_weight = np.sin(along), np.cos(along)
         row_table = np.outer(A[:, 1], np.sin(across)) + np.outer(A[:, 2], np.cos(across))
     else:

@@ -95,7 +95,7 @@ def depth_candidates(
         geometry.baseline,
         options.disparity_sigma,
         options.max_disparity_step,
-        geometry.model == "spherical",
+        geometry.surface == "spherical",
         side == "left",
         first,
         depth,
