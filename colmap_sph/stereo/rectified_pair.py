@@ -76,6 +76,11 @@ class RectifiedPair:
         return self.left_origin if side == "left" else self.right_origin
 
 
+def ray_angles(rays: Float) -> tuple[Float, Float]:
+    """(n,) angles λ and θ, radians, of (n, 3) rays in the rectified frame."""
+    return np.arctan2(rays[:, 1], rays[:, 2]), np.arctan2(rays[:, 0], np.hypot(rays[:, 1], rays[:, 2]))
+
+
 def pixel_from_rectified_ray(view: View, pair: RectifiedPair) -> Float:
     """(3, 3) matrix from a ray in the rectified frame to the homogeneous pixel of `view`."""
     return np.asarray(view.K @ view.R @ pair.rectified_from_world.T)

@@ -11,6 +11,8 @@ from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, pixel_from_rec
 
 # Images are resampled in bands of this many rows, which bounds the memory for their maps.
 _BAND_ROWS = 128
+# Rays of length about 1 whose depth is less lie beside the camera.
+_LEAST_DEPTH = 1e-6
 
 
 def resample(
@@ -88,7 +90,7 @@ def _pixel_maps(
         np.multiply.outer(row[band], tables.weights) + column
         for row, column in zip(tables.rows, tables.columns, strict=True)
     )
-    in_front = z > 1e-6
+    in_front = z > _LEAST_DEPTH
     np.divide(1, z, out=z, where=in_front)
     x *= z
     y *= z
