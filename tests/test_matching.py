@@ -12,7 +12,7 @@ from scipy import ndimage
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
-from colmap_sph.stereo import matching
+from colmap_sph.stereo import matching, offsets
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
@@ -221,7 +221,7 @@ def test_images_of_unlike_widths_are_matched():
 def smoothed(offset):
     """The matcher's median of offsets in whole pixels, NaN = none."""
     smooth = np.where(np.isnan(offset), np.iinfo(np.int32).min, np.nan_to_num(offset) * 256).astype(np.int32)
-    matching._smooth(smooth)
+    offsets.smooth(smooth)
     return np.where(smooth == np.iinfo(np.int32).min, np.nan, smooth / 256)
 
 
@@ -317,17 +317,17 @@ def test_offsets_are_drawn_away_from_whole_pixels_that_they_are_locked_to():
     fraction = (np.arange(100000) + 0.5) / 100000
     drawn = np.interp(fraction, fraction + 0.12 * np.sin(2 * np.pi * fraction) / (2 * np.pi), fraction)
     offset = np.round(256 * (drawn + np.arange(drawn.size) % 9 - 4)).astype(np.int32)[None]
-    shifts = matching._evening_shifts(offset)
+    shifts = offsets.evening_shifts(offset)
     for values, uneven in ((drawn, (0.1, 0.15)), (offset[0] / 256 + shifts[offset[0] & 255], (0, 0.03))):
         shares = np.histogram(values % 1, bins=8, range=(0, 1))[0] / drawn.size * 8
         assert uneven[0] < np.abs(shares - 1).max() < uneven[1]
     # Drawn to anything but whole pixels, or by more than ever seen, they are the scene's.
     for scenes in (offset + 77, offset - 128, np.round(64 * np.cos(offset / 50)).astype(np.int32)):
-        assert not matching._evening_shifts(scenes).any()
+        assert not offsets.evening_shifts(scenes).any()
     for one in (0, 77, 128, -1):
-        same = np.array([[one, matching._OFFSET_INVALID]], dtype=np.int32)
-        assert matching._evening_shifts(same)[one & 255] == 0
-    assert not matching._evening_shifts(np.full((2, 2), matching._OFFSET_INVALID, np.int32)).any()
+        same = np.array([[one, offsets.INVALID]], dtype=np.int32)
+        assert offsets.evening_shifts(same)[one & 255] == 0
+    assert not offsets.evening_shifts(np.full((2, 2), offsets.INVALID, np.int32)).any()
 
 
 def test_the_excess_is_that_of_the_level(monkeypatch):
@@ -346,7 +346,7 @@ def test_planes_of_few_disparities_are_not_made_worse(angle, monkeypatch):
     """Their fractions are uneven by themselves."""
     scene = syn.slanted_plane_pair(angle, focal_length=FOCAL, size=SIZE)
     error = [np.median(np.abs(Matched(scene, "frame").error))]
-    monkeypatch.setattr(matching, "_evening_shifts", lambda _: np.zeros(256, np.float32))
+    monkeypatch.setattr(offsets, "evening_shifts", lambda _: np.zeros(256, np.float32))
     error.append(np.median(np.abs(Matched(scene, "frame").error)))
     assert error[0] < 1.03 * error[1]
 
