@@ -93,10 +93,9 @@ def _sample(view: View, depth: float) -> NDArray[np.float64]:
 
 
 def sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of (N, 3) points lie before the camera and inside its image; occlusion is not considered."""
-    camera = points @ view.R.T + view.t
-    pixels = camera @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        u, v = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
-        inside = (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
-    return np.asarray(inside & (camera[:, 2] > 0))
+    """Return which of (N, 3) points lie before the camera and inside its image; occlusion is not considered.
+
+    The image ends at the outer edges of its pixels: a point is seen wherever in a pixel it lies.
+    """
+    pixels, depth = view.project(points)
+    return np.asarray((depth > 0) & (pixels > 0).all(axis=1) & (pixels < [view.width, view.height]).all(axis=1))

@@ -18,6 +18,7 @@ from colmap_sph.errors import OptionError, RectificationError
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.disparity_range import Range, columns_with_counterparts, few_digits, parallax_range
 from colmap_sph.stereo.extent import Extent, extent_on_plane, extent_on_sphere
+from colmap_sph.stereo.frusta import sees
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Surface
 
 # In units of the depth: a parallax of some hundredths of a pixel, and more than centres on a grid are off.
@@ -124,12 +125,8 @@ def _points_in_both(scene: Scene, left: View, right: View) -> Float:
     indices = np.union1d(left.point_indices, right.point_indices)
     points = scene.points[indices]
     for view in (left, right):
-        pixel = (points @ view.R.T + view.t) @ view.K.T
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            uv = pixel[:, :2] / pixel[:, 2:]
-        inside = (pixel[:, 2] > 0) & (uv > 0).all(axis=1) & (uv < [view.width, view.height]).all(axis=1)
-        points = points[inside]
-    return np.asarray(points)
+        points = points[sees(view, points)]
+    return points
 
 
 def _finest_scale(left: View, right: View, points: Float) -> float:
