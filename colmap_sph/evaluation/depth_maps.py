@@ -177,8 +177,10 @@ def truth_normals_at_pixel_origin(
         Unit normals in the camera frame, towards the camera; (0, 0, 0) where the depth has none.
     """
     inverse, usable = _inverse_depth_and_corners(centre_depth, edge_tolerance, largest_step)
-    upper_left, upper_right = inverse[:-1, :-1], inverse[:-1, 1:]
-    lower_left, lower_right = inverse[1:, :-1], inverse[1:, 1:]
+    upper_left = inverse[:-1, :-1]
+    upper_right = inverse[:-1, 1:]
+    lower_left = inverse[1:, :-1]
+    lower_right = inverse[1:, 1:]
     along_x = 0.5 * (upper_right - upper_left + lower_right - lower_left)
     along_y = 0.5 * (lower_left - upper_left + lower_right - upper_right)
     mean = 0.25 * (upper_left + upper_right + lower_left + lower_right)

@@ -105,7 +105,8 @@ def check_overlap(cloud: PointCloud, reference: Reference, reach: float) -> None
     low, high = bounds(reference.points)
     if np.all(cloud_low - reach <= high) and np.all(low - reach <= cloud_high):
         return
-    here, there = (cloud_low + cloud_high) / 2, (low + high) / 2
+    here = (cloud_low + cloud_high) / 2
+    there = (low + high) / 2
     places = f"{cloud.name} lies around {_place(here)}, {reference.name} around {_place(there)}"
     for name, crs, centre, other in (
         (cloud.name, cloud.crs, here, there),

@@ -108,7 +108,8 @@ def mean_voxel_shares(points: Points, hits: npt.NDArray[np.bool_], size: float) 
     The voxels are those of two grids, the second shifted by half a voxel, so that it matters less where the
     grid happens to lie.
     """
-    total, voxel_count = np.zeros(hits.shape[1]), 0
+    total = np.zeros(hits.shape[1])
+    voxel_count = 0
     for offset in (0.0, 0.5):
         order, starts = _by_voxel(points, size, offset=offset)
         counts = np.diff(starts, append=len(points))

@@ -42,7 +42,9 @@ class CloudReference:
     movable = True
 
     def __init__(self, cloud: PointCloud, options: EvaluationOptions) -> None:
-        self.name, self.crs, self.z_is_up = cloud.name, cloud.crs, cloud.z_is_up
+        self.name = cloud.name
+        self.crs = cloud.crs
+        self.z_is_up = cloud.z_is_up
         self.points = cloud.points - np.asarray(options.reference_shift)
         self._index = PointIndex(self.points)
 

@@ -38,9 +38,12 @@ class Covisibility:
         points: NDArray[np.float64],
         observed: list[NDArray[np.int64]],
     ) -> None:
-        self.scene, self.source = scene, source
+        self.scene = scene
+        self.source = source
         self.centers = np.array([view.center for view in scene.views])
-        self._weights, self._points, self._observed = weights, points, observed
+        self._weights = weights
+        self._points = points
+        self._observed = observed
         self._angles: dict[tuple[int, int], float] = {}
         self._is_observed = np.zeros(len(points), dtype=bool)
 
@@ -51,7 +54,8 @@ class Covisibility:
     def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the views that share something with view `i`, most first, and how much it is."""
         row = slice(self._weights.indptr[i], self._weights.indptr[i + 1])
-        views, weights = self._weights.indices[row], self._weights.data[row]
+        views = self._weights.indices[row]
+        weights = self._weights.data[row]
         order = np.lexsort((views, -weights))
         return views[order].astype(np.int64), weights[order].astype(np.int64)
 

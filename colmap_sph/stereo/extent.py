@@ -136,7 +136,8 @@ def _rolled(rotation: Float, angle: float) -> Float:
 def _border_rays(view: View, rotation: Float) -> Float:
     """(4 n, 3) rays along the image border, in the rectified frame, in order around the image."""
     t = np.linspace(0, 1, _SIDE_SAMPLES)
-    zero, one = np.zeros_like(t), np.ones_like(t)
+    zero = np.zeros_like(t)
+    one = np.ones_like(t)
     x = np.concatenate([t, one, 1 - t, zero]) * view.width
     y = np.concatenate([zero, t, one, 1 - t]) * view.height
     rays = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(view.K).T

@@ -57,7 +57,8 @@ def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
     for depth in _DEPTHS:
         first = len(points) * count
         samples = [_sample(view, depth * d) for view, d in zip(views, distances, strict=True)]
-        block, points = np.array(samples), points + samples
+        block = np.array(samples)
+        points = points + samples
         targets = centers + depth * distances[:, None] * directions
         nearest = cKDTree(targets).query(targets, k=min(_NUM_TESTED, len(views)))[1]
         for k, i in enumerate(posed):

@@ -136,7 +136,8 @@ def fuse_view(
         For each point the number of these views and their indices: ``fused.ply.vis``.
     """
     shape = reference.depth.shape
-    covered, agreeing = np.zeros(shape, np.uint8), np.zeros(shape, np.uint64)
+    covered = np.zeros(shape, np.uint8)
+    agreeing = np.zeros(shape, np.uint64)
     colour = reference.image.astype(np.uint16)
     indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
     indices[0] = reference.index
@@ -161,13 +162,16 @@ def fuse_view(
             agreeing,
             colour,
         )
-    view, step = reference.view, max(_BAND_PIXELS // shape[1], 1)
+    view = reference.view
+    step = max(_BAND_PIXELS // shape[1], 1)
     pixels = (reference.depth, reference.normals, covered, agreeing, colour, options.min_num_pixels)
-    world_from_pixel, world_from_camera = view.R.T @ np.linalg.inv(view.K), view.R.T
+    world_from_pixel = view.R.T @ np.linalg.inv(view.K)
+    world_from_camera = view.R.T
     frame = (np.ascontiguousarray(world_from_pixel), np.ascontiguousarray(world_from_camera), view.center + offset)
     for first in range(0, shape[0], step):
         rows = (first, min(first + step, shape[0]))
         num_points, num_words = _native.count_points(*pixels, *rows)
-        points, visibility = np.empty((num_points, POINT.itemsize), np.uint8), np.empty(num_words, np.uint32)
+        points = np.empty((num_points, POINT.itemsize), np.uint8)
+        visibility = np.empty(num_words, np.uint32)
         _native.write_points(*pixels, *rows, *frame, indices, points, visibility)
         yield points.view(POINT)[:, 0], visibility

@@ -201,7 +201,8 @@ def _pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
     """Full resolution first. Odd rows and columns are doubled, so that pixel x of a level covers 2x, 2x + 1."""
     pyramid = [image]
     for _ in range(levels):
-        pixels, valid = pyramid[-1].image, pyramid[-1].valid
+        pixels = pyramid[-1].image
+        valid = pyramid[-1].valid
         height, width = pixels.shape
         border = (0, height % 2, 0, width % 2)
         if height % 2 or width % 2:
@@ -243,7 +244,8 @@ def _match_level(
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest are refined from the raw costs."""
     kernels = backend()
-    left_census, image = _census(left), np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
+    left_census = _census(left)
+    image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
     del left
     right_census = _census(right)
     del right

@@ -76,14 +76,16 @@ def fit_normals(
         low, high = max(first - options.radius, 0), min(end + options.radius, view.height)
         kept = slice(first - low, end - low)
         band_normals, band_fitted = _fit_rows(view, estimate, low, high, options)
-        normals[first:end], fitted[first:end] = band_normals[kept], band_fitted[kept]
+        normals[first:end] = band_normals[kept]
+        fitted[first:end] = band_fitted[kept]
     return normals, fitted
 
 
 def _fit_rows(
     view: View, estimate: DepthEstimate, first: int, end: int, options: NormalOptions
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    depth, sigma = estimate.depth[first:end], estimate.sigma[first:end]
+    depth = estimate.depth[first:end]
+    sigma = estimate.sigma[first:end]
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
     inverse_sigma = (sigma * inverse * inverse).astype(np.float32)

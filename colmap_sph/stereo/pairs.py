@@ -199,7 +199,8 @@ def _explicit_selection(
     partners: dict[str, tuple[Partner, ...]] = {}
     obeyed = set(index_of) - set(explicit) != set()
     for name in sorted(explicit.keys() & index_of.keys(), key=index_of.__getitem__):
-        sources, i = explicit[name], index_of[name]
+        sources = explicit[name]
+        i = index_of[name]
         if isinstance(sources, int):
             partners[name] = _best_partners(graph, options, i)
             continue

@@ -26,7 +26,8 @@ _SURVEY_ROWS = 16
 # Partners that bring the planes near in the rounds before the last.
 _FIRST_PARTNERS = 3
 # Arrays of equations, and sources of one call; see `kernels.h`.
-_EQUATIONS, _SOURCES = 12, 32
+_EQUATIONS = 12
+_SOURCES = 32
 
 # A partner's image, and where the pixels of the view lie in it.
 _Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
@@ -110,10 +111,12 @@ def refine_maps(
         partners = _most_telling(view, image, estimate, normals, depth, partners, options)
     for done in range(options.rounds):
         if done:
-            smooth, moved = NormalOptions(radius=options.smoothing_radius), replace(estimate, depth=depth)
+            smooth = NormalOptions(radius=options.smoothing_radius)
+            moved = replace(estimate, depth=depth)
             smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
             fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
-            normals[fitted], depth[fitted] = smooth_normals[fitted], smooth_depth[fitted]
+            normals[fitted] = smooth_normals[fitted]
+            depth[fitted] = smooth_depth[fitted]
         for first in range(0, view.height, _BAND_ROWS):
             rows = slice(first, min(first + _BAND_ROWS, view.height), 1)
             planes = _planes_of_maps(view, normals, depth, rows)
@@ -181,7 +184,8 @@ def _planes_of_maps(
     view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], rows: slice
 ) -> NDArray[np.float32]:
     """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
-    normals, depth = normals[rows], depth[rows]
+    normals = normals[rows]
+    depth = depth[rows]
     # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d. No matrix product: it would wake BLAS's
     # threads for three columns.
     (a, b, c), (_, d, e), _ = np.linalg.inv(view.K).astype(np.float32)
@@ -215,7 +219,8 @@ def _maps_of_planes(
         normals /= np.sqrt(x * x + y * y + z * z)[..., None]
         depth = 1 / inverse
     lost = ~(inverse > 0)
-    normals[lost], depth[lost] = 0, 0
+    normals[lost] = 0
+    depth[lost] = 0
     return normals, depth
 
 

@@ -43,7 +43,8 @@ def _candidates(
     surfaces: Sequence[Surface], cameras: Sequence[Camera], count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Points (N, 3) and world normals (N, 3) behind random places of every picture."""
-    points, normals = [], []
+    points = []
+    normals = []
     for camera in cameras:
         image = rng.uniform([0.0, 0.0], [camera.width, camera.height], (count, 2))
         hits = trace_points(surfaces, camera, image)
@@ -100,7 +101,8 @@ def sample_sparse_points(
     points, normals = _candidates(surfaces, cameras, 2 * count // len(cameras) + 1, rng)
     seen = np.stack([visible(surfaces, camera, points, normals) for camera in cameras])
     kept = rng.permutation(np.flatnonzero(seen.sum(axis=0) >= min_track_length))[:count]
-    points, seen = points[kept], seen[:, kept]
+    points = points[kept]
+    seen = seen[:, kept]
     indices = tuple(np.flatnonzero(row) for row in seen)
     observations = tuple(camera.project(points[rows])[0] for camera, rows in zip(cameras, indices, strict=True))
     return SparsePoints(points, observations, indices)

@@ -128,7 +128,8 @@ def slanted_plane_pair(
     """
     left = Camera(pinhole(focal_length, *size), np.eye(3), np.zeros(3), *size)
     right = replace(left, t=np.array([-baseline, 0.0, 0.0]))
-    angle, direction = np.radians(slant), np.radians(tilt)
+    angle = np.radians(slant)
+    direction = np.radians(tilt)
     normal = (np.sin(angle) * np.cos(direction), np.sin(angle) * np.sin(direction), -np.cos(angle))
     # Between what the foreshortened and the other direction want.
     gsd = depth / focal_length / np.sqrt(max(np.cos(angle), 0.1))
@@ -178,7 +179,8 @@ def forward_motion_pair(
     seed: int = 0,
 ) -> SyntheticPair:
     """Motion by `step` metres along the first camera's axis: the epipole is the principal point."""
-    eye, target = np.array([0.0, -1.0, 3.0]), np.array([0.0, 8.0, 1.2])
+    eye = np.array([0.0, -1.0, 3.0])
+    target = np.array([0.0, 8.0, 1.2])
     axis = (target - eye) / np.linalg.norm(target - eye)
     left = _camera(eye, target, focal_length, size)
     right = _camera(eye + step * axis, target, focal_length, size)

@@ -90,7 +90,8 @@ class Rays:
         starts = np.cumsum([0] + [len(hull) for hull in hulls[:-1]])
         image, depth = self.image(np.concatenate(hulls))
         low, high = np.minimum.reduceat(image, starts), np.maximum.reduceat(image, starts)
-        nearest, farthest = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
+        nearest = np.minimum.reduceat(depth, starts)
+        farthest = np.maximum.reduceat(depth, starts)
         everything: Index = (slice(None),) * len(self.shape)
         found: list[Index | None] = []
         for number in range(len(hulls)):
@@ -122,8 +123,11 @@ class OrthographicRays(Rays):
     def __init__(
         self, x: FloatArray, y: FloatArray, origins: FloatArray, direction: FloatArray, axes: FloatArray
     ) -> None:
-        self.x, self.y, self.axes = x, y, axes
-        self.origins, self.directions = origins, direction
+        self.x = x
+        self.y = y
+        self.axes = axes
+        self.origins = origins
+        self.directions = direction
         self.shape = (y.size, x.size)
 
     def image(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -137,7 +141,10 @@ class PinholeRays(Rays):
     """Rays of unit z through image coordinates: a grid, or a list of places."""
 
     def __init__(self, camera: Camera, x: FloatArray, y: FloatArray, *, grid: bool) -> None:
-        self.camera, self.x, self.y, self.grid = camera, x, y, grid
+        self.camera = camera
+        self.x = x
+        self.y = y
+        self.grid = grid
         self.shape = (y.size, x.size) if grid else x.shape
         ones = (1,) * len(self.shape)
         across = x[None, :] if grid else x

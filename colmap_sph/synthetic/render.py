@@ -61,9 +61,11 @@ def _band_colour(surfaces: Sequence[Surface], rays: Rays, light: Light) -> Float
     colour[:] = _SKY
     directions = rays.directions.reshape(3, -1)
     centre = rays.origins.reshape(3, 1)
-    distance, face = hits.distance.ravel(), hits.face.ravel()
+    distance = hits.distance.ravel()
+    face = hits.face.ravel()
     for number, places in _groups(hits.surface):
-        surface, faces = surfaces[number], face[places]
+        surface = surfaces[number]
+        faces = face[places]
         points = centre + distance[places] * directions[:, places]
         normals = surface.normals(points, faces)
         coordinates = surface.texture_coordinates(points, faces)
@@ -97,7 +99,8 @@ def _normals_in_camera(surfaces: Sequence[Surface], camera: Camera, rays: Rays, 
     normals = np.zeros((3, hits.surface.size))
     directions = rays.directions.reshape(3, -1)
     centre = rays.origins.reshape(3, 1)
-    distance, face = hits.distance.ravel(), hits.face.ravel()
+    distance = hits.distance.ravel()
+    face = hits.face.ravel()
     for number, places in _groups(hits.surface):
         towards = directions[:, places]
         outward = surfaces[number].normals(centre + distance[places] * towards, face[places])

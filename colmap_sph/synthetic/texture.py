@@ -203,7 +203,8 @@ class Painting:
         x, i, i_next = _mirrored((coordinates[0] - self.corner[0]) / self.texel - 0.5, columns)
         y, j, j_next = _mirrored((coordinates[1] - self.corner[1]) / self.texel - 0.5, rows)
         flat = self.pixels.reshape(-1, 4)
-        x, y = x[:, None], y[:, None]
+        x = x[:, None]
+        y = y[:, None]
         low = flat[j * columns + i] * (1 - x) + flat[j * columns + i_next] * x
         high = flat[j_next * columns + i] * (1 - x) + flat[j_next * columns + i_next] * x
         value = (low + (high - low) * y) * np.float32(1.0 / 255.0)
