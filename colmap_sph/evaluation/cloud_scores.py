@@ -165,6 +165,11 @@ def threshold_scores(
         Their distances to the reference.
     reference : Reference
     options : EvaluationOptions
+
+    Returns
+    -------
+    tuple of ThresholdScores
+        One for every τ, ascending.
     """
     taus = options.taus
     if options.definition == "tanks-and-temples":

@@ -166,7 +166,9 @@ def truth_normals_at_pixel_origin(
 
     Parameters
     ----------
-    centre_depth, edge_tolerance, largest_step
+    centre_depth : (H, W) float
+        Exact z-depth at pixel centres, 0 = none.
+    edge_tolerance, largest_step : float
         As for `truth_at_pixel_origin`.
     K : (3, 3) float64
         Pinhole without skew; the first pixel's centre is at (0.5, 0.5).

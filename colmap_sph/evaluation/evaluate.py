@@ -30,6 +30,17 @@ def evaluate_files(
 ) -> list[CloudScores]:
     """Measure the clouds of some files, read one at a time, against the cloud or mesh of another.
 
+    Parameters
+    ----------
+    clouds : sequence of Path
+    reference : Path
+    options : EvaluationOptions, optional
+
+    Returns
+    -------
+    list of CloudScores
+        In the order of the clouds.
+
     Raises
     ------
     InputError, NoResultError, OptionError
@@ -97,7 +108,20 @@ def evaluate_cloud(
 
 
 def check_overlap(cloud: PointCloud, reference: Reference, reach: float) -> None:
-    """Raise InputError, with the remedy, unless the two bounding boxes come within `reach` of each other."""
+    """Make sure that a cloud and its reference lie in one place.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    reference : Reference
+    reach : float
+        Metres that may lie between their bounding boxes.
+
+    Raises
+    ------
+    InputError
+        They are farther apart, or in degrees; the message has the remedy.
+    """
     for name, crs in ((cloud.name, cloud.crs), (reference.name, reference.crs)):
         if crs is not None and crs.startswith("geographic"):
             raise InputError(f"{name} is in degrees, {crs}: reproject it to the metric frame of the other first")

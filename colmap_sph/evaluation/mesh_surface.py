@@ -38,7 +38,21 @@ class MeshSurface:
         self.index = PointIndex(np.concatenate([self.samples, centroids]))
 
     def distances(self, points: Points, *, threads: int = 1, bound: float = np.inf) -> npt.NDArray[np.float64]:
-        """Distance of each of (N, 3) points to the mesh; infinite beyond `bound`."""
+        """Distance of each point to the mesh.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 ndarray
+        threads : int
+            -1: one per core.
+        bound : float
+            Metres.
+
+        Returns
+        -------
+        (n,) float64 ndarray
+            Metres; infinite beyond `bound`.
+        """
         result = np.empty(len(points))
         for start in range(0, len(points), _CHUNK):
             chunk = points[start : start + _CHUNK]

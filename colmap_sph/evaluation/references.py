@@ -28,7 +28,22 @@ class Reference(Protocol):
     """Whether a cloud may be registered to it."""
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
-        """Distance of each of (N, 3) points to the reference; infinite beyond `bound`."""
+        """Distance of each point to the reference.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 ndarray
+            In the reference's frame, metres.
+        threads : int
+            -1: one per core.
+        bound : float
+            Metres.
+
+        Returns
+        -------
+        (n,) float64 ndarray
+            Metres; infinite beyond `bound`.
+        """
         ...
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
@@ -49,9 +64,11 @@ class CloudReference:
         self._index = PointIndex(self.points)
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
+        """As `Reference.distances`."""
         return self._index.distances(points, threads=threads, bound=bound)
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
+        """As `Reference.can_judge`."""
         return np.ones(len(points), bool)
 
 
@@ -69,9 +86,11 @@ class MeshReference:
         self.points = self._surface.samples
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
+        """As `Reference.distances`."""
         return self._surface.distances(points, threads=threads, bound=bound)
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
+        """As `Reference.can_judge`."""
         return np.ones(len(points), bool)
 
 
@@ -101,9 +120,11 @@ class DepthReference:
         self._index = PointIndex(surface)
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
+        """As `Reference.distances`."""
         return self._index.distances(points, threads=threads, bound=bound)
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
+        """As `Reference.can_judge`."""
         return observed(points, self._views)
 
 

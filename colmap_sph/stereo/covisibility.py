@@ -28,7 +28,20 @@ _ANGLE_PERCENTILE = 75
 
 
 class Covisibility:
-    """Candidates of every view with the weight of each, and the angles of pairs, computed when asked for."""
+    """Candidates of every view with the weight of each, and the angles of pairs, computed when asked for.
+
+    Parameters
+    ----------
+    scene : Scene
+    source : "tracks", "database" or "frusta"
+        What the weights rest on.
+    weights : (V, V) sparse array of int
+        What two views share.
+    points : (N, 3) float64 ndarray
+        World frame: the scene's, or samples of the frusta.
+    observed : list of (n,) int64 ndarray
+        For every view the ascending rows of `points` that it observes or has in view.
+    """
 
     def __init__(
         self,

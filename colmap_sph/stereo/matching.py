@@ -165,6 +165,18 @@ def match_pair(
     (H, W) float32 ndarray
         Disparity of every left pixel, pixels; NaN where there is none or where the two directions disagree.
 
+    Examples
+    --------
+    Noise that lies 5 columns further left in the right image:
+
+    >>> texture = np.random.default_rng(0).uniform(0, 255, (64, 105)).astype(np.float32)
+    >>> valid = np.full((64, 100), 255, np.uint8)
+    >>> left = RectifiedImage(np.ascontiguousarray(texture[:, :100]), valid)
+    >>> right = RectifiedImage(np.ascontiguousarray(texture[:, 5:]), valid)
+    >>> disparity = match_pair(left, right, min_disparity=0, max_disparity=10, options=MatchingOptions())
+    >>> round(float(np.nanmedian(disparity)), 2)
+    5.0
+
     References
     ----------
     H. Hirschmüller, Stereo processing by semiglobal matching and mutual information, PAMI 2008,

@@ -68,6 +68,19 @@ def fit_normals(
         Unit vectors in the camera frame, towards the camera; (0, 0, 0) where no plane fits.
     depth : (H, W) float32 ndarray
         Depth of each plane at its pixel; 0 where no plane fits.
+
+    Examples
+    --------
+    A plane that faces the camera:
+
+    >>> K = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
+    >>> view = View(1, "a", 64, 48, K, np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    >>> shape = (48, 64)
+    >>> depth = np.full(shape, 5, np.float32)
+    >>> estimate = DepthEstimate(depth, sigma=depth / 500, support=np.full(shape, 3, np.uint8))
+    >>> normals, fitted = fit_normals(view, estimate, NormalOptions())
+    >>> np.allclose(normals, [0, 0, -1], atol=1e-6), np.allclose(fitted, 5)
+    (True, True)
     """
     normals = np.empty((*estimate.depth.shape, 3), dtype=np.float32)
     fitted = np.empty_like(estimate.depth)

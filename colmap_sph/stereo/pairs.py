@@ -134,6 +134,21 @@ def select_pairs(
     ------
     NoResultError
         No image has a partner.
+
+    Examples
+    --------
+    Three cameras in a row, each of which sees points up to 4 units beside it: neighbours see most of the same.
+
+    >>> import numpy as np
+    >>> from colmap_sph.scene import View
+    >>> K = np.array([[200.0, 0, 100], [0, 200, 100], [0, 0, 1]])
+    >>> points = np.array([(x, y, 8) for x in np.arange(-5, 8) for y in np.arange(-3, 4)])
+    >>> views = []
+    >>> for k in range(3):
+    ...     seen = np.flatnonzero(np.abs(points[:, 0] - k) < 4)
+    ...     views.append(View(k, "abc"[k], 200, 200, K, np.eye(3), np.array([-k, 0, 0]), seen))
+    >>> select_pairs(Scene(tuple(views), points), PairOptions(num_pairs=1)).unique_pairs()
+    [('a', 'b'), ('b', 'c')]
     """
     options.check()
     graph = find_covisibility(scene, options.min_shared_points, matches)

@@ -25,7 +25,20 @@ _ANGLES = (0.0, 6.0, 40.0, 70.0)
 def triangulation_angles(
     points: NDArray[np.float64], center1: NDArray[np.float64], center2: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the angles in degrees, 0 to 180, between the rays from (N, 3) points to two centres."""
+    """Angles between the rays from points to two projection centres.
+
+    Parameters
+    ----------
+    points : (n, 3) float64 ndarray
+        World frame.
+    center1, center2 : (3,) float64 ndarray
+        Projection centres, world frame.
+
+    Returns
+    -------
+    (n,) float64 ndarray
+        Degrees, 0 to 180.
+    """
     rays1 = center1 - points
     rays2 = center2 - points
     # Unlike the arc cosine, exact for small angles.

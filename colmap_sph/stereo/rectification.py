@@ -87,6 +87,22 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
     ------
     RectificationError
         The centres coincide, the images do not overlap, or the chosen surface cannot hold the pair.
+
+    Examples
+    --------
+    Parallel cameras, 1 unit apart, and points 10 to 20 units away: surfaces at half to one and a half times these
+    distances are looked for. On the plane the parallax is baseline over distance.
+
+    >>> import numpy as np
+    >>> K = np.array([[500.0, 0, 200], [0, 500, 150], [0, 0, 1]])
+    >>> points = np.column_stack([np.zeros((101, 2)), np.linspace(10, 20, 101)])
+    >>> left, right = (
+    ...     View(k, "ab"[k], 400, 300, K, np.eye(3), np.array([-k, 0, 0]), np.arange(101)) for k in range(2)
+    ... )
+    >>> pair = rectify_pair(Scene((left, right), points), left, right, RectificationOptions(surface="frame"))
+    >>> parallax = np.array([pair.max_disparity, pair.min_disparity]) + pair.disparity_origin
+    >>> np.round(pair.baseline / (parallax / pair.columns_per_radian)).tolist()
+    [5.0, 30.0]
     """
     baseline = float(np.linalg.norm(right.center - left.center))
     depths = (scene.points[left.point_indices] - left.center) @ left.viewing_direction

@@ -42,6 +42,11 @@ def num_levels(count: int, size: int, most: int) -> int:
         Shortest side of the two images, pixels.
     most : int
         Offsets to search at the coarsest level, at most.
+
+    Returns
+    -------
+    int
+        0: full resolution alone.
     """
     levels = 0
     while _with_spare(count >> levels) > most and (size >> levels) >= 2 * _LEAST_SIDE:

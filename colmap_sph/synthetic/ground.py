@@ -108,7 +108,22 @@ class _Canvas:
 
 
 def rectangle(centre: FloatArray, size: tuple[float, float], yaw: float) -> FloatArray:
-    """Corners (4, 2) of a turned rectangle in metres."""
+    """Corners of a turned rectangle.
+
+    Parameters
+    ----------
+    centre : (2,) float64 ndarray
+        Metres.
+    size : (float, float)
+        Along the turned x and y, metres.
+    yaw : float
+        Radians, counter-clockwise.
+
+    Returns
+    -------
+    (4, 2) float64 ndarray
+        Metres, in order around the rectangle.
+    """
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     signs = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     corners: FloatArray = centre + (signs * np.asarray(size)) @ axes

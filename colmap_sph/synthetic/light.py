@@ -39,6 +39,10 @@ class ShadowMap:
             Points whose convex hull holds what may receive shadow.
         texel : float
             Grid step in metres.
+
+        Returns
+        -------
+        ShadowMap
         """
         casters = [surface for surface in surfaces if surface.corners() is not None]
         down = -np.asarray(sun, dtype=np.float64) / np.linalg.norm(np.asarray(sun))

@@ -61,7 +61,19 @@ def _candidates(
 def visible(
     surfaces: Sequence[Surface], camera: Camera, points: FloatArray, normals: FloatArray
 ) -> npt.NDArray[np.bool_]:
-    """Whether a camera sees surface points (N, 3) with outward normals (N, 3), not too grazing."""
+    """Whether a camera sees points of surfaces, not too grazing.
+
+    Parameters
+    ----------
+    surfaces : sequence of Surface
+    camera : Camera
+    points, normals : (N, 3) float64 ndarray
+        On the surfaces, and outward; world frame.
+
+    Returns
+    -------
+    (N,) bool ndarray
+    """
     image, depth = camera.project(points)
     seen: npt.NDArray[np.bool_] = (depth > 0) & np.all(
         (image > _BORDER) & (image < np.array([camera.width, camera.height]) - _BORDER), axis=1
@@ -144,6 +156,10 @@ def build_reconstruction(
         Standard deviation in pixels added to the exact observations.
     rng : numpy.random.Generator, optional
         Needed for the noise.
+
+    Returns
+    -------
+    pycolmap.Reconstruction
     """
     rng = rng or np.random.default_rng(0)
     model = pycolmap.Reconstruction()

@@ -59,7 +59,19 @@ class Noise:
         self._cells: Float32Array = rng.random((_CELLS, _CELLS), dtype=np.float32)
 
     def sample(self, u: FloatArray, v: FloatArray, stretch: float = 1.0) -> Float32Array:
-        """Field of zero mean and unit variance at (u, v) in metres, its features enlarged by `stretch`."""
+        """Field of zero mean and unit variance.
+
+        Parameters
+        ----------
+        u, v : float64 ndarray
+            Coordinates, metres; of one shape.
+        stretch : float
+            Features are so many times larger.
+
+        Returns
+        -------
+        float32 ndarray of the same shape
+        """
         x = u * (self._scale / stretch)
         y = v * (self._scale / stretch)
         column = np.floor(x)

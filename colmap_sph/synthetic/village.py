@@ -224,6 +224,10 @@ def build_village(gsd: float, buildings: int, trees: int, seed: int) -> Village:
         How many; fewer where there is no room.
     seed : int
         The same seed gives the same village.
+
+    Returns
+    -------
+    Village
     """
     rng = np.random.default_rng(seed)
     noise = Noise(gsd, seed)
