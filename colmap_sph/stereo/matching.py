@@ -1,8 +1,8 @@
 """Rectified pair → disparity map: hierarchical semi-global matching.
 
-Census (9 × 7) of the sharpened images, Hamming cost, aggregation along 8 paths (Hirschmüller 2008), left-right
-check, sub-pixel fit without pixel locking, and removal of small segments, on an image pyramid with per-pixel
-search ranges (Rothermel et al. 2012, "tSGM"; see `search_ranges`).
+Census (9 × 7) of the sharpened images, Hamming cost, aggregation along 8 paths (Hirschmüller 2008), comparison
+of the matches from left and from right, sub-pixel fit without pixel locking, and removal of small segments, on an
+image pyramid with per-pixel search ranges (Rothermel et al. 2012, "tSGM"; see `search_ranges`).
 
 This module is the only caller of the matching kernels. Their convention is an *offset*, target column minus
 reference column; with the left image as reference it is minus the disparity.
@@ -254,7 +254,7 @@ def _match_level(
     *,
     finest: bool,
 ) -> NDArray[np.int32]:
-    """Offsets of one level, 1/256 pixel; those of the finest are refined from the raw costs."""
+    """Offsets of one level, 1/256 pixel; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
     left_census = _census(left)
     image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
@@ -278,9 +278,9 @@ def _match_level(
     )
     if not finest:
         return offset
-    refined = np.empty_like(offset)
-    _native.refine_offsets(kernels, offset, left_census, right_census, refined)
-    return refined
+    fitted = np.empty_like(offset)
+    _native.refine_offsets(kernels, offset, left_census, right_census, fitted)
+    return fitted
 
 
 def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:

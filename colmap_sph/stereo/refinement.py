@@ -1,4 +1,4 @@
-"""Checked depth and normals → refined ones, by least-squares matching of small planes.
+"""Confirmed depth and normals → refined ones, by least-squares matching of small planes.
 
 Every pixel's plane carries the window around it into the images of its partners. How far the windows differ there,
 and how that changes with the plane, gives normal equations; all partners together move the plane a little, against
@@ -42,7 +42,7 @@ class RefinementOptions:
     max_partners: int = 8
     """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
     depth_freedom: float = 6.0
-    """How far a depth may move: the standard deviation it is given, as a multiple of that of the checked depth."""
+    """How far a depth may move: the standard deviation it is given, in those of the confirmed depth."""
     slope_freedom: float = 5.0
     """How far a plane may turn: the standard deviation it is given, degrees."""
     contrast: float = 20.0
@@ -94,7 +94,7 @@ def refine_maps(
     image : (H, W) uint8 ndarray
         Its grey image.
     estimate : DepthEstimate
-        Checked depth, whose standard deviations say how far the planes may move.
+        Confirmed depth, whose standard deviations say how far the planes may move.
     normals, depth : (H, W, 3) and (H, W) float32 ndarray
         The planes that `fit_normals` fitted to it; changed.
     sources : sequence of (View, (h, w) uint8 ndarray)
@@ -158,7 +158,7 @@ def _most_telling(
 def _freedom(
     sigma: NDArray[np.float32], planes: NDArray[np.float32], options: RefinementOptions
 ) -> NDArray[np.float32]:
-    """Standard deviation that planes' inverse depths are given, from that of their checked depth."""
+    """Standard deviation that planes' inverse depths are given, from that of their confirmed depth."""
     return np.asarray(options.depth_freedom * sigma * planes[0] ** 2, np.float32)
 
 
