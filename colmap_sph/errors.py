@@ -71,4 +71,4 @@ class OutOfMemoryError(ColmapSphError):
 
 
 class RectificationError(ColmapSphError):
-    """A pair that the chosen rectification model cannot handle; the pair is skipped and reported."""
+    """A pair that cannot be rectified on the chosen surface; the pair is skipped and reported."""

@@ -69,6 +69,38 @@ class View:
         """The view as if it observed no sparse point: all that a worker needs of it."""
         return replace(self, point_indices=self.point_indices[:0])
 
+    def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Project points into the image, wherever its borders are.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 ndarray
+            World frame, model units.
+
+        Returns
+        -------
+        pixels : (n, 2) float64 ndarray
+            Image coordinates x and y; the image reaches from 0 to its width and height, and its first pixel's
+            centre is (0.5, 0.5). Not finite for points in the plane of the camera's centre.
+        depth : (n,) float64 ndarray
+            z in the camera frame, model units; not positive for points that are not in front of the camera.
+
+        Examples
+        --------
+        A point 2 units to the right, at a distance of 10, with a focal length of 100 pixels: 20 pixels right.
+
+        >>> import numpy as np
+        >>> K = np.array([[100.0, 0, 320], [0, 100, 240], [0, 0, 1]])
+        >>> view = View(1, "a.jpg", 640, 480, K, np.eye(3), np.zeros(3), np.empty(0, np.int64))
+        >>> pixels, depth = view.project(np.array([[2.0, 0, 10]]))
+        >>> pixels.tolist(), depth.tolist()
+        ([[340.0, 240.0]], [10.0])
+        """
+        camera = points @ self.R.T + self.t
+        homogeneous = camera @ self.K.T
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            return homogeneous[:, :2] / homogeneous[:, 2:], camera[:, 2]
+
 
 def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:
     """Return the (3, 4) matrix [A | a] from pixels of one view to those of another.

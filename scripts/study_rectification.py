@@ -4,7 +4,7 @@
     python scripts/study_rectification.py --model sparse/0 --lidar lidar.laz --output /tmp/study
 
 Without --model it takes the shared test block `penta` (COLMAP_SPH_DATA, or ../shared/data beside the repository).
-Both models get the same pairs, matcher and options; each is computed in a process of its own, so that the peak
+Both surfaces get the same pairs, matcher and options; each is computed in a process of its own, so that the peak
 memory is its own. OUTPUT gets study.md, study.json and the plots. What is already computed in OUTPUT with the same
 options is measured again, not computed again. Needs matplotlib: pip install 'colmap_sph[study]'.
 """
@@ -57,7 +57,7 @@ def main(study: Study) -> None:
     study.output.mkdir(parents=True, exist_ok=True)
     results = {
         name: runs.reconstruct(study.model, study.images, study.output / name, study.run, name)
-        for name in runs.MODELS
+        for name in runs.SURFACES
     }
     scene = read_scene(results["spherical"].workspace.sparse_dir)
     gsd = study.gsd or median_gsd(scene)
@@ -71,9 +71,9 @@ def main(study: Study) -> None:
         "model": str(study.model),
         "images": len(scene.views),
         "gsd_m": gsd,
-        "cost": {model: run.cost for model, run in results.items()},
-        "skipped_pairs": {model: run.report["skipped_pairs"] for model, run in results.items()},
-        "points": {model: run.points() for model, run in results.items()},
+        "cost": {surface: run.cost for surface, run in results.items()},
+        "skipped_pairs": {surface: run.report["skipped_pairs"] for surface, run in results.items()},
+        "points": {surface: run.points() for surface, run in results.items()},
         "pairs": scored_pairs,
         "by_angle": pairs.by_angle(scored_pairs),
     }
@@ -84,8 +84,8 @@ def main(study: Study) -> None:
         print("measuring: exact depth", flush=True)
         content["exact_clouds"] = clouds.against_exact_depth(results, exact, gsd)
         content["exact_depth_maps"] = {
-            model: mean_of_depth_maps(score_depth_maps(run.workspace, exact)).as_dict()
-            for model, run in results.items()
+            surface: mean_of_depth_maps(score_depth_maps(run.workspace, exact)).as_dict()
+            for surface, run in results.items()
         }
 
     figures = [plots.points_per_image(content, study.output), plots.pairs_by_angle(content, study.output)]

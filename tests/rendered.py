@@ -46,9 +46,9 @@ def project(view, points):
 
 
 def array_coordinates(pair, side, directions):
-    """(columns, rows) in a rectified image of world directions (n, 3), by the model's definition."""
+    """(columns, rows) in a rectified image of world directions (n, 3), by the surface's definition."""
     x, y, z = pair.rectified_from_world @ np.asarray(directions).T
-    if pair.model == "spherical":
+    if pair.surface == "spherical":
         along, across = np.arctan2(x, np.sqrt(y**2 + z**2)), np.arctan2(y, z)
     else:
         along, across = x / z, y / z
@@ -75,7 +75,7 @@ def source_pixels(view, pair, side):
     column, row = np.meshgrid(np.arange(pair.width(side)), np.arange(pair.height))
     along = (column + pair.column_origin(side)) / pair.columns_per_radian
     across = (row + pair.row_origin) / pair.rows_per_radian
-    if pair.model == "spherical":
+    if pair.surface == "spherical":
         rays = [np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)]
     else:
         rays = [along, across, np.ones_like(along)]

@@ -78,15 +78,15 @@ def test_pictures_hardly_move(scale, tracks):
     np.testing.assert_array_equal(result.points + result.anchor, scene.points - result.anchor + result.anchor)
 
 
-@pytest.mark.parametrize("model", ["spherical", "frame"])
+@pytest.mark.parametrize("surface", ["spherical", "frame"])
 @pytest.mark.parametrize("offset", OFFSETS)
-def test_rectified_pairs_do_not_depend_on_where_the_model_lies(offset, model):
+def test_rectified_pairs_do_not_depend_on_where_the_model_lies(offset, surface):
     """Nor on the last digits of the sparse points, which differ."""
     near, far = anchored(make_scene()), anchored(shifted(make_scene(), offset))
     assert not np.array_equal(near.points, far.points)
     for k in range(1, len(near.views)):
         pairs = [
-            rectify_pair(s, s.views[0], s.views[k], RectificationOptions(rectification=model)) for s in (near, far)
+            rectify_pair(s, s.views[0], s.views[k], RectificationOptions(surface=surface)) for s in (near, far)
         ]
         assert digest(pairs[0]) == digest(pairs[1])
 

@@ -19,7 +19,7 @@ SIZE, FOCAL, BASELINE = (240, 180), 300.0, 1.5
 
 
 def reconstruct(surfaces, light, cameras):
-    """Geometric estimate and normals of every view, matched in all pairs."""
+    """Geometric depth and normals of every view, matched in all pairs."""
     scene = scene_of(surfaces, cameras)
     pictures = {
         view.name: grey(syn.render(surfaces, c.K, c.R, c.t, c.width, c.height, light=light))
@@ -41,10 +41,10 @@ def reconstruct(surfaces, light, cameras):
     results = []
     for view in scene.views:
         partners = [(other, own[other.name]) for other in scene.views if other is not view]
-        checked = confirm_depth(view, own[view.name], partners, ConfirmOptions())
-        normals, fitted = fit_normals(view, checked, NormalOptions())
-        checked.depth[fitted == 0] = 0
-        results.append((checked, normals))
+        confirmed = confirm_depth(view, own[view.name], partners, ConfirmOptions())
+        normals, fitted = fit_normals(view, confirmed, NormalOptions())
+        confirmed.depth[fitted == 0] = 0
+        results.append((confirmed, normals))
     return results
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import assert_refused
 from scipy.special import erf
 
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
@@ -217,16 +218,16 @@ def test_the_table_names_each_cloud():
         ({"distance_cap": 0.0}, "distance_cap must be"),
         ({"registration_distance": math.inf}, "registration_distance must be"),
         ({"truth_spacing": 0.0}, "truth_spacing must be"),
-        ({"definition": "dtu"}, "definition is"),
-        ({"crop": "polygon"}, "crop is"),
-        ({"reference_shift": (1.0, math.nan, 0.0)}, "reference_shift is"),
+        ({"definition": "dtu"}, "definition must be"),
+        ({"crop": "polygon"}, "crop must be"),
+        ({"reference_shift": (1.0, math.nan, 0.0)}, "reference_shift must be"),
         ({"min_view_count": 0}, "min_view_count must"),
         ({"threads": -1}, "threads must"),
     ],
 )
 def test_options_out_of_bounds_are_named(change, message):
-    with pytest.raises(OptionError, match=message):
-        EvaluationOptions(**change).check()
+    error = assert_refused(EvaluationOptions(**change), *change)
+    assert str(error).startswith(message)
 
 
 def test_bad_clouds_are_named():

@@ -8,6 +8,7 @@ import numpy as np
 import oracle
 import pytest
 from exact_maps import HEIGHT, WIDTH, make_workspace, stored_maps, write_maps
+from refusals import assert_refused
 from scipy.spatial import cKDTree
 
 from colmap_sph import synthetic as syn
@@ -441,8 +442,8 @@ def test_what_cannot_be_fused_is_named(what, kind, tmp_path):
 
 
 def test_unknown_method():
-    with pytest.raises(OptionError, match="'best-pixel' or 'colmap', not 'pmvs'"):
-        FusionOptions(method="pmvs").check()
+    error = assert_refused(FusionOptions(method="pmvs"), "method")
+    assert "'best-pixel' or 'colmap', not 'pmvs'" in str(error)
 
 
 def test_reprojection_takes_no_points_from_us(workspace):

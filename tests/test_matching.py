@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import assert_refused
 from rendered import exact_disparity, grey, scene_of_pair
 from scipy import ndimage
 
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
-from colmap_sph.stereo import matching
+from colmap_sph.stereo import matching, offsets
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
@@ -31,9 +32,9 @@ def rectified_images(synthetic, pair, left, right):
 class Matched:
     """A synthetic pair's disparity map and its truth."""
 
-    def __init__(self, synthetic, rectification="spherical", options=OPTIONS):
+    def __init__(self, synthetic, surface="spherical", options=OPTIONS):
         scene, left, right = scene_of_pair(synthetic)
-        self.pair = rectify_pair(scene, left, right, RectificationOptions(rectification=rectification))
+        self.pair = rectify_pair(scene, left, right, RectificationOptions(surface=surface))
         self.images = rectified_images(synthetic, self.pair, left, right)
         self.disparity = self.match(options)
         self.truth, self.seen = exact_disparity(synthetic.surfaces, left, right, self.pair, "left")
@@ -72,14 +73,14 @@ PLANES = [(0, 0), (25, 120), (45, 0), (45, 90), (60, 0), (60, 30), (60, 90)]
 
 
 @pytest.mark.parametrize(
-    ("slant", "tilt", "rectification"),
+    ("slant", "tilt", "surface"),
     [*((*plane, "spherical") for plane in PLANES), (25, 120, "frame"), (45, 0, "frame"), (60, 30, "frame")],
 )
-def test_planes_are_matched_to_a_fraction_of_a_pixel(slant, tilt, rectification):
-    matched = Matched(syn.slanted_plane_pair(slant, tilt, focal_length=FOCAL, size=SIZE), rectification)
+def test_planes_are_matched_to_a_fraction_of_a_pixel(slant, tilt, surface):
+    matched = Matched(syn.slanted_plane_pair(slant, tilt, focal_length=FOCAL, size=SIZE), surface)
     assert matched.completeness > 0.98
     # Unsharp masking costs 2 % of the precision on these clean pictures, and gives more at edges and in real ones.
-    bound = 0.08 if slant == 60 else 0.055 if rectification == "frame" else 0.05
+    bound = 0.08 if slant == 60 else 0.055 if surface == "frame" else 0.05
     assert np.median(np.abs(matched.error)) < bound
     assert abs(np.median(matched.error)) < 0.03
     assert (np.abs(matched.error) > 1).mean() < 0.01
@@ -220,7 +221,7 @@ def test_images_of_unlike_widths_are_matched():
 def smoothed(offset):
     """The matcher's median of offsets in whole pixels, NaN = none."""
     smooth = np.where(np.isnan(offset), np.iinfo(np.int32).min, np.nan_to_num(offset) * 256).astype(np.int32)
-    matching._smooth(smooth)
+    offsets.smooth(smooth)
     return np.where(smooth == np.iinfo(np.int32).min, np.nan, smooth / 256)
 
 
@@ -316,17 +317,17 @@ def test_offsets_are_drawn_away_from_whole_pixels_that_they_are_locked_to():
     fraction = (np.arange(100000) + 0.5) / 100000
     drawn = np.interp(fraction, fraction + 0.12 * np.sin(2 * np.pi * fraction) / (2 * np.pi), fraction)
     offset = np.round(256 * (drawn + np.arange(drawn.size) % 9 - 4)).astype(np.int32)[None]
-    shifts = matching._evening_shifts(offset)
+    shifts = offsets.evening_shifts(offset)
     for values, uneven in ((drawn, (0.1, 0.15)), (offset[0] / 256 + shifts[offset[0] & 255], (0, 0.03))):
         shares = np.histogram(values % 1, bins=8, range=(0, 1))[0] / drawn.size * 8
         assert uneven[0] < np.abs(shares - 1).max() < uneven[1]
     # Drawn to anything but whole pixels, or by more than ever seen, they are the scene's.
     for scenes in (offset + 77, offset - 128, np.round(64 * np.cos(offset / 50)).astype(np.int32)):
-        assert not matching._evening_shifts(scenes).any()
+        assert not offsets.evening_shifts(scenes).any()
     for one in (0, 77, 128, -1):
-        same = np.array([[one, matching._OFFSET_INVALID]], dtype=np.int32)
-        assert matching._evening_shifts(same)[one & 255] == 0
-    assert not matching._evening_shifts(np.full((2, 2), matching._OFFSET_INVALID, np.int32)).any()
+        same = np.array([[one, offsets.INVALID]], dtype=np.int32)
+        assert offsets.evening_shifts(same)[one & 255] == 0
+    assert not offsets.evening_shifts(np.full((2, 2), offsets.INVALID, np.int32)).any()
 
 
 def test_the_excess_is_that_of_the_level(monkeypatch):
@@ -345,7 +346,7 @@ def test_planes_of_few_disparities_are_not_made_worse(angle, monkeypatch):
     """Their fractions are uneven by themselves."""
     scene = syn.slanted_plane_pair(angle, focal_length=FOCAL, size=SIZE)
     error = [np.median(np.abs(Matched(scene, "frame").error))]
-    monkeypatch.setattr(matching, "_evening_shifts", lambda _: np.zeros(256, np.float32))
+    monkeypatch.setattr(offsets, "evening_shifts", lambda _: np.zeros(256, np.float32))
     error.append(np.median(np.abs(Matched(scene, "frame").error)))
     assert error[0] < 1.03 * error[1]
 
@@ -384,10 +385,9 @@ def test_an_unknown_backend_is_refused(monkeypatch):
     "wrong",
     [
         {"p1": -1},
-        {"p1": 31, "p2_min": 30},
-        {"p2_min": 130, "p2": 120},
         {"p1": 64, "p2_min": 64},
         {"p2": 128},
+        {"p2": -1},
         {"p2_contrast": 0},
         *[{"disparities": value} for value in (0, 16, 33, 1056, -32)],
         *[{"coarse_disparities": value} for value in (0, 48)],
@@ -407,5 +407,9 @@ def test_an_unknown_backend_is_refused(monkeypatch):
 )
 def test_options_out_of_bounds_are_refused(wrong):
     OPTIONS.check()
-    with pytest.raises(OptionError):
-        MatchingOptions(**wrong).check()
+    assert_refused(MatchingOptions(**wrong), next(iter(wrong)))
+
+
+@pytest.mark.parametrize("wrong", [{"p1": 31, "p2_min": 30}, {"p2_min": 130, "p2": 120}, {"p2_min": -1}], ids=str)
+def test_penalties_out_of_order_are_refused(wrong):
+    assert_refused(MatchingOptions(**wrong), "p2_min", "p1", "p2")

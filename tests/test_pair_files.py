@@ -20,7 +20,7 @@ HEIGHT, WIDTH = 6, 9
 def make_pair(disparity: np.ndarray) -> PairDisparity:
     """A pair of rather ugly numbers, which must survive to the last bit."""
     geometry = RectifiedPair(
-        model="spherical",
+        surface="spherical",
         rectified_from_world=np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0],
         baseline=np.pi * 1e5,
         columns_per_radian=1 / 3,

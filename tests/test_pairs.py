@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from refusals import assert_refused
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.project.database import read_verified_matches
@@ -213,17 +214,22 @@ def test_no_pair_at_all(line: Scene) -> None:
             select_pairs(line, FEW, explicit=explicit)
 
 
+ANGLES = ("min_triangulation_angle", "max_triangulation_angle")
+
+
 @pytest.mark.parametrize(
-    "options",
+    ("options", "names"),
     [
-        PairOptions(num_pairs=0),
-        PairOptions(min_triangulation_angle=-1),
-        PairOptions(min_triangulation_angle=61),
-        PairOptions(max_triangulation_angle=181),
-        PairOptions(min_shared_points=0),
+        (PairOptions(num_pairs=0), ("num_pairs",)),
+        (PairOptions(min_triangulation_angle=-1), ANGLES),
+        (PairOptions(min_triangulation_angle=61), ANGLES),
+        (PairOptions(max_triangulation_angle=181), ANGLES),
+        (PairOptions(min_triangulation_angle=float("nan")), ANGLES),
+        (PairOptions(min_shared_points=0), ("min_shared_points",)),
     ],
 )
-def test_options_out_of_bounds(line: Scene, options: PairOptions) -> None:
+def test_options_out_of_bounds(line: Scene, options: PairOptions, names: tuple[str, ...]) -> None:
+    assert_refused(options, *names)
     with pytest.raises(OptionError):
         select_pairs(line, options)
 

@@ -41,7 +41,7 @@ from colmap_sph.stereo.vote import VoteOptions
 from colmap_sph.synthetic import DemoBlock
 
 FEW_PAIRS = RunOptions(threads=2, pairs=PairOptions(num_pairs=2))
-FRAME = replace(FEW_PAIRS, rectification=RectificationOptions(rectification="frame"))
+FRAME = replace(FEW_PAIRS, rectification=RectificationOptions(surface="frame"))
 NADIR = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 
 

@@ -10,6 +10,8 @@ import pytest
 from colmap_sph.errors import InputError
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.sparse_model import load_model
+from colmap_sph.scene import View
+from colmap_sph.stereo.frusta import sees
 
 
 def make_model(camera_model: str = "PINHOLE", num_images: int = 4) -> pycolmap.Reconstruction:
@@ -58,14 +60,32 @@ def test_scene_agrees_with_colmap(tmp_path: Path, text: bool, camera_model: str)
         seen = [i for i in range(30) if (i + view.image_id) % 3]
         expected = np.array([model.point3D(i + 1).xyz for i in seen])
         np.testing.assert_allclose(scene.points[view.point_indices], expected, atol=1e-12)
-        for point in expected:
-            x, y, z = view.K @ (view.R @ point + view.t)
+        for point, pixel, depth in zip(expected, *view.project(expected), strict=True):
             projected = image.project_point(point)
             assert projected is not None
-            np.testing.assert_allclose([x / z, y / z], projected, atol=1e-9)
+            np.testing.assert_allclose(pixel, projected, atol=1e-9)
+            np.testing.assert_allclose(depth, (image.cam_from_world() * point)[2], atol=1e-12)
         np.testing.assert_allclose(view.center, image.projection_center(), atol=1e-12)
         np.testing.assert_allclose(view.viewing_direction, image.viewing_direction(), atol=1e-12)
         np.testing.assert_allclose(view.cam_from_world, image.cam_from_world().matrix(), atol=1e-12)
+
+
+def test_points_that_have_no_pixel_are_told_by_their_depth() -> None:
+    K = np.array([[100.0, 0, 50], [0, 200, 40], [0, 0, 1]])
+    view = View(1, "a", 100, 80, K, np.eye(3), np.array([0, 0, -1.0]), np.empty(0, np.int64))
+    pixels, depth = view.project(np.array([[0.1, 0.2, 2], [0.1, 0.2, 0], [0.1, 0.2, 1], [0, 0, 1]]))
+    assert depth.tolist() == [1, -1, 0, 0]
+    np.testing.assert_allclose(pixels[:2], [[60, 80], [40, 0]], atol=1e-12)
+    assert not np.isfinite(pixels[2:]).any()
+
+
+def test_an_image_ends_at_the_outer_edges_of_its_pixels() -> None:
+    view = View(1, "a", 100, 80, np.diag([1.0, 1, 1]), np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    inside = [[0.01, 0.01], [99.99, 79.99], [50, 0.01], [0.01, 40]]
+    outside = [[-0.01, 40], [100.01, 40], [50, -0.01], [50, 80.01]]
+    for depth, seen in ((1, [True] * 4 + [False] * 4), (-1, [False] * 8)):
+        points = np.column_stack([inside + outside, np.ones(8)]) * depth
+        assert sees(view, points).tolist() == seen
 
 
 def test_view_by_name(tmp_path: Path) -> None:

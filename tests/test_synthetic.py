@@ -374,8 +374,9 @@ def test_block_does_not_depend_on_threads(block, tmp_path):
 
 
 def test_block_options_name_every_bound():
-    with pytest.raises(OptionError, match=r"forward_overlap = 1\.5 .*points = 0 "):
+    with pytest.raises(OptionError, match=r"forward_overlap = 1\.5 .*points = 0 ") as refused:
         syn.BlockOptions(forward_overlap=1.5, points=0).check()
+    assert refused.value.names == ("forward_overlap", "points")
 
 
 def test_unwritable_output_is_one_sentence(tmp_path: Path):

@@ -1,7 +1,14 @@
 """Clouds and depth maps against truth. Needs no stage of the pipeline.
 
->>> scores = evaluate_files([Path("fused.ply")], Path("lidar.laz"), EvaluationOptions(gsd=0.1))
->>> print(format_clouds(scores))
+Files are measured by `evaluate_files`, arrays so. A cloud 3 cm above its reference:
+
+>>> import numpy as np
+>>> ground = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), axis=-1).reshape(-1, 3)
+>>> reference = make_reference(PointCloud("ground", ground))
+>>> options = EvaluationOptions(tau=(0.02, 0.05), register=False)
+>>> scores = evaluate_cloud(PointCloud("cloud", ground + [0, 0, 0.03]), reference, options)
+>>> [(threshold.tau, threshold.accuracy) for threshold in scores.thresholds]
+[(0.02, 0.0), (0.05, 1.0)]
 """
 
 from colmap_sph.evaluation.cloud_scores import CloudScores, DistanceStatistics, ThresholdScores

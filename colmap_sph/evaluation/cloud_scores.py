@@ -165,6 +165,11 @@ def threshold_scores(
         Their distances to the reference.
     reference : Reference
     options : EvaluationOptions
+
+    Returns
+    -------
+    tuple of ThresholdScores
+        One for every τ, ascending.
     """
     taus = options.taus
     if options.definition == "tanks-and-temples":
@@ -193,7 +198,8 @@ def _shares(
 
 
 def _thinned_scores(cloud: Points, reference: Points, tau: float, threads: int) -> ThresholdScores:
-    source, target = voxel_centroids(cloud, tau / 2), voxel_centroids(reference, tau / 2)
+    source = voxel_centroids(cloud, tau / 2)
+    target = voxel_centroids(reference, tau / 2)
     forward = PointIndex(target).distances(source, threads=threads, bound=tau)
     backward = PointIndex(source).distances(target, threads=threads, bound=tau)
     return ThresholdScores(tau, float(np.mean(forward < tau)), float(np.mean(backward < tau)))

@@ -25,7 +25,7 @@ class DepthMapScores:
     truth_pixels: int
     """Pixels that have exact depth: the ones that are judged."""
     compared_pixels: int
-    """Judged pixels that have an estimated depth."""
+    """Judged pixels that have a depth."""
     coverage: float
     """compared_pixels / truth_pixels."""
     thresholds: tuple[float, ...]
@@ -35,7 +35,7 @@ class DepthMapScores:
     median_error: float
     """Median absolute depth error of the compared pixels, in GSD; NaN without one."""
     median_normal_angle: float | None = None
-    """Median angle in degrees between estimated and exact normals; None where not asked for."""
+    """Median angle in degrees between the map's and the exact normals; None where not asked for."""
     normal_coverage: float | None = None
     """Share of the compared pixels that have both normals; None where not asked for."""
 
@@ -68,12 +68,12 @@ def compare_depth_map(
     normals: npt.NDArray[np.float32] | None = None,
     truth_normals: npt.NDArray[np.float32] | None = None,
 ) -> DepthMapScores:
-    """Score an estimated depth map against exact depth on the same pixel grid.
+    """Score a depth map against exact depth on the same pixel grid.
 
     Parameters
     ----------
     depth : (H, W) float
-        Estimated z-depth; values that are not positive and finite mean none.
+        z-depth; values that are not positive and finite mean none.
     truth : (H, W) float
         Exact z-depth in the same unit and at the same pixel origin (see `truth_at_pixel_origin`); none as
         above.
@@ -166,7 +166,9 @@ def truth_normals_at_pixel_origin(
 
     Parameters
     ----------
-    centre_depth, edge_tolerance, largest_step
+    centre_depth : (H, W) float
+        Exact z-depth at pixel centres, 0 = none.
+    edge_tolerance, largest_step : float
         As for `truth_at_pixel_origin`.
     K : (3, 3) float64
         Pinhole without skew; the first pixel's centre is at (0.5, 0.5).
@@ -177,8 +179,10 @@ def truth_normals_at_pixel_origin(
         Unit normals in the camera frame, towards the camera; (0, 0, 0) where the depth has none.
     """
     inverse, usable = _inverse_depth_and_corners(centre_depth, edge_tolerance, largest_step)
-    upper_left, upper_right = inverse[:-1, :-1], inverse[:-1, 1:]
-    lower_left, lower_right = inverse[1:, :-1], inverse[1:, 1:]
+    upper_left = inverse[:-1, :-1]
+    upper_right = inverse[:-1, 1:]
+    lower_left = inverse[1:, :-1]
+    lower_right = inverse[1:, 1:]
     along_x = 0.5 * (upper_right - upper_left + lower_right - lower_left)
     along_y = 0.5 * (lower_left - upper_left + lower_right - upper_right)
     mean = 0.25 * (upper_left + upper_right + lower_left + lower_right)
@@ -231,13 +235,13 @@ def _normal_angle(
     shape = (*compared.shape, 3)
     if normals is None or truth_normals is None or normals.shape != shape or truth_normals.shape != shape:
         raise InputError(f"comparing normals needs both normal maps, each of shape {shape}")
-    estimated = normals[compared].astype(np.float64)
+    given = normals[compared].astype(np.float64)
     exact = truth_normals[compared].astype(np.float64)
-    lengths = np.linalg.norm(estimated, axis=1) * np.linalg.norm(exact, axis=1)
+    lengths = np.linalg.norm(given, axis=1) * np.linalg.norm(exact, axis=1)
     both = lengths > 0
     if not both.any():
         return None, 0.0
-    cosine = np.einsum("ij,ij->i", estimated[both], exact[both]) / lengths[both]
+    cosine = np.einsum("ij,ij->i", given[both], exact[both]) / lengths[both]
     angle = float(np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
     return angle, float(np.mean(both))
 

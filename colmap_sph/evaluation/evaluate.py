@@ -30,6 +30,17 @@ def evaluate_files(
 ) -> list[CloudScores]:
     """Measure the clouds of some files, read one at a time, against the cloud or mesh of another.
 
+    Parameters
+    ----------
+    clouds : sequence of Path
+    reference : Path
+    options : EvaluationOptions, optional
+
+    Returns
+    -------
+    list of CloudScores
+        In the order of the clouds.
+
     Raises
     ------
     InputError, NoResultError, OptionError
@@ -97,7 +108,20 @@ def evaluate_cloud(
 
 
 def check_overlap(cloud: PointCloud, reference: Reference, reach: float) -> None:
-    """Raise InputError, with the remedy, unless the two bounding boxes come within `reach` of each other."""
+    """Make sure that a cloud and its reference lie in one place.
+
+    Parameters
+    ----------
+    cloud : PointCloud
+    reference : Reference
+    reach : float
+        Metres that may lie between their bounding boxes.
+
+    Raises
+    ------
+    InputError
+        They are farther apart, or in degrees; the message has the remedy.
+    """
     for name, crs in ((cloud.name, cloud.crs), (reference.name, reference.crs)):
         if crs is not None and crs.startswith("geographic"):
             raise InputError(f"{name} is in degrees, {crs}: reproject it to the metric frame of the other first")
@@ -105,7 +129,8 @@ def check_overlap(cloud: PointCloud, reference: Reference, reach: float) -> None
     low, high = bounds(reference.points)
     if np.all(cloud_low - reach <= high) and np.all(low - reach <= cloud_high):
         return
-    here, there = (cloud_low + cloud_high) / 2, (low + high) / 2
+    here = (cloud_low + cloud_high) / 2
+    there = (low + high) / 2
     places = f"{cloud.name} lies around {_place(here)}, {reference.name} around {_place(there)}"
     for name, crs, centre, other in (
         (cloud.name, cloud.crs, here, there),

@@ -38,7 +38,21 @@ class MeshSurface:
         self.index = PointIndex(np.concatenate([self.samples, centroids]))
 
     def distances(self, points: Points, *, threads: int = 1, bound: float = np.inf) -> npt.NDArray[np.float64]:
-        """Distance of each of (N, 3) points to the mesh; infinite beyond `bound`."""
+        """Distance of each point to the mesh.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 ndarray
+        threads : int
+            -1: one per core.
+        bound : float
+            Metres.
+
+        Returns
+        -------
+        (n,) float64 ndarray
+            Metres; infinite beyond `bound`.
+        """
         result = np.empty(len(points))
         for start in range(0, len(points), _CHUNK):
             chunk = points[start : start + _CHUNK]
@@ -53,7 +67,7 @@ class MeshSurface:
 
 def distances_to_triangles(points: Points, corners: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """Distance of each of (N, 3) points to its own triangle of (N, 3, 3) corners."""
-    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    a, b, c = np.moveaxis(corners, 1, 0)
     to_edges = np.stack([_to_segments(points, a, b), _to_segments(points, b, c), _to_segments(points, c, a)])
     nearest_edge = to_edges.min(axis=0)
     normal = np.cross(b - a, c - a)
@@ -87,6 +101,7 @@ def _sample_by_area(
     random = np.random.default_rng(0)
     steps = (np.arange(count) + 0.5) / count * areas.sum()
     owners = np.minimum(np.searchsorted(np.cumsum(areas), steps), len(areas) - 1)
-    root, other = np.sqrt(random.random(count))[:, None], random.random(count)[:, None]
+    root = np.sqrt(random.random(count))[:, None]
+    other = random.random(count)[:, None]
     a, b, c = (corners[owners, corner] for corner in range(3))
     return (1 - root) * a + root * (1 - other) * b + root * other * c, owners

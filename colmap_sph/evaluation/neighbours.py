@@ -23,7 +23,21 @@ class PointIndex:
         self._tree = cKDTree(points[self._order], balanced_tree=False, compact_nodes=False)
 
     def distances(self, queries: Points, *, threads: int = 1, bound: float = np.inf) -> npt.NDArray[np.float64]:
-        """Distance from each of (Q, 3) queries to the nearest point; infinite beyond `bound`."""
+        """Distance from each query to the nearest point.
+
+        Parameters
+        ----------
+        queries : (n, 3) float64 ndarray
+        threads : int
+            -1: one per core.
+        bound : float
+            In the unit of the points.
+
+        Returns
+        -------
+        (n,) float64 ndarray
+            In the unit of the points; infinite beyond `bound`.
+        """
         result = np.empty(len(queries))
         order = spatial_order(queries)
         for start in range(0, len(queries), _QUERY_CHUNK):
@@ -32,7 +46,21 @@ class PointIndex:
         return result
 
     def nearest(self, queries: Points, count: int, *, threads: int = 1) -> npt.NDArray[np.int64]:
-        """Indices (Q, count) of the nearest points of each query; there must be as many points."""
+        """The points nearest to each query.
+
+        Parameters
+        ----------
+        queries : (n, 3) float64 ndarray
+        count : int
+            How many; there must be as many points.
+        threads : int
+            -1: one per core.
+
+        Returns
+        -------
+        (n, count) int64 ndarray
+            Indices of points, the nearest first.
+        """
         _, rows = self._tree.query(queries, k=np.arange(1, count + 1), workers=threads)
         return np.asarray(self._order[rows])
 
@@ -67,6 +95,10 @@ def voxel_keys(points: Points, size: float, *, offset: float = 0.0) -> npt.NDArr
     offset : float
         The grid starts this many voxels before the smallest coordinates.
 
+    Returns
+    -------
+    (N,) int64
+
     Raises
     ------
     OptionError
@@ -77,7 +109,8 @@ def voxel_keys(points: Points, size: float, *, offset: float = 0.0) -> npt.NDArr
     if counts[0] * counts[1] * counts[2] >= 2**63:
         raise OptionError(
             f"voxels of {size:g} m are too small for points spread over {(high - low).max():g} m: "
-            "use a larger tau, or remove far outliers from the cloud"
+            "use a larger tau, or remove far outliers from the cloud",
+            "tau",
         )
     keys = np.zeros(len(points), np.int64)
     for axis in range(3):
@@ -102,12 +135,30 @@ def voxel_centroids(points: Points, size: float) -> Points:
 
 
 def mean_voxel_shares(points: Points, hits: npt.NDArray[np.bool_], size: float) -> npt.NDArray[np.float64]:
-    """Per column of (N, T) hits: the share of hits among the points of a voxel, averaged over voxels.
+    """Per column of hits: the share of hits among the points of a voxel, averaged over voxels.
 
     The voxels are those of two grids, the second shifted by half a voxel, so that it matters less where the
     grid happens to lie.
+
+    Parameters
+    ----------
+    points : (n, 3) float64 ndarray
+    hits : (n, T) bool ndarray
+    size : float
+        Edge of a voxel, in the unit of the points.
+
+    Returns
+    -------
+    (T,) float64 ndarray
+        0 to 1.
+
+    Raises
+    ------
+    OptionError
+        More voxels than 64 bits can number.
     """
-    total, voxel_count = np.zeros(hits.shape[1]), 0
+    total = np.zeros(hits.shape[1])
+    voxel_count = 0
     for offset in (0.0, 0.5):
         order, starts = _by_voxel(points, size, offset=offset)
         counts = np.diff(starts, append=len(points))

@@ -73,7 +73,7 @@ class EvaluationOptions:
         return self.threads or os.cpu_count() or 1
 
     def check(self) -> None:
-        """Raise OptionError for the first option out of its bounds."""
+        """Raise `OptionError` for the first option out of its bounds."""
         for value in self.tau:
             _check_positive("tau", value)
         _check_positive("gsd", self.gsd)
@@ -82,17 +82,20 @@ class EvaluationOptions:
         _check_positive("registration_distance", self.registration_distance)
         _check_positive("truth_spacing", self.truth_spacing)
         if self.definition not in ("points", "tanks-and-temples", "eth3d"):
-            raise OptionError(f"definition is points, tanks-and-temples or eth3d, not {self.definition!r}")
+            message = f"definition must be 'points', 'tanks-and-temples' or 'eth3d', not {self.definition!r}."
+            raise OptionError(message, "definition")
         if self.crop not in ("auto", "box", "horizontal", "none"):
-            raise OptionError(f"crop is auto, box, horizontal or none, not {self.crop!r}")
+            message = f"crop must be 'auto', 'box', 'horizontal' or 'none', not {self.crop!r}."
+            raise OptionError(message, "crop")
         if len(self.reference_shift) != 3 or not all(math.isfinite(value) for value in self.reference_shift):
-            raise OptionError(f"reference_shift is three finite numbers x y z, not {self.reference_shift}")
+            message = f"reference_shift must be three finite numbers x y z, not {self.reference_shift}."
+            raise OptionError(message, "reference_shift")
         if self.min_view_count < 1:
-            raise OptionError(f"min_view_count must be at least 1, not {self.min_view_count}")
+            raise OptionError(f"min_view_count must be at least 1, not {self.min_view_count}.", "min_view_count")
         if self.threads < 0:
-            raise OptionError(f"threads must be 0 (one per core) or more, not {self.threads}")
+            raise OptionError(f"threads must be 0 (one per core) or more, not {self.threads}.", "threads")
 
 
 def _check_positive(name: str, value: float | None) -> None:
     if value is not None and not (math.isfinite(value) and value > 0):
-        raise OptionError(f"{name} must be a positive number, not {value}")
+        raise OptionError(f"{name} must be a positive number, not {value}.", name)

@@ -28,7 +28,22 @@ class Reference(Protocol):
     """Whether a cloud may be registered to it."""
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
-        """Distance of each of (N, 3) points to the reference; infinite beyond `bound`."""
+        """Distance of each point to the reference.
+
+        Parameters
+        ----------
+        points : (n, 3) float64 ndarray
+            In the reference's frame, metres.
+        threads : int
+            -1: one per core.
+        bound : float
+            Metres.
+
+        Returns
+        -------
+        (n,) float64 ndarray
+            Metres; infinite beyond `bound`.
+        """
         ...
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
@@ -42,14 +57,18 @@ class CloudReference:
     movable = True
 
     def __init__(self, cloud: PointCloud, options: EvaluationOptions) -> None:
-        self.name, self.crs, self.z_is_up = cloud.name, cloud.crs, cloud.z_is_up
+        self.name = cloud.name
+        self.crs = cloud.crs
+        self.z_is_up = cloud.z_is_up
         self.points = cloud.points - np.asarray(options.reference_shift)
         self._index = PointIndex(self.points)
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
+        """As `Reference.distances`."""
         return self._index.distances(points, threads=threads, bound=bound)
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
+        """As `Reference.can_judge`."""
         return np.ones(len(points), bool)
 
 
@@ -67,9 +86,11 @@ class MeshReference:
         self.points = self._surface.samples
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
+        """As `Reference.distances`."""
         return self._surface.distances(points, threads=threads, bound=bound)
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
+        """As `Reference.can_judge`."""
         return np.ones(len(points), bool)
 
 
@@ -99,9 +120,11 @@ class DepthReference:
         self._index = PointIndex(surface)
 
     def distances(self, points: Points, *, threads: int, bound: float) -> npt.NDArray[np.float64]:
+        """As `Reference.distances`."""
         return self._index.distances(points, threads=threads, bound=bound)
 
     def can_judge(self, points: Points) -> npt.NDArray[np.bool_]:
+        """As `Reference.can_judge`."""
         return observed(points, self._views)
 
 

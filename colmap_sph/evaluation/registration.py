@@ -71,6 +71,10 @@ def register(cloud: Points, reference: Points, *, max_distance: float, threads: 
     threads : int
         For the measurement of the residuals; ICP itself runs on one thread so that its result is repeatable.
 
+    Returns
+    -------
+    Registration
+
     Raises
     ------
     InputError

@@ -114,7 +114,8 @@ def _cloud_row(scores: CloudScores) -> list[str]:
 
 
 def _registration_line(scores: CloudScores) -> str:
-    registration, name = scores.registration, Path(scores.cloud).name
+    registration = scores.registration
+    name = Path(scores.cloud).name
     if registration is None:
         return f"{name}: not registered"
     shift = ", ".join(f"{value:.3f}" for value in registration.shift)

@@ -103,7 +103,8 @@ def back_project(view: DepthView, depth: npt.NDArray[np.float32]) -> Points:
     row, column = np.nonzero(depth > 0)
     z = depth[row, column].astype(np.float64)
     x, y = column + 0.5, row + 0.5
-    world_rays, centre = view.R.T @ np.linalg.inv(view.K), -view.R.T @ view.t
+    world_rays = view.R.T @ np.linalg.inv(view.K)
+    centre = -view.R.T @ view.t
     points = np.empty((len(z), 3))
     for axis in range(3):
         ray = world_rays[axis]
@@ -130,13 +131,16 @@ def _look_up(
     whose centres surround each."""
     height, width = depth.shape
     # Column by column: a threaded matrix product of so slim matrices stalls on a busy machine.
-    X, Y, Z = points[:, 0], points[:, 1], points[:, 2]
-    matrix, offset = view.K @ view.R, view.K @ view.t
+    X, Y, Z = points.T
+    matrix = view.K @ view.R
+    offset = view.K @ view.t
     x, y, z = (row[0] * X + row[1] * Y + row[2] * Z + shift for row, shift in zip(matrix, offset, strict=True))
     safe = np.where(z > 0, z, 1.0)
-    x, y = x / safe, y / safe
+    x = x / safe
+    y = y / safe
     rows = np.nonzero((z > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height))[0]
-    x, y = x[rows], y[rows]
+    x = x[rows]
+    y = y[rows]
 
     def around() -> Iterator[npt.NDArray[np.float32]]:
         # A pixel's centre is at +0.5: the centres around (x, y) belong to floor(x ± 0.5), floor(y ± 0.5).

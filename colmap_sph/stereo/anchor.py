@@ -50,7 +50,8 @@ def anchored(scene: Scene) -> Scene:
     distances = np.linalg.norm(centers - middle, axis=1)
     # The first by name, not the nearest: in a regular block several are equally near.
     anchor = centers[np.argmax(distances <= _OUTLYING * np.median(distances))]
-    centers, points = centers - anchor, scene.points - anchor
+    centers = centers - anchor
+    points = scene.points - anchor
     step = _grid_step(scene, centers, points, exact=_EXACT * float(np.abs(scene.origin + anchor).max()))
     if step > _LEAST_STEP:
         centers = (np.round(centers / step - _PHASE) + _PHASE) * step

@@ -79,7 +79,8 @@ def confirm_depth(
     """
     shape = estimate.depth.shape
     observing, agreeing, contradicting = (np.zeros(shape, np.uint8) for _ in range(3))
-    weighted, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    weighted = np.zeros(shape, np.float32)
+    weight = np.zeros(shape, np.float32)
     for partner, partner_estimate in partners:
         _native.check_consistency(
             backend(),

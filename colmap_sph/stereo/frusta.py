@@ -57,7 +57,8 @@ def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
     for depth in _DEPTHS:
         first = len(points) * count
         samples = [_sample(view, depth * d) for view, d in zip(views, distances, strict=True)]
-        block, points = np.array(samples), points + samples
+        block = np.array(samples)
+        points = points + samples
         targets = centers + depth * distances[:, None] * directions
         nearest = cKDTree(targets).query(targets, k=min(_NUM_TESTED, len(views)))[1]
         for k, i in enumerate(posed):
@@ -93,10 +94,9 @@ def _sample(view: View, depth: float) -> NDArray[np.float64]:
 
 
 def sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which of (N, 3) points lie before the camera and inside its image; occlusion is not considered."""
-    camera = points @ view.R.T + view.t
-    pixels = camera @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        u, v = pixels[:, 0] / pixels[:, 2], pixels[:, 1] / pixels[:, 2]
-        inside = (u > 0) & (u < view.width) & (v > 0) & (v < view.height)
-    return np.asarray(inside & (camera[:, 2] > 0))
+    """Return which of (N, 3) points lie before the camera and inside its image; occlusion is not considered.
+
+    The image ends at the outer edges of its pixels: a point is seen wherever in a pixel it lies.
+    """
+    pixels, depth = view.project(points)
+    return np.asarray((depth > 0) & (pixels > 0).all(axis=1) & (pixels < [view.width, view.height]).all(axis=1))

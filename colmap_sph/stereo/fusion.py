@@ -57,20 +57,22 @@ class FusionOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
         if self.method not in ("best-pixel", "colmap"):
-            raise OptionError(f"fusion method must be 'best-pixel' or 'colmap', not {self.method!r}.")
+            raise OptionError(f"method must be 'best-pixel' or 'colmap', not {self.method!r}.", "method")
         if self.input not in ("geometric", "photometric"):
             raise OptionError(f"input must be 'geometric' or 'photometric', not {self.input!r}.", "input")
         for name in ("min_num_pixels", "max_num_pixels", "max_traversal_depth", "check_num_images"):
             if getattr(self, name) < 1:
-                raise OptionError(f"fusion {name} must be at least 1, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}.", name)
         if self.max_num_pixels < self.min_num_pixels:
             raise OptionError(
-                f"fusion max_num_pixels ({self.max_num_pixels}) must not be less than "
-                f"min_num_pixels ({self.min_num_pixels})."
+                f"max_num_pixels must not be less than min_num_pixels ({self.min_num_pixels}), "
+                f"not {self.max_num_pixels}.",
+                "max_num_pixels",
+                "min_num_pixels",
             )
         for name in ("max_reproj_error", "max_depth_error", "max_normal_error", "cache_size"):
             if not getattr(self, name) > 0:
-                raise OptionError(f"fusion {name} must be positive, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
 
     def for_colmap(self) -> dict[str, Any]:
         """The options that COLMAP's fusion has, too, under its names."""
@@ -142,7 +144,8 @@ def fuse_view(
         For each point the number of these views and their indices: ``fused.ply.vis``.
     """
     shape = reference.depth.shape
-    covered, agreeing = np.zeros(shape, np.uint8), np.zeros(shape, np.uint64)
+    covered = np.zeros(shape, np.uint8)
+    agreeing = np.zeros(shape, np.uint64)
     colour = reference.image.astype(np.uint16)
     indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
     indices[0] = reference.index
@@ -167,13 +170,16 @@ def fuse_view(
             agreeing,
             colour,
         )
-    view, step = reference.view, max(_BAND_PIXELS // shape[1], 1)
+    view = reference.view
+    step = max(_BAND_PIXELS // shape[1], 1)
     pixels = (reference.depth, reference.normals, covered, agreeing, colour, options.min_num_pixels)
-    world_from_pixel, world_from_camera = view.R.T @ np.linalg.inv(view.K), view.R.T
+    world_from_pixel = view.R.T @ np.linalg.inv(view.K)
+    world_from_camera = view.R.T
     frame = (np.ascontiguousarray(world_from_pixel), np.ascontiguousarray(world_from_camera), view.center + offset)
     for first in range(0, shape[0], step):
         rows = (first, min(first + step, shape[0]))
         num_points, num_words = _native.count_points(*pixels, *rows)
-        points, visibility = np.empty((num_points, POINT.itemsize), np.uint8), np.empty(num_words, np.uint32)
+        points = np.empty((num_points, POINT.itemsize), np.uint8)
+        visibility = np.empty(num_words, np.uint32)
         _native.write_points(*pixels, *rows, *frame, indices, points, visibility)
         yield points.view(POINT)[:, 0], visibility

@@ -118,17 +118,15 @@ def _verdicts(
     options: FusionOptions,
 ) -> NDArray[np.bool_]:
     """(n, 4): stopped by depth, by reprojection, by normal; agrees. All false where the view has no depth."""
-    in_camera = points @ view.R.T + view.t
-    pixel = in_camera @ view.K.T
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        uv = pixel[:, :2] / pixel[:, 2:]
-    inside = (pixel[:, 2] > 0) & (uv > -0.5).all(axis=1)
-    inside &= (uv < np.array([view.width, view.height]) - 0.5).all(axis=1)
-    columns, rows = (np.rint(np.where(inside[:, None], uv, 0)).astype(int)).T
+    pixels, distance = view.project(points)
+    # Depth maps count integer pixels, the first one 0: a point is inside where the pixel next to it is in the map.
+    last = np.array([view.width, view.height]) - 0.5
+    inside = (distance > 0) & (pixels > -0.5).all(axis=1) & (pixels < last).all(axis=1)
+    columns, rows = (np.rint(np.where(inside[:, None], pixels, 0)).astype(int)).T
     z = depth[rows, columns].astype(np.float64)
     seen = inside & (z > 0)
-    far = seen & (np.abs(in_camera[:, 2] - z) > options.max_depth_error * z)
-    off = seen & ~far & (np.hypot(*(uv - np.stack([columns, rows], axis=1)).T) > options.max_reproj_error)
+    far = seen & (np.abs(distance - z) > options.max_depth_error * z)
+    off = seen & ~far & (np.hypot(*(pixels - np.stack([columns, rows], axis=1)).T) > options.max_reproj_error)
     if options.method != "colmap":  # what is farther away agrees all the same, and becomes a point of its own
         off[:] = False
     cosine = (normals * (view_normals[rows, columns] @ view.R)).sum(axis=1)

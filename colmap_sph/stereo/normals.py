@@ -41,13 +41,13 @@ class NormalOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
         if not 1 <= self.radius <= 16:
-            raise OptionError(f"the normals' radius must lie in 1..16, not {self.radius}.")
-        if not self.tolerance > 0:
-            raise OptionError(f"the normals' tolerance must be positive, not {self.tolerance}.")
-        if not self.max_shift > 0:
-            raise OptionError(f"the normals' max_shift must be positive, not {self.max_shift}.")
+            raise OptionError(f"radius must lie in 1..16, not {self.radius}.", "radius")
+        for name in ("tolerance", "max_shift"):
+            if not getattr(self, name) > 0:
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
         if not 0 < self.max_incidence <= 90:
-            raise OptionError(f"the normals' max_incidence must lie in 0..90 degrees, not {self.max_incidence}.")
+            message = f"max_incidence must lie above 0 and up to 90 degrees, not {self.max_incidence}."
+            raise OptionError(message, "max_incidence")
 
 
 def fit_normals(
@@ -68,6 +68,19 @@ def fit_normals(
         Unit vectors in the camera frame, towards the camera; (0, 0, 0) where no plane fits.
     depth : (H, W) float32 ndarray
         Depth of each plane at its pixel; 0 where no plane fits.
+
+    Examples
+    --------
+    A plane that faces the camera:
+
+    >>> K = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
+    >>> view = View(1, "a", 64, 48, K, np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    >>> shape = (48, 64)
+    >>> depth = np.full(shape, 5, np.float32)
+    >>> estimate = DepthEstimate(depth, sigma=depth / 500, support=np.full(shape, 3, np.uint8))
+    >>> normals, fitted = fit_normals(view, estimate, NormalOptions())
+    >>> np.allclose(normals, [0, 0, -1], atol=1e-6), np.allclose(fitted, 5)
+    (True, True)
     """
     normals = np.empty((*estimate.depth.shape, 3), dtype=np.float32)
     fitted = np.empty_like(estimate.depth)
@@ -76,14 +89,16 @@ def fit_normals(
         low, high = max(first - options.radius, 0), min(end + options.radius, view.height)
         kept = slice(first - low, end - low)
         band_normals, band_fitted = _fit_rows(view, estimate, low, high, options)
-        normals[first:end], fitted[first:end] = band_normals[kept], band_fitted[kept]
+        normals[first:end] = band_normals[kept]
+        fitted[first:end] = band_fitted[kept]
     return normals, fitted
 
 
 def _fit_rows(
     view: View, estimate: DepthEstimate, first: int, end: int, options: NormalOptions
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    depth, sigma = estimate.depth[first:end], estimate.sigma[first:end]
+    depth = estimate.depth[first:end]
+    sigma = estimate.sigma[first:end]
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
     inverse_sigma = (sigma * inverse * inverse).astype(np.float32)

@@ -12,22 +12,18 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.scene import Scene, SourceImages
-from colmap_sph.stereo.frusta import observe_frusta, observe_points
+from colmap_sph.stereo.covisibility import Covisibility, CovisibilitySource, find_covisibility
 from colmap_sph.stereo.pairing import Pair
-from colmap_sph.stereo.partner_choice import choose, triangulation_angles, worth_of
+from colmap_sph.stereo.partner_choice import choose
 
 logger = logging.getLogger(__name__)
 
-PairSource = Literal["tracks", "database", "frusta", "patch-match.cfg"]
-# Candidates that a view chooses from, unless it is to have more; points that tell a pair's angle and its worth.
+PairSource = CovisibilitySource | Literal["patch-match.cfg"]
+# Candidates that a view chooses from, unless it is to have more.
 _MAX_CANDIDATES = 100
-_MAX_ANGLE_POINTS = 512
-_MAX_WORTH_POINTS = 512
-_ANGLE_PERCENTILE = 75
 
 
 @dataclass(frozen=True)
@@ -49,14 +45,17 @@ class PairOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of its bounds."""
         if self.num_pairs < 1:
-            raise OptionError(f"num_pairs must be at least 1, not {self.num_pairs}.")
+            raise OptionError(f"num_pairs must be at least 1, not {self.num_pairs}.", "num_pairs")
         if not 0 <= self.min_triangulation_angle < self.max_triangulation_angle <= 180:
             raise OptionError(
-                "0 <= min_triangulation_angle < max_triangulation_angle <= 180 degrees must hold, not "
-                f"{self.min_triangulation_angle} and {self.max_triangulation_angle}."
+                "min_triangulation_angle must be less than max_triangulation_angle, both in 0..180 degrees, not "
+                f"{self.min_triangulation_angle} and {self.max_triangulation_angle}.",
+                "min_triangulation_angle",
+                "max_triangulation_angle",
             )
         if self.min_shared_points < 1:
-            raise OptionError(f"min_shared_points must be at least 1, not {self.min_shared_points}.")
+            message = f"min_shared_points must be at least 1, not {self.min_shared_points}."
+            raise OptionError(message, "min_shared_points")
 
 
 @dataclass(frozen=True)
@@ -134,9 +133,24 @@ def select_pairs(
     ------
     NoResultError
         No image has a partner.
+
+    Examples
+    --------
+    Three cameras in a row, each of which sees points up to 4 units beside it: neighbours see most of the same.
+
+    >>> import numpy as np
+    >>> from colmap_sph.scene import View
+    >>> K = np.array([[200.0, 0, 100], [0, 200, 100], [0, 0, 1]])
+    >>> points = np.array([(x, y, 8) for x in np.arange(-5, 8) for y in np.arange(-3, 4)])
+    >>> views = []
+    >>> for k in range(3):
+    ...     seen = np.flatnonzero(np.abs(points[:, 0] - k) < 4)
+    ...     views.append(View(k, "abc"[k], 200, 200, K, np.eye(3), np.array([-k, 0, 0]), seen))
+    >>> select_pairs(Scene(tuple(views), points), PairOptions(num_pairs=1)).unique_pairs()
+    [('a', 'b'), ('b', 'c')]
     """
     options.check()
-    graph = _build_graph(scene, options, matches)
+    graph = find_covisibility(scene, options.min_shared_points, matches)
     if explicit is None:
         partners = {view.name: _best_partners(graph, options, i) for i, view in enumerate(scene.views)}
         selection = PairSelection(partners, graph.source)
@@ -151,127 +165,14 @@ def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
 
     Where the model has no tracks, projected points or the frusta say what overlaps.
     """
-    graph = _build_graph(scene, PairOptions(min_shared_points=1), None)
+    graph = find_covisibility(scene, 1, None)
     return {
         view.name: [scene.views[j].name for j in graph.candidates(i)[0][:most]]
         for i, view in enumerate(scene.views)
     }
 
 
-class _Graph:
-    """Candidates of every view with the weight of each, and the angles of pairs, computed when asked for."""
-
-    def __init__(
-        self,
-        scene: Scene,
-        source: PairSource,
-        weights: sparse.csr_array,
-        points: NDArray[np.float64],
-        observed: list[NDArray[np.int64]],
-    ) -> None:
-        self.scene, self.source = scene, source
-        self.centers = np.array([view.center for view in scene.views])
-        self._weights, self._points, self._observed = weights, points, observed
-        self._angles: dict[tuple[int, int], float] = {}
-        self._is_observed = np.zeros(len(points), dtype=bool)
-
-    def weight(self, i: int, j: int) -> int:
-        """Return what views `i` and `j` share."""
-        return int(self._weights[i, j])
-
-    def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the views that share something with view `i`, most first, and how much it is."""
-        row = slice(self._weights.indptr[i], self._weights.indptr[i + 1])
-        views, weights = self._weights.indices[row], self._weights.data[row]
-        order = np.lexsort((views, -weights))
-        return views[order].astype(np.int64), weights[order].astype(np.int64)
-
-    def angle(self, i: int, j: int) -> float:
-        """Return the 75th percentile of the triangulation angles in degrees; NaN without common points."""
-        key = (min(i, j), max(i, j))
-        if key not in self._angles:
-            self._angles[key] = self._compute_angle(*key)
-        return self._angles[key]
-
-    def worth(self, i: int, j: int) -> NDArray[np.float32]:
-        """Return how well view `j` would serve the points of view `i`, or an even part of them."""
-        rows = self._observed[i]
-        rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
-        believed: NDArray[np.bool_] | float
-        if self.source == "database":
-            believed = float(self.weight(i, j) / self._weights[[i]].max())
-        else:
-            believed = self._observes(j, rows)
-        views = self.scene.views
-        return worth_of(views[i], views[j], self._points[rows], believed)
-
-    def _observes(self, i: int, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which of the points view `i` observes."""
-        self._is_observed[self._observed[i]] = True
-        result = self._is_observed[rows]
-        self._is_observed[self._observed[i]] = False
-        return result
-
-    def _compute_angle(self, i: int, j: int) -> float:
-        shared = self._observed[j][self._observes(i, self._observed[j])]
-        if len(shared) == 0:
-            return float("nan")
-        # Spread evenly over the points, whose order says nothing about where they are.
-        points = self._points[shared[:: -(-len(shared) // _MAX_ANGLE_POINTS)]]
-        angles = triangulation_angles(points, self.centers[i], self.centers[j])
-        return float(np.percentile(angles, _ANGLE_PERCENTILE))
-
-
-def _build_graph(scene: Scene, options: PairOptions, matches: Mapping[Pair, int] | None) -> _Graph:
-    """Find what views have in common: tracks, else verified matches, else samples of the frusta."""
-    finite = np.asarray(np.isfinite(scene.points).all(axis=1))
-    posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
-    observed = [
-        view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
-        for view, good in zip(scene.views, posed, strict=True)
-    ]
-    if any(len(indices) for indices in observed):
-        weights = _shared_points(observed, len(scene.points), options.min_shared_points)
-        return _Graph(scene, "tracks", weights, scene.points, observed)
-    points = scene.points[finite]
-    if len(points):
-        observed = observe_points(scene, points)
-    else:
-        points, observed = observe_frusta(scene)
-    if matches is not None:
-        weights = _match_counts(scene, matches, options.min_shared_points)
-        if weights.nnz:
-            return _Graph(scene, "database", weights, points, observed)
-        logger.warning("the database has no verified matches of the model's images")
-    return _Graph(scene, "frusta", _shared_points(observed, len(points), 1), points, observed)
-
-
-def _shared_points(observed: list[NDArray[np.int64]], num_points: int, least: int) -> sparse.csr_array:
-    """Count the points that two views share, as a (V, V) matrix of counts of at least `least`."""
-    indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
-    indices = np.concatenate([*observed, np.empty(0, np.int64)])
-    ones = np.ones(len(indices), dtype=np.int32)
-    seen = sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
-    return _without_self_and_few(seen @ seen.T, least)
-
-
-def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_array:
-    entries = counts.tocoo()
-    keep = (entries.row != entries.col) & (entries.data >= least)
-    kept = (entries.data[keep], (entries.row[keep], entries.col[keep]))
-    return sparse.csr_array(kept, shape=counts.shape)
-
-
-def _match_counts(scene: Scene, matches: Mapping[Pair, int], least: int) -> sparse.csr_array:
-    """Numbers of verified matches between views, as a (V, V) matrix of those of at least `least`."""
-    index_of = scene.index_of
-    known = [(index_of[a], index_of[b], n) for (a, b), n in matches.items() if a in index_of and b in index_of]
-    first, second, counts = np.array(known, dtype=np.int64).reshape(-1, 3).T
-    both = (np.tile(counts, 2), (np.concatenate([first, second]), np.concatenate([second, first])))
-    return _without_self_and_few(sparse.csr_array(both, shape=(len(scene.views),) * 2), least)
-
-
-def _best_partners(graph: _Graph, options: PairOptions, i: int) -> tuple[Partner, ...]:
+def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[Partner, ...]:
     """Return the best partners of view `i`: those that together see most of it, then those under a wide angle."""
     near: list[Partner] = []
     wide: list[Partner] = []
@@ -296,14 +197,15 @@ def _best_partners(graph: _Graph, options: PairOptions, i: int) -> tuple[Partner
 
 
 def _explicit_selection(
-    graph: _Graph, options: PairOptions, explicit: Mapping[str, SourceImages]
+    graph: Covisibility, options: PairOptions, explicit: Mapping[str, SourceImages]
 ) -> PairSelection:
     index_of = graph.scene.index_of
     _warn_unknown(explicit, index_of)
     partners: dict[str, tuple[Partner, ...]] = {}
     obeyed = set(index_of) - set(explicit) != set()
     for name in sorted(explicit.keys() & index_of.keys(), key=index_of.__getitem__):
-        sources, i = explicit[name], index_of[name]
+        sources = explicit[name]
+        i = index_of[name]
         if isinstance(sources, int):
             partners[name] = _best_partners(graph, options, i)
             continue

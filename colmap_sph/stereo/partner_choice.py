@@ -25,8 +25,22 @@ _ANGLES = (0.0, 6.0, 40.0, 70.0)
 def triangulation_angles(
     points: NDArray[np.float64], center1: NDArray[np.float64], center2: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the angles in degrees, 0 to 180, between the rays from (N, 3) points to two centres."""
-    rays1, rays2 = center1 - points, center2 - points
+    """Angles between the rays from points to two projection centres.
+
+    Parameters
+    ----------
+    points : (n, 3) float64 ndarray
+        World frame.
+    center1, center2 : (3,) float64 ndarray
+        Projection centres, world frame.
+
+    Returns
+    -------
+    (n,) float64 ndarray
+        Degrees, 0 to 180.
+    """
+    rays1 = center1 - points
+    rays2 = center2 - points
     # Unlike the arc cosine, exact for small angles.
     sines = np.linalg.norm(np.cross(rays1, rays2), axis=1)
     return np.asarray(np.degrees(np.arctan2(sines, np.einsum("ij,ij->i", rays1, rays2))))
@@ -73,7 +87,8 @@ def choose(worths: Sequence[NDArray[np.float32]], count: int) -> list[int]:
         Indices of candidates; of equals the first.
     """
     chosen: list[int] = []
-    table, need = np.array(worths), np.ones(len(worths[0]) if worths else 0)
+    table = np.array(worths)
+    need = np.ones(len(worths[0]) if worths else 0)
     left = np.ones(len(worths), dtype=bool)
     while left.any() and len(chosen) < count:
         # Rounded: of candidates that serve alike the first must win, however their points' places are rounded.

@@ -5,7 +5,7 @@ Rectified frame: x along the baseline from the left to the right centre, z towar
 
     (sin θ, cos θ sin λ, cos θ cos λ),   λ = row angle about the baseline, θ = angle inside the epipolar plane
 
-and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. On the plane ("frame" model, §3.1) the
+and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. On the plane ("frame", §3.1) the
 ray is (x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described by one record, `RectifiedPair`:
 array coordinate = (angle or tangent) · scale − origin, with pixel centres at whole array coordinates.
 """
@@ -18,11 +18,10 @@ from numpy.typing import NDArray
 
 from colmap_sph.scene import View
 
-Model = Literal["spherical", "frame"]
-
+Surface = Literal["spherical", "frame"]
+"""What both images of a pair are resampled to: a sphere around the baseline, or a plane parallel to it."""
 
 Side = Literal["left", "right"]
-
 
 Float = NDArray[np.float64]
 
@@ -33,7 +32,8 @@ class RectifiedPair:
 
     Attributes
     ----------
-    model : {"spherical", "frame"}
+    surface : {"spherical", "frame"}
+        What its images are resampled to: the sphere, or the plane.
     rectified_from_world : (3, 3) float64 ndarray
         Rotation to the rectified frame.
     baseline : float
@@ -48,7 +48,7 @@ class RectifiedPair:
         Range to search, in array coordinates: column in the left image minus column in the right image.
     """
 
-    model: Model
+    surface: Surface
     rectified_from_world: Float
     baseline: float
     columns_per_radian: float
@@ -74,6 +74,11 @@ class RectifiedPair:
     def column_origin(self, side: Side) -> float:
         """Column origin of one of the two images."""
         return self.left_origin if side == "left" else self.right_origin
+
+
+def ray_angles(rays: Float) -> tuple[Float, Float]:
+    """(n,) angles λ and θ, radians, of (n, 3) rays in the rectified frame."""
+    return np.arctan2(rays[:, 1], rays[:, 2]), np.arctan2(rays[:, 0], np.hypot(rays[:, 1], rays[:, 2]))
 
 
 def pixel_from_rectified_ray(view: View, pair: RectifiedPair) -> Float:

@@ -1,4 +1,4 @@
-"""Checked depth and normals → refined ones, by least-squares matching of small planes.
+"""Confirmed depth and normals → refined ones, by least-squares matching of small planes.
 
 Every pixel's plane carries the window around it into the images of its partners. How far the windows differ there,
 and how that changes with the plane, gives normal equations; all partners together move the plane a little, against
@@ -26,7 +26,8 @@ _SURVEY_ROWS = 16
 # Partners that bring the planes near in the rounds before the last.
 _FIRST_PARTNERS = 3
 # Arrays of equations, and sources of one call; see `kernels.h`.
-_EQUATIONS, _SOURCES = 12, 32
+_EQUATIONS = 12
+_SOURCES = 32
 
 # A partner's image, and where the pixels of the view lie in it.
 _Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
@@ -41,7 +42,7 @@ class RefinementOptions:
     max_partners: int = 8
     """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
     depth_freedom: float = 6.0
-    """How far a depth may move: the standard deviation it is given, as a multiple of that of the checked depth."""
+    """How far a depth may move: the standard deviation it is given, in those of the confirmed depth."""
     slope_freedom: float = 5.0
     """How far a plane may turn: the standard deviation it is given, degrees."""
     contrast: float = 20.0
@@ -54,18 +55,21 @@ class RefinementOptions:
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
         if not 0 <= self.rounds <= 16:
-            raise OptionError(f"the refinement's rounds must lie in 0..16, not {self.rounds}.")
+            raise OptionError(f"rounds must lie in 0..16, not {self.rounds}.", "rounds")
         if not self.max_partners >= 1:
-            raise OptionError(f"max_partners must be at least 1, not {self.max_partners}.")
+            raise OptionError(f"max_partners must be at least 1, not {self.max_partners}.", "max_partners")
         for name in ("depth_freedom", "contrast"):
             if not getattr(self, name) > 0:
-                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.")
+                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
         if not 0 < self.slope_freedom < 90:
-            raise OptionError(f"slope_freedom must lie between 0 and 90 degrees, not {self.slope_freedom}.")
+            message = f"slope_freedom must lie between 0 and 90 degrees, not {self.slope_freedom}."
+            raise OptionError(message, "slope_freedom")
         if not -1 <= self.min_score < 1:
-            raise OptionError(f"min_score must lie in -1..1, not {self.min_score}.")
+            raise OptionError(f"min_score must lie in -1..1, not {self.min_score}.", "min_score")
         if not 1 <= self.smoothing_radius <= 16:
-            raise OptionError(f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.")
+            raise OptionError(
+                f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.", "smoothing_radius"
+            )
 
     def images_used(self, partners: int) -> int:
         """How often a partner's image is matched in, all rounds together, where there are so many partners."""
@@ -90,7 +94,7 @@ def refine_maps(
     image : (H, W) uint8 ndarray
         Its grey image.
     estimate : DepthEstimate
-        Checked depth, whose standard deviations say how far the planes may move.
+        Confirmed depth, whose standard deviations say how far the planes may move.
     normals, depth : (H, W, 3) and (H, W) float32 ndarray
         The planes that `fit_normals` fitted to it; changed.
     sources : sequence of (View, (h, w) uint8 ndarray)
@@ -107,10 +111,12 @@ def refine_maps(
         partners = _most_telling(view, image, estimate, normals, depth, partners, options)
     for done in range(options.rounds):
         if done:
-            smooth, moved = NormalOptions(radius=options.smoothing_radius), replace(estimate, depth=depth)
+            smooth = NormalOptions(radius=options.smoothing_radius)
+            moved = replace(estimate, depth=depth)
             smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
             fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
-            normals[fitted], depth[fitted] = smooth_normals[fitted], smooth_depth[fitted]
+            normals[fitted] = smooth_normals[fitted]
+            depth[fitted] = smooth_depth[fitted]
         for first in range(0, view.height, _BAND_ROWS):
             rows = slice(first, min(first + _BAND_ROWS, view.height), 1)
             planes = _planes_of_maps(view, normals, depth, rows)
@@ -152,7 +158,7 @@ def _most_telling(
 def _freedom(
     sigma: NDArray[np.float32], planes: NDArray[np.float32], options: RefinementOptions
 ) -> NDArray[np.float32]:
-    """Standard deviation that planes' inverse depths are given, from that of their checked depth."""
+    """Standard deviation that planes' inverse depths are given, from that of their confirmed depth."""
     return np.asarray(options.depth_freedom * sigma * planes[0] ** 2, np.float32)
 
 
@@ -178,7 +184,8 @@ def _planes_of_maps(
     view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], rows: slice
 ) -> NDArray[np.float32]:
     """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
-    normals, depth = normals[rows], depth[rows]
+    normals = normals[rows]
+    depth = depth[rows]
     # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d. No matrix product: it would wake BLAS's
     # threads for three columns.
     (a, b, c), (_, d, e), _ = np.linalg.inv(view.K).astype(np.float32)
@@ -212,7 +219,8 @@ def _maps_of_planes(
         normals /= np.sqrt(x * x + y * y + z * z)[..., None]
         depth = 1 / inverse
     lost = ~(inverse > 0)
-    normals[lost], depth[lost] = 0, 0
+    normals[lost] = 0
+    depth[lost] = 0
     return normals, depth
 
 

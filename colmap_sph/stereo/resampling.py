@@ -11,6 +11,8 @@ from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, pixel_from_rec
 
 # Images are resampled in bands of this many rows, which bounds the memory for their maps.
 _BAND_ROWS = 128
+# Rays of length about 1 whose depth is less lie beside the camera.
+_LEAST_DEPTH = 1e-6
 
 
 def resample(
@@ -41,8 +43,10 @@ def resample(
     valid : (H, W) uint8 ndarray
         255 where the rectified pixel lies inside the image and no ignored pixel has a part in it, else 0.
     """
-    shape, image = (pair.height, pair.width(side)), image.astype(np.float32, copy=False)
-    rectified, valid = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.uint8)
+    shape = (pair.height, pair.width(side))
+    image = image.astype(np.float32, copy=False)
+    rectified = np.empty(shape, dtype=np.float32)
+    valid = np.empty(shape, dtype=np.uint8)
     tables = _ray_tables(view, pair, side)
     for first in range(0, pair.height, _BAND_ROWS):
         band = slice(first, first + _BAND_ROWS)
@@ -70,11 +74,13 @@ def _ray_tables(view: View, pair: RectifiedPair, side: Side) -> _RayTables:
     A = pixel_from_rectified_ray(view, pair)
     along = (np.arange(pair.width(side)) + pair.column_origin(side)) / pair.columns_per_radian
     across = (np.arange(pair.height) + pair.row_origin) / pair.rows_per_radian
-    if pair.model == "spherical":
-        column_table, column_weight = np.sin(along), np.cos(along)
+    if pair.surface == "spherical":
+        column_table = np.sin(along)
+        column_weight = np.cos(along)
         row_table = np.outer(A[:, 1], np.sin(across)) + np.outer(A[:, 2], np.cos(across))
     else:
-        column_table, column_weight = along, np.ones_like(along)
+        column_table = along
+        column_weight = np.ones_like(along)
         row_table = np.outer(A[:, 1], across) + A[:, 2:3]
     tables = row_table, np.outer(A[:, 0], column_table), column_weight
     return _RayTables(*(table.astype(np.float32) for table in tables))
@@ -88,7 +94,7 @@ def _pixel_maps(
         np.multiply.outer(row[band], tables.weights) + column
         for row, column in zip(tables.rows, tables.columns, strict=True)
     )
-    in_front = z > 1e-6
+    in_front = z > _LEAST_DEPTH
     np.divide(1, z, out=z, where=in_front)
     x *= z
     y *= z

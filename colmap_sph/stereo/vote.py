@@ -95,7 +95,7 @@ def depth_candidates(
         geometry.baseline,
         options.disparity_sigma,
         options.max_disparity_step,
-        geometry.model == "spherical",
+        geometry.surface == "spherical",
         side == "left",
         first,
         depth,
@@ -117,6 +117,22 @@ def vote_depth(view: View, pairs: Iterable[PairDisparity], options: VoteOptions)
     Returns
     -------
     DepthEstimate
+
+    Examples
+    --------
+    A disparity of 10 pixels, 1 unit of baseline and a focal length of 100 pixels: a depth of 1 · 100 / 10.
+
+    >>> K = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
+    >>> view = View(1, "a", 64, 48, K, np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    >>> geometry = RectifiedPair(
+    ...     surface="frame", rectified_from_world=np.eye(3), baseline=1.0, columns_per_radian=100.0,
+    ...     rows_per_radian=100.0, row_origin=-24.0, left_origin=-32.0, right_origin=-32.0, height=48,
+    ...     left_width=64, right_width=64, min_disparity=0.0, max_disparity=20.0,
+    ... )
+    >>> pair = PairDisparity("a", "b", geometry, np.full((48, 64), 10, np.float32))
+    >>> estimate = vote_depth(view, [pair], VoteOptions())
+    >>> round(float(estimate.depth[20, 30]), 4), int(estimate.support[20, 30])
+    (10.0, 1)
     """
     sources: list[tuple[NDArray[np.float32], RectifiedPair, Side]] = []
     for pair in pairs:

@@ -101,13 +101,13 @@ class BlockOptions:
             "jpeg_quality": (1, 100),
             "seed": (0, 2**32 - 1),
         }
-        wrong = [
-            f"{name} = {getattr(self, name)} (allowed: {low} to {high})"
+        wrong = {
+            name: f"{name} = {getattr(self, name)} (allowed: {low} to {high})"
             for name, (low, high) in bounds.items()
             if not low <= getattr(self, name) <= high
-        ]
+        }
         if wrong:
-            raise OptionError("demo block options out of bounds: " + ", ".join(wrong))
+            raise OptionError("demo block options out of bounds: " + ", ".join(wrong.values()), *wrong)
 
 
 @dataclass(frozen=True)

@@ -108,7 +108,22 @@ class _Canvas:
 
 
 def rectangle(centre: FloatArray, size: tuple[float, float], yaw: float) -> FloatArray:
-    """Corners (4, 2) of a turned rectangle in metres."""
+    """Corners of a turned rectangle.
+
+    Parameters
+    ----------
+    centre : (2,) float64 ndarray
+        Metres.
+    size : (float, float)
+        Along the turned x and y, metres.
+    yaw : float
+        Radians, counter-clockwise.
+
+    Returns
+    -------
+    (4, 2) float64 ndarray
+        Metres, in order around the rectangle.
+    """
     axes = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
     signs = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
     corners: FloatArray = centre + (signs * np.asarray(size)) @ axes
@@ -125,7 +140,9 @@ def _paint_fields(canvas: _Canvas, plots: list[Plot], rng: np.random.Generator, 
     for j in range(ny - 1):
         for i in range(nx - 1):
             outline = corners[[j, j, j + 1, j + 1], [i, i + 1, i + 1, i]]
-            kind, direction, spacing = rng.random(), rng.uniform(0, np.pi), rng.uniform(1.2, 2.0)
+            kind = rng.random()
+            direction = rng.uniform(0, np.pi)
+            spacing = rng.uniform(1.2, 2.0)
             near = any(np.hypot(*(plot.centre - outline.mean(axis=0))) < 0.62 * cell for plot in plots)
             if not near and kind < 0.7:
                 canvas.field(outline, _FIELDS[int(kind / 0.7 * len(_FIELDS))], direction, spacing)

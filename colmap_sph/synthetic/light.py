@@ -39,6 +39,10 @@ class ShadowMap:
             Points whose convex hull holds what may receive shadow.
         texel : float
             Grid step in metres.
+
+        Returns
+        -------
+        ShadowMap
         """
         casters = [surface for surface in surfaces if surface.corners() is not None]
         down = -np.asarray(sun, dtype=np.float64) / np.linalg.norm(np.asarray(sun))
@@ -68,8 +72,10 @@ class ShadowMap:
         rows, columns = self.distance.shape
         x = np.clip((x - self.corner[0]) / self.texel, 0.0, columns - 1.001)
         y = np.clip((y - self.corner[1]) / self.texel, 0.0, rows - 1.001)
-        i, j = x.astype(np.int64), y.astype(np.int64)
-        fx, fy = (x - i).astype(np.float32), (y - j).astype(np.float32)
+        i = x.astype(np.int64)
+        j = y.astype(np.int64)
+        fx = (x - i).astype(np.float32)
+        fy = (y - j).astype(np.float32)
         # A slanted face must not shade itself: its own depth changes by this much from texel to texel.
         slope = np.sqrt(1.0 - np.minimum(incidence, 1.0) ** 2) / np.maximum(incidence, 0.1)
         limit = (depth - self.texel * (0.3 + 1.5 * slope)).astype(np.float32)

@@ -43,7 +43,8 @@ def _candidates(
     surfaces: Sequence[Surface], cameras: Sequence[Camera], count: int, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Points (N, 3) and world normals (N, 3) behind random places of every picture."""
-    points, normals = [], []
+    points = []
+    normals = []
     for camera in cameras:
         image = rng.uniform([0.0, 0.0], [camera.width, camera.height], (count, 2))
         hits = trace_points(surfaces, camera, image)
@@ -60,7 +61,19 @@ def _candidates(
 def visible(
     surfaces: Sequence[Surface], camera: Camera, points: FloatArray, normals: FloatArray
 ) -> npt.NDArray[np.bool_]:
-    """Whether a camera sees surface points (N, 3) with outward normals (N, 3), not too grazing."""
+    """Whether a camera sees points of surfaces, not too grazing.
+
+    Parameters
+    ----------
+    surfaces : sequence of Surface
+    camera : Camera
+    points, normals : (N, 3) float64 ndarray
+        On the surfaces, and outward; world frame.
+
+    Returns
+    -------
+    (N,) bool ndarray
+    """
     image, depth = camera.project(points)
     seen: npt.NDArray[np.bool_] = (depth > 0) & np.all(
         (image > _BORDER) & (image < np.array([camera.width, camera.height]) - _BORDER), axis=1
@@ -100,7 +113,8 @@ def sample_sparse_points(
     points, normals = _candidates(surfaces, cameras, 2 * count // len(cameras) + 1, rng)
     seen = np.stack([visible(surfaces, camera, points, normals) for camera in cameras])
     kept = rng.permutation(np.flatnonzero(seen.sum(axis=0) >= min_track_length))[:count]
-    points, seen = points[kept], seen[:, kept]
+    points = points[kept]
+    seen = seen[:, kept]
     indices = tuple(np.flatnonzero(row) for row in seen)
     observations = tuple(camera.project(points[rows])[0] for camera, rows in zip(cameras, indices, strict=True))
     return SparsePoints(points, observations, indices)
@@ -142,6 +156,10 @@ def build_reconstruction(
         Standard deviation in pixels added to the exact observations.
     rng : numpy.random.Generator, optional
         Needed for the noise.
+
+    Returns
+    -------
+    pycolmap.Reconstruction
     """
     rng = rng or np.random.default_rng(0)
     model = pycolmap.Reconstruction()

@@ -33,6 +33,11 @@ def look_at(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = _UP) 
     -------
     R, t : (3, 3) and (3,) float64
         `x_cam = R x_world + t`.
+
+    Raises
+    ------
+    ValueError
+        `up` is along the line of sight.
     """
     centre = np.asarray(eye, dtype=np.float64)
     forward = np.asarray(target, dtype=np.float64) - centre
@@ -47,7 +52,20 @@ def look_at(eye: npt.ArrayLike, target: npt.ArrayLike, up: npt.ArrayLike = _UP) 
 
 
 def pinhole(focal_length: float, width: int, height: int) -> FloatArray:
-    """Calibration matrix (3, 3) with the principal point in the middle of the picture; all in pixels."""
+    """Calibration matrix with the principal point in the middle of the picture.
+
+    Parameters
+    ----------
+    focal_length : float
+        Pixels.
+    width, height : int
+        Pixels.
+
+    Returns
+    -------
+    (3, 3) float64 ndarray
+        Pixels; the first pixel's centre is at (0.5, 0.5).
+    """
     return np.array([[focal_length, 0.0, width / 2], [0.0, focal_length, height / 2], [0.0, 0.0, 1.0]])
 
 
@@ -70,7 +88,26 @@ class SyntheticPair:
         noise: float = 0.0,
         seed: int = 0,
     ) -> Rendering:
-        """Render one side; parameters as for `render`."""
+        """Render one side; see `render`.
+
+        Parameters
+        ----------
+        side : {"left", "right"}
+        origin : float
+            Depth and normals are those along the rays through (col + origin, row + origin).
+        supersample : int
+            Rays per pixel and direction.
+        light : Light, optional
+            In place of the pair's own.
+        noise : float
+            Standard deviation of the sensor noise, grey values.
+        seed : int
+            Of the noise.
+
+        Returns
+        -------
+        Rendering
+        """
         camera = self.left if side == "left" else self.right
         return render(
             self.surfaces,
@@ -125,10 +162,15 @@ def slanted_plane_pair(
         Width and height in pixels.
     seed : int
         Seed of the texture.
+
+    Returns
+    -------
+    SyntheticPair
     """
     left = Camera(pinhole(focal_length, *size), np.eye(3), np.zeros(3), *size)
     right = replace(left, t=np.array([-baseline, 0.0, 0.0]))
-    angle, direction = np.radians(slant), np.radians(tilt)
+    angle = np.radians(slant)
+    direction = np.radians(tilt)
     normal = (np.sin(angle) * np.cos(direction), np.sin(angle) * np.sin(direction), -np.cos(angle))
     # Between what the foreshortened and the other direction want.
     gsd = depth / focal_length / np.sqrt(max(np.cos(angle), 0.1))
@@ -162,7 +204,23 @@ def convergent_pair(
     size: tuple[int, int] = (320, 240),
     seed: int = 0,
 ) -> SyntheticPair:
-    """Two cameras on an arc that look at one place of a yard; `angle` in degrees between their axes."""
+    """Two cameras on an arc that look at one place of a yard.
+
+    Parameters
+    ----------
+    angle : float
+        Degrees between the cameras' axes.
+    focal_length : float
+        Pixels.
+    size : (int, int)
+        Width and height in pixels.
+    seed : int
+        Of the textures.
+
+    Returns
+    -------
+    SyntheticPair
+    """
     target = np.array([0.0, 8.0, 1.2])
     half = np.radians(angle) / 2
     eyes = [target + np.array([9.0 * np.sin(turn), -9.0 * np.cos(turn), 2.5]) for turn in (-half, half)]
@@ -177,8 +235,25 @@ def forward_motion_pair(
     size: tuple[int, int] = (320, 240),
     seed: int = 0,
 ) -> SyntheticPair:
-    """Motion by `step` metres along the first camera's axis: the epipole is the principal point."""
-    eye, target = np.array([0.0, -1.0, 3.0]), np.array([0.0, 8.0, 1.2])
+    """Motion along the first camera's axis: the epipole is the principal point.
+
+    Parameters
+    ----------
+    step : float
+        Metres.
+    focal_length : float
+        Pixels.
+    size : (int, int)
+        Width and height in pixels.
+    seed : int
+        Of the textures.
+
+    Returns
+    -------
+    SyntheticPair
+    """
+    eye = np.array([0.0, -1.0, 3.0])
+    target = np.array([0.0, 8.0, 1.2])
     axis = (target - eye) / np.linalg.norm(target - eye)
     left = _camera(eye, target, focal_length, size)
     right = _camera(eye + step * axis, target, focal_length, size)
@@ -192,7 +267,23 @@ def epipole_inside_pair(
     size: tuple[int, int] = (320, 240),
     seed: int = 0,
 ) -> SyntheticPair:
-    """Forward and sideways motion with a turn: the epipoles lie inside both pictures, off their middle."""
+    """Forward and sideways motion with a turn: the epipoles lie inside both pictures, off their middle.
+
+    Parameters
+    ----------
+    step : float
+        About the metres from camera to camera.
+    focal_length : float
+        Pixels.
+    size : (int, int)
+        Width and height in pixels.
+    seed : int
+        Of the textures.
+
+    Returns
+    -------
+    SyntheticPair
+    """
     eye = np.array([0.0, -1.0, 3.0])
     motion = np.array([0.2, 0.95, -0.1])
     left = _camera(eye, (0.0, 8.0, 1.2), focal_length, size)

@@ -288,6 +288,10 @@ def box(
         For the faces +x, -x, +y, -y, top, bottom (before the turn); the last serves the remaining ones.
     yaw : float
         Turn about the vertical in radians.
+
+    Returns
+    -------
+    ConvexPolyhedron
     """
     length, width, height = size
     planes: list[tuple[Sequence[float], float]] = [
@@ -325,6 +329,10 @@ def gabled_house(
         Turn about the vertical in radians.
     hipped : bool
         Slope the roof at the gables too.
+
+    Returns
+    -------
+    ConvexPolyhedron
     """
     length, width, eaves = size
     rise = ridge_height - eaves
@@ -344,5 +352,18 @@ def gabled_house(
 
 
 def sphere(centre: npt.ArrayLike, radius: float, material: Material) -> Ellipsoid:
-    """Sphere of a radius in metres about a world point (3,)."""
+    """A sphere.
+
+    Parameters
+    ----------
+    centre : (3,) array_like
+        World frame.
+    radius : float
+        Metres.
+    material : Material
+
+    Returns
+    -------
+    Ellipsoid
+    """
     return Ellipsoid(np.asarray(centre, dtype=np.float64), np.full(3, float(radius)), material)

@@ -90,7 +90,8 @@ class Rays:
         starts = np.cumsum([0] + [len(hull) for hull in hulls[:-1]])
         image, depth = self.image(np.concatenate(hulls))
         low, high = np.minimum.reduceat(image, starts), np.maximum.reduceat(image, starts)
-        nearest, farthest = np.minimum.reduceat(depth, starts), np.maximum.reduceat(depth, starts)
+        nearest = np.minimum.reduceat(depth, starts)
+        farthest = np.maximum.reduceat(depth, starts)
         everything: Index = (slice(None),) * len(self.shape)
         found: list[Index | None] = []
         for number in range(len(hulls)):
@@ -117,13 +118,29 @@ def _grid_window(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray
 
 
 class OrthographicRays(Rays):
-    """Parallel rays on the grid x, y along the first two axes."""
+    """Parallel rays on the grid x, y along the first two axes.
+
+    Parameters
+    ----------
+    x : (W,) float64 ndarray
+    y : (H,) float64 ndarray
+        Places of the grid along the first two axes, metres.
+    origins : (3, H, W) float64 ndarray
+        World frame.
+    direction : (3, 1, 1) float64 ndarray
+        World frame.
+    axes : (3, 3) float64 ndarray
+        Rows: along x, along y, along the rays; world frame.
+    """
 
     def __init__(
         self, x: FloatArray, y: FloatArray, origins: FloatArray, direction: FloatArray, axes: FloatArray
     ) -> None:
-        self.x, self.y, self.axes = x, y, axes
-        self.origins, self.directions = origins, direction
+        self.x = x
+        self.y = y
+        self.axes = axes
+        self.origins = origins
+        self.directions = direction
         self.shape = (y.size, x.size)
 
     def image(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -134,10 +151,22 @@ class OrthographicRays(Rays):
 
 
 class PinholeRays(Rays):
-    """Rays of unit z through image coordinates: a grid, or a list of places."""
+    """Rays of unit z through image coordinates: a grid, or a list of places.
+
+    Parameters
+    ----------
+    camera : Camera
+    x, y : (W,) and (H,), or (N,) and (N,) float64 ndarray
+        Image coordinates, pixels.
+    grid : bool
+        Whether x and y are the sides of a grid, or one place each.
+    """
 
     def __init__(self, camera: Camera, x: FloatArray, y: FloatArray, *, grid: bool) -> None:
-        self.camera, self.x, self.y, self.grid = camera, x, y, grid
+        self.camera = camera
+        self.x = x
+        self.y = y
+        self.grid = grid
         self.shape = (y.size, x.size) if grid else x.shape
         ones = (1,) * len(self.shape)
         across = x[None, :] if grid else x
@@ -180,5 +209,18 @@ def trace(surfaces: Sequence[Surface], rays: Rays) -> Hits:
 
 
 def trace_points(surfaces: Sequence[Surface], camera: Camera, image: FloatArray) -> Hits:
-    """First surface along the rays through image coordinates (N, 2); the ray parameter is the z-depth."""
+    """First surface along the rays through places of the image.
+
+    Parameters
+    ----------
+    surfaces : sequence of Surface
+    camera : Camera
+    image : (N, 2) float64 ndarray
+        Image coordinates, pixels.
+
+    Returns
+    -------
+    Hits
+        Their distance is the z-depth.
+    """
     return trace(surfaces, PinholeRays(camera, image[:, 0], image[:, 1], grid=False))

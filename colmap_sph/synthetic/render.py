@@ -61,9 +61,11 @@ def _band_colour(surfaces: Sequence[Surface], rays: Rays, light: Light) -> Float
     colour[:] = _SKY
     directions = rays.directions.reshape(3, -1)
     centre = rays.origins.reshape(3, 1)
-    distance, face = hits.distance.ravel(), hits.face.ravel()
+    distance = hits.distance.ravel()
+    face = hits.face.ravel()
     for number, places in _groups(hits.surface):
-        surface, faces = surfaces[number], face[places]
+        surface = surfaces[number]
+        faces = face[places]
         points = centre + distance[places] * directions[:, places]
         normals = surface.normals(points, faces)
         coordinates = surface.texture_coordinates(points, faces)
@@ -97,7 +99,8 @@ def _normals_in_camera(surfaces: Sequence[Surface], camera: Camera, rays: Rays, 
     normals = np.zeros((3, hits.surface.size))
     directions = rays.directions.reshape(3, -1)
     centre = rays.origins.reshape(3, 1)
-    distance, face = hits.distance.ravel(), hits.face.ravel()
+    distance = hits.distance.ravel()
+    face = hits.face.ravel()
     for number, places in _groups(hits.surface):
         towards = directions[:, places]
         outward = surfaces[number].normals(centre + distance[places] * towards, face[places])
@@ -109,7 +112,24 @@ def _normals_in_camera(surfaces: Sequence[Surface], camera: Camera, rays: Rays, 
 def exact_geometry(
     surfaces: Sequence[Surface], camera: Camera, *, origin: float = 0.5
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.int16]]:
-    """Depth, normals and surface numbers without a picture; see `render` for the parameters."""
+    """Depth, normals and surface numbers without a picture; see `render`.
+
+    Parameters
+    ----------
+    surfaces : sequence of Surface
+    camera : Camera
+    origin : float
+        Geometry is that along the rays through (col + origin, row + origin).
+
+    Returns
+    -------
+    depth : (H, W) float64 ndarray
+        z-depth; 0 where nothing is met.
+    normals : (H, W, 3) float64 ndarray
+        Unit normals in the camera frame, towards the camera; 0 where nothing is met.
+    surface : (H, W) int16 ndarray
+        Number of the surface; -1 where nothing is met.
+    """
     x: FloatArray = np.arange(camera.width, dtype=np.float64) + origin
     y: FloatArray = np.arange(camera.height, dtype=np.float64) + origin
     rays = PinholeRays(camera, x, y, grid=True)

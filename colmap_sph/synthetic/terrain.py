@@ -61,7 +61,8 @@ class Terrain(Surface):
 
     def slopes(self, x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the height along x and y at world (x, y)."""
-        x_slope, y_slope = np.zeros(x.shape), np.zeros(x.shape)
+        x_slope = np.zeros(x.shape)
+        y_slope = np.zeros(x.shape)
         for amplitude, (kx, ky), phase in zip(self.amplitudes, self.wave_vectors, self.phases, strict=True):
             derivative = amplitude * np.cos(kx * x + ky * y + phase)
             x_slope += kx * derivative
@@ -111,7 +112,8 @@ class Terrain(Surface):
                 place = np.arange(directions.shape[axis + 1]) / _COARSE
                 low = np.minimum(place.astype(np.int64), inverse.shape[axis] - 2)
                 share = (place - low).reshape((-1, 1) if axis == 0 else (1, -1))
-                below, above = np.take(inverse, low, axis), np.take(inverse, low + 1, axis)
+                below = np.take(inverse, low, axis)
+                above = np.take(inverse, low + 1, axis)
                 inverse = below + share * (above - below)
             return 1.0 / inverse
 
@@ -161,7 +163,9 @@ class Terrain(Surface):
         distance: FloatArray = (self.base + self._relief - origins[2]) / directions[2]
         active: IntArray = np.arange(distance.size)
         for _ in range(_SAFE_STEPS):
-            o, d, s = origins[:, active], directions[:, active], distance[active]
+            o = origins[:, active]
+            d = directions[:, active]
+            s = distance[active]
             x, y = o[0] + s * d[0], o[1] + s * d[1]
             x_slope, y_slope = self.slopes(x, y)
             gap = np.maximum(o[2] + s * d[2] - self.height(x, y), 0.0)

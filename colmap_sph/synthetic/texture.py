@@ -59,7 +59,19 @@ class Noise:
         self._cells: Float32Array = rng.random((_CELLS, _CELLS), dtype=np.float32)
 
     def sample(self, u: FloatArray, v: FloatArray, stretch: float = 1.0) -> Float32Array:
-        """Field of zero mean and unit variance at (u, v) in metres, its features enlarged by `stretch`."""
+        """Field of zero mean and unit variance.
+
+        Parameters
+        ----------
+        u, v : float64 ndarray
+            Coordinates, metres; of one shape.
+        stretch : float
+            Features are so many times larger.
+
+        Returns
+        -------
+        float32 ndarray of the same shape
+        """
         x = u * (self._scale / stretch)
         y = v * (self._scale / stretch)
         column = np.floor(x)
@@ -203,7 +215,8 @@ class Painting:
         x, i, i_next = _mirrored((coordinates[0] - self.corner[0]) / self.texel - 0.5, columns)
         y, j, j_next = _mirrored((coordinates[1] - self.corner[1]) / self.texel - 0.5, rows)
         flat = self.pixels.reshape(-1, 4)
-        x, y = x[:, None], y[:, None]
+        x = x[:, None]
+        y = y[:, None]
         low = flat[j * columns + i] * (1 - x) + flat[j * columns + i_next] * x
         high = flat[j_next * columns + i] * (1 - x) + flat[j_next * columns + i_next] * x
         value = (low + (high - low) * y) * np.float32(1.0 / 255.0)

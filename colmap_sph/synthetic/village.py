@@ -96,7 +96,8 @@ def _plots(count: int, roads: list[Road], rng: np.random.Generator) -> list[Plot
         if attempt < len(sites):
             centre, yaw = sites[attempt]
         else:
-            centre, yaw = rng.uniform(-1, 1, 2) * _BUILT, rng.uniform(0, np.pi)
+            centre = rng.uniform(-1, 1, 2) * _BUILT
+            yaw = rng.uniform(0, np.pi)
         large = rng.random() < 0.28
         size = (rng.uniform(13, 19), rng.uniform(10, 12)) if large else (rng.uniform(9, 12), rng.uniform(7, 9))
         radius = 0.5 * np.hypot(*size)
@@ -164,7 +165,8 @@ def _tree(place: FloatArray, terrain: Terrain, noise: Noise, rng: np.random.Gene
     for number in range(_CROWN_PARTS):
         share = 0.82 if number == 0 else rng.uniform(0.36, 0.58)
         # The golden angle spreads the boughs evenly about the stem.
-        bearing, rise = 2.4 * number + rng.uniform(-0.4, 0.4), rng.uniform(-0.15, 0.75)
+        bearing = 2.4 * number + rng.uniform(-0.4, 0.4)
+        rise = rng.uniform(-0.15, 0.75)
         reach = 0.0 if number == 0 else np.sqrt(1.0 - rise**2) * 0.68
         shift = radius * np.array([reach * np.cos(bearing), reach * np.sin(bearing), 0.8 * rise * (number > 0)])
         radii = radius * share * np.array([1.0, 1.0, rng.uniform(0.8, 1.1)])
@@ -222,6 +224,10 @@ def build_village(gsd: float, buildings: int, trees: int, seed: int) -> Village:
         How many; fewer where there is no room.
     seed : int
         The same seed gives the same village.
+
+    Returns
+    -------
+    Village
     """
     rng = np.random.default_rng(seed)
     noise = Noise(gsd, seed)

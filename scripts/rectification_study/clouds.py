@@ -16,7 +16,7 @@ from colmap_sph.evaluation import (
     visible_surface,
 )
 from colmap_sph.evaluation.neighbours import PointIndex
-from colmap_sph.stereo.rectified_pair import Model
+from colmap_sph.stereo.rectified_pair import Surface
 from rectification_study.runs import Run
 
 SEEN_BY_LIDAR = 4.0
@@ -24,7 +24,7 @@ SEEN_BY_LIDAR = 4.0
 
 
 def against_lidar(
-    runs: Mapping[Model, Run], lidar: Path, exact: Sequence[DepthView] | None, gsd: float
+    runs: Mapping[Surface, Run], lidar: Path, exact: Sequence[DepthView] | None, gsd: float
 ) -> dict[str, Any]:
     """Cloud-to-cloud distances after registration, as in the paper's Table 2, and where exact depth is given
     the floor below each: the same statistics of the exact surface at the places of the cloud's points."""
@@ -33,29 +33,29 @@ def against_lidar(
     surface = None if exact is None else visible_surface(exact, gsd / 2)
     surface_index = None if surface is None else PointIndex(surface)
     result: dict[str, Any] = {}
-    for model, run in runs.items():
+    for surface, run in runs.items():
         cloud = read_geometry(run.workspace.fused_path)
-        result[model] = {"cloud": evaluate_cloud(cloud, reference, options).as_dict()}
+        result[surface] = {"cloud": evaluate_cloud(cloud, reference, options).as_dict()}
         if surface is None or surface_index is None:
             continue
         rows = surface_index.nearest(cloud.points, 1, threads=options.worker_count)[:, 0]
         fixed = EvaluationOptions(gsd=gsd, register=False)
         floor = PointCloud("exact surface", surface[rows])
-        result[model]["floor"] = evaluate_cloud(floor, reference, fixed).as_dict()
+        result[surface]["floor"] = evaluate_cloud(floor, reference, fixed).as_dict()
         seen = np.asarray(reference.distances(floor.points, threads=options.worker_count, bound=np.inf))
         kept = seen <= SEEN_BY_LIDAR * gsd
-        result[model]["share_seen_by_lidar"] = float(kept.mean())
+        result[surface]["share_seen_by_lidar"] = float(kept.mean())
         for name, points in (("cloud", cloud.points), ("floor", floor.points)):
             part = PointCloud(name, points[kept])
-            result[model][f"{name}_seen_by_lidar"] = evaluate_cloud(part, reference, fixed).as_dict()
+            result[surface][f"{name}_seen_by_lidar"] = evaluate_cloud(part, reference, fixed).as_dict()
     return result
 
 
-def against_exact_depth(runs: Mapping[Model, Run], exact: Sequence[DepthView], gsd: float) -> dict[str, Any]:
+def against_exact_depth(runs: Mapping[Surface, Run], exact: Sequence[DepthView], gsd: float) -> dict[str, Any]:
     """Accuracy, completeness and F-score of the clouds, aware of what the images see."""
     options = EvaluationOptions(gsd=gsd)
     reference = make_reference(exact, options)
     return {
-        model: evaluate_cloud(read_geometry(run.workspace.fused_path), reference, options).as_dict()
-        for model, run in runs.items()
+        surface: evaluate_cloud(read_geometry(run.workspace.fused_path), reference, options).as_dict()
+        for surface, run in runs.items()
     }

@@ -1,4 +1,4 @@
-"""What each pair's disparity map gives, in both rectification models, on the pixels of the original images."""
+"""What each pair's disparity map gives, on both surfaces, for the pixels of the original images."""
 
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -14,9 +14,9 @@ from colmap_sph.evaluation import DepthView, truth_at_pixel_origin, truth_normal
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.pair_files import read_pair
 from colmap_sph.scene import Scene, View
-from colmap_sph.stereo.rectified_pair import Model, PairDisparity
+from colmap_sph.stereo.rectified_pair import PairDisparity, Surface
 from colmap_sph.stereo.vote import depth_candidates, right_disparity
-from rectification_study.runs import MODELS, Run
+from rectification_study.runs import SURFACES, Run
 
 CORRECT = 2.0
 """A depth is correct up to this error, in GSD of its pixel."""
@@ -80,17 +80,17 @@ def pair_depths(left: View, right: View, pair: PairDisparity, options: RunOption
 
 
 def score_pairs(
-    scene: Scene, runs: Mapping[Model, Run], exact: Sequence[DepthView] | None, options: RunOptions
+    scene: Scene, runs: Mapping[Surface, Run], exact: Sequence[DepthView] | None, options: RunOptions
 ) -> list[PairScores]:
-    """Score every pair that either model matched.
+    """Score every pair that was matched on either surface.
 
     Returns
     -------
     list of dict
-        ``left``, ``right``, ``view_angle_deg`` between the viewing directions, and per model either ``skipped``
+        ``left``, ``right``, ``view_angle_deg`` between the viewing directions, and per surface either ``skipped``
         (why), or: ``matched`` pixels of the two original images that the pair gives a depth; ``warped`` pixels,
         those of the rectified images. With exact depth also ``correct`` pixels, those of every class of slopes
-        where both models matched the pair, ``median_error_gsd``, and that of the pixels which both models match,
+        where the pair was matched on both, ``median_error_gsd``, and that of the pixels matched on both,
         ``median_error_common_gsd``.
     """
     maps = ExactMaps(exact)
@@ -101,18 +101,18 @@ def score_pairs(
         cosine = float(np.clip(views[0].viewing_direction @ views[1].viewing_direction, -1, 1))
         found = {m: read_pair(pair_files(run)[pair]) for m, run in runs.items() if pair in pair_files(run)}
         scores: PairScores = {"left": pair[0], "right": pair[1], "view_angle_deg": np.degrees(np.arccos(cosine))}
-        for model, run in runs.items():
+        for surface, run in runs.items():
             reason = run.report["skipped_pairs"].get(" - ".join(pair), "not matched")
-            scores[model] = {"skipped": reason} if model not in found else {}
-        depths = {model: pair_depths(*views, disparity, options) for model, disparity in found.items()}
-        for model, disparity in found.items():
+            scores[surface] = {"skipped": reason} if surface not in found else {}
+        depths = {surface: pair_depths(*views, disparity, options) for surface, disparity in found.items()}
+        for surface, disparity in found.items():
             geometry = disparity.geometry
-            scores[model]["warped"] = geometry.height * (geometry.left_width + geometry.right_width)
-            scores[model]["matched"] = sum(int((depth > 0).sum()) for depth in depths[model])
+            scores[surface]["warped"] = geometry.height * (geometry.left_width + geometry.right_width)
+            scores[surface]["matched"] = sum(int((depth > 0).sum()) for depth in depths[surface])
         if maps.views:
-            plane = found["frame"].geometry.rectified_from_world[2] if len(found) == len(MODELS) else None
-            for model, of_model in _exact_scores(views, depths, maps, plane).items():
-                scores[model] |= of_model
+            plane = found["frame"].geometry.rectified_from_world[2] if len(found) == len(SURFACES) else None
+            for surface, of_surface in _exact_scores(views, depths, maps, plane).items():
+                scores[surface] |= of_surface
         return scores
 
     with ThreadPoolExecutor(options.num_threads) as pool:
@@ -125,27 +125,27 @@ def _exact_scores(
     maps: ExactMaps,
     plane: NDArray[np.float64] | None,
 ) -> dict[str, dict[str, Any]]:
-    """Per model what exact depth says about a pair's depths; by slope against a plane where one is given."""
+    """Per surface what exact depth says about a pair's depths; by slope against a plane where one is given."""
 
     def flat(parts: Sequence[Map]) -> Map:
         return np.concatenate([part.ravel() for part in parts])
 
     errors = {
-        model: flat([maps.errors(view, depth) for view, depth in zip(views, of_model, strict=True)])
-        for model, of_model in depths.items()
+        surface: flat([maps.errors(view, depth) for view, depth in zip(views, of_surface, strict=True)])
+        for surface, of_surface in depths.items()
     }
     common = np.logical_and.reduce([np.isfinite(error) for error in errors.values()])
     slopes = None if plane is None else flat([maps.slopes(view, plane) for view in views])
     scores: dict[str, dict[str, Any]] = {}
-    for model, error in errors.items():
-        scores[model] = {
+    for surface, error in errors.items():
+        scores[surface] = {
             "correct": int((error <= CORRECT).sum()),
             "median_error_gsd": _median(error[np.isfinite(error)]),
             "median_error_common_gsd": _median(error[common]),
         }
         if slopes is not None:
             counts, _ = np.histogram(slopes[(error <= CORRECT) & np.isfinite(slopes)], SLOPE_EDGES)
-            scores[model]["correct_by_slope"] = counts.tolist()
+            scores[surface]["correct_by_slope"] = counts.tolist()
     return scores
 
 
@@ -156,13 +156,13 @@ def by_angle(scored: Sequence[PairScores]) -> list[dict[str, Any]]:
         inside = [pair for pair in scored if low <= pair["view_angle_deg"] < high]
         if inside:
             row: dict[str, Any] = {"from_deg": low, "to_deg": high, "pairs": len(inside)}
-            rows.append(row | {model: _summed([pair[model] for pair in inside]) for model in MODELS})
+            rows.append(row | {surface: _summed([pair[surface] for pair in inside]) for surface in SURFACES})
     return rows
 
 
 def telling_pairs(scored: Sequence[PairScores], count: int) -> list[PairScores]:
-    """Pairs to look at: those in which the models differ most, each of another class of angles if possible."""
-    usable = [pair for pair in scored if all("matched" in pair[model] for model in MODELS)]
+    """Pairs to look at: those in which the surfaces differ most, each of another class of angles if possible."""
+    usable = [pair for pair in scored if all("matched" in pair[surface] for surface in SURFACES)]
     usable.sort(key=lambda pair: abs(pair["spherical"]["matched"] - pair["frame"]["matched"]), reverse=True)
     chosen: dict[int, PairScores] = {}
     for pair in usable:

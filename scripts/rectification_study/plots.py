@@ -13,10 +13,10 @@ from colmap_sph.evaluation import DepthView
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.pair_files import read_pair
 from colmap_sph.scene import Scene
-from colmap_sph.stereo.rectified_pair import Model, Side
+from colmap_sph.stereo.rectified_pair import Side, Surface
 from colmap_sph.stereo.resampling import resample
 from rectification_study.pairs import CORRECT, ExactMaps, pair_depths, pair_files
-from rectification_study.runs import MODELS, Run
+from rectification_study.runs import SURFACES, Run
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -27,13 +27,13 @@ _DPI = 130
 
 def points_per_image(content: Mapping[str, Any], folder: Path) -> Path:
     """Bars as in the paper's Figure 5: pixels with a geometric depth of every image."""
-    points = {model: content["points"][model]["pixels_per_image"] for model in MODELS}
+    points = {surface: content["points"][surface]["pixels_per_image"] for surface in SURFACES}
     names = sorted(points["spherical"])
     figure, axes = plt.subplots(figsize=(max(8.0, 0.3 * len(names)), 4), layout="constrained")
     places = np.arange(len(names))
-    for shift, model in ((-0.2, "frame"), (0.2, "spherical")):
-        heights = [points[model].get(name, 0) / 1e6 for name in names]
-        axes.bar(places + shift, heights, 0.4, color=COLOURS[model], label=model)
+    for shift, surface in ((-0.2, "frame"), (0.2, "spherical")):
+        heights = [points[surface].get(name, 0) / 1e6 for name in names]
+        axes.bar(places + shift, heights, 0.4, color=COLOURS[surface], label=surface)
     axes.set_xticks(places, [Path(name).stem for name in names], rotation=90, fontsize=8)
     axes.set_ylabel("million points")
     axes.set_title("Pixels with a geometric depth")
@@ -43,7 +43,7 @@ def points_per_image(content: Mapping[str, Any], folder: Path) -> Path:
 
 def pairs_by_angle(content: Mapping[str, Any], folder: Path) -> Path:
     """Gain of every pair against the angle between its viewing directions."""
-    usable = [pair for pair in content["pairs"] if all("matched" in pair[model] for model in MODELS)]
+    usable = [pair for pair in content["pairs"] if all("matched" in pair[surface] for surface in SURFACES)]
     keys = ["matched", "correct"] if usable and "correct" in usable[0]["spherical"] else ["matched"]
     figure, panels = plt.subplots(1, len(keys) + 1, figsize=(5 * len(keys) + 5, 4), layout="constrained")
     angles = [pair["view_angle_deg"] for pair in usable]
@@ -54,9 +54,9 @@ def pairs_by_angle(content: Mapping[str, Any], folder: Path) -> Path:
         axes.yaxis.set_major_formatter("{x:+g}")
         axes.set_ylabel("spherical against frame [%]")
         axes.set_title(f"{key} pixels of each pair")
-    for model in MODELS:
-        ratio = [pair[model]["warped"] / 1e6 for pair in usable]
-        panels[-1].scatter(angles, ratio, s=12, alpha=0.6, color=COLOURS[model], label=model)
+    for surface in SURFACES:
+        ratio = [pair[surface]["warped"] / 1e6 for pair in usable]
+        panels[-1].scatter(angles, ratio, s=12, alpha=0.6, color=COLOURS[surface], label=surface)
     panels[-1].set_title("million pixels warped")
     panels[-1].legend()
     for axes in panels:
@@ -66,13 +66,13 @@ def pairs_by_angle(content: Mapping[str, Any], folder: Path) -> Path:
 
 def depth_side_by_side(
     scene: Scene,
-    runs: Mapping[Model, Run],
+    runs: Mapping[Surface, Run],
     pair: Mapping[str, Any],
     exact: Sequence[DepthView] | None,
     options: RunOptions,
     folder: Path,
 ) -> Path:
-    """As the paper's Figure 3: a pair's rectified images, depth map and errors in both models, a row each."""
+    """As the paper's Figure 3: a pair's rectified images, depth map and errors on both surfaces, a row each."""
     names = pair["left"], pair["right"]
     left, right = (scene.view(name) for name in names)
     maps = ExactMaps(exact)
@@ -80,26 +80,26 @@ def depth_side_by_side(
     columns = 3 if truth is None else 4
     figure, panels = plt.subplots(2, columns, figsize=(5 * columns, 8), layout="constrained")
     depths = {}
-    for model in MODELS:
-        disparity = read_pair(pair_files(runs[model])[names])
-        depths[model] = pair_depths(left, right, disparity, options)[0]
+    for surface in SURFACES:
+        disparity = read_pair(pair_files(runs[surface])[names])
+        depths[surface] = pair_depths(left, right, disparity, options)[0]
         sides: tuple[Side, Side] = ("left", "right")
-        for axes, view, side in zip(panels[MODELS.index(model)], (left, right), sides, strict=False):
-            image = cv2.imread(str(runs[model].workspace.image_path(view.name)), cv2.IMREAD_GRAYSCALE)
+        for axes, view, side in zip(panels[SURFACES.index(surface)], (left, right), sides, strict=False):
+            image = cv2.imread(str(runs[surface].workspace.image_path(view.name)), cv2.IMREAD_GRAYSCALE)
             rectified, valid = resample(np.asarray(image, np.uint8), view, disparity.geometry, side)
             axes.imshow(np.where(valid, rectified, 255), cmap="gray", vmin=0, vmax=255)
-            axes.set_title(f"{model}: {view.name}, {rectified.shape[1]} x {rectified.shape[0]}")
+            axes.set_title(f"{surface}: {view.name}, {rectified.shape[1]} x {rectified.shape[0]}")
     known = np.concatenate([depth[depth > 0] for depth in depths.values()])
     low, high = np.percentile(known, [1, 99]) if len(known) else (0, 1)
-    for row, (model, depth) in zip(panels, depths.items(), strict=True):
+    for row, (surface, depth) in zip(panels, depths.items(), strict=True):
         shown = row[2].imshow(_masked(depth), cmap="turbo", vmin=low, vmax=high)
-        row[2].set_title(f"{model}: depth of {left.name}, {(depth > 0).mean():.1%} of its pixels")
+        row[2].set_title(f"{surface}: depth of {left.name}, {(depth > 0).mean():.1%} of its pixels")
         figure.colorbar(shown, ax=row[2], shrink=0.7)
         if truth is not None:
             errors = maps.errors(left, depth)
             shown = row[3].imshow(errors, cmap="inferno", vmin=0, vmax=2 * CORRECT, interpolation="nearest")
             good = np.count_nonzero(errors <= CORRECT) / np.count_nonzero(truth)
-            row[3].set_title(f"{model}: error [GSD]; {good:.1%} of the truth within {CORRECT:g} GSD")
+            row[3].set_title(f"{surface}: error [GSD]; {good:.1%} of the truth within {CORRECT:g} GSD")
             figure.colorbar(shown, ax=row[3], shrink=0.7)
     for axes in panels.ravel():
         axes.set_xticks([])

@@ -1,4 +1,4 @@
-"""One reconstruction per rectification model, in a process of its own, with the cost of every stage."""
+"""One reconstruction per surface of rectification, in a process of its own, with the cost of every stage."""
 
 import json
 import shutil
@@ -16,9 +16,9 @@ from colmap_sph.evaluation import write_json
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.rectified_pair import Model
+from colmap_sph.stereo.rectified_pair import Surface
 
-MODELS: tuple[Model, ...] = ("frame", "spherical")
+SURFACES: tuple[Surface, ...] = ("frame", "spherical")
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ class StageMeter:
         self._stage = ""
 
 
-def reconstruct(model: Path, images: Path | None, folder: Path, options: RunOptions, rectification: Model) -> Run:
+def reconstruct(model: Path, images: Path | None, folder: Path, options: RunOptions, surface: Surface) -> Run:
     """Reconstruct in ``folder/dense``, or take what an earlier study with the same options left there.
 
     Raises
@@ -86,7 +86,7 @@ def reconstruct(model: Path, images: Path | None, folder: Path, options: RunOpti
     OutputError
         The folder is not empty and not a study's.
     """
-    options = replace(options, rectification=replace(options.rectification, rectification=rectification))
+    options = replace(options, rectification=replace(options.rectification, surface=surface))
     asked = {"model": str(Path(model).resolve()), "options": plain(options)}
     record = folder / "run.json"
     if not record.is_file():
@@ -115,7 +115,7 @@ def _make_empty(folder: Path) -> None:
 
 def _reconstruct(model: Path, images: Path | None, root: Path, options: RunOptions) -> dict[str, Any]:
     """In the child process: run and measure."""
-    meter = StageMeter(options.rectification.rectification)
+    meter = StageMeter(options.rectification.surface)
     report = colmap_sph.run(model, images=images, output=root, options=options, progress=meter)
     meter.finish()
     return {"report": plain(report), "cost": meter.cost}

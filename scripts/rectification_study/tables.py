@@ -81,7 +81,7 @@ def _lidar(lidar: Mapping[str, Any]) -> str:
             continue
         for label, key in statistics.items():
             values = [
-                lidar[model][f"cloud{suffix}"]["cloud_to_reference"][key] for model in ("frame", "spherical")
+                lidar[surface][f"cloud{suffix}"]["cloud_to_reference"][key] for surface in ("frame", "spherical")
             ]
             row = [label + words, *(f"{value:.4f}" for value in values), change(*values)]
             if has_floor:
@@ -90,7 +90,7 @@ def _lidar(lidar: Mapping[str, Any]) -> str:
             rows.append(row)
     lines = [table(header, rows)]
     if has_floor:
-        shares = [f"{lidar[model]['share_seen_by_lidar']:.1%} ({model})" for model in ("frame", "spherical")]
+        shares = [f"{lidar[surface]['share_seen_by_lidar']:.1%} ({surface})" for surface in ("frame", "spherical")]
         lines.append(
             "The floor is the same statistic of the exact surface at the places of the cloud's points: what a "
             "perfect cloud would have, for LiDAR's own spacing and for what it did not see. It saw the surface of "
@@ -151,7 +151,7 @@ def _by_angle(rows: Sequence[Mapping[str, Any]]) -> str:
 
 def _by_slope(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Correct pixels by the slope of the surface, for every class of angles; nothing without exact depth."""
-    rows = [row for row in rows if all("correct_by_slope" in row[model] for model in ("frame", "spherical"))]
+    rows = [row for row in rows if all("correct_by_slope" in row[surface] for surface in ("frame", "spherical"))]
     if not rows:
         return []
     header = ["angle [deg]"]
@@ -165,7 +165,7 @@ def _by_slope(rows: Sequence[Mapping[str, Any]]) -> list[str]:
         )
     return [
         "## By slope of the surface",
-        f"{table(header, lines)}\n\nCorrect pixels of the pairs that both models matched, by the angle in degrees "
+        f"{table(header, lines)}\n\nCorrect pixels of the pairs matched on both surfaces, by the angle in degrees "
         "of the exact surface against the plane that frame rectification uses.",
     ]
 
@@ -187,8 +187,8 @@ def _pairs(pairs: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _skipped(skipped: Mapping[str, Mapping[str, str]]) -> str:
-    rows = [[pair, model, reason] for model, pairs in skipped.items() for pair, reason in pairs.items()]
-    return table(["pair", "model", "why"], rows) if rows else "None, with either model."
+    rows = [[pair, surface, reason] for surface, pairs in skipped.items() for pair, reason in pairs.items()]
+    return table(["pair", "surface", "why"], rows) if rows else "None, on either surface."
 
 
 def _cost(content: Mapping[str, Any]) -> str:
@@ -197,7 +197,9 @@ def _cost(content: Mapping[str, Any]) -> str:
     for stage in costs["spherical"]:
         row = [stage]
         for key, scale in (("seconds", 1), ("cpu_seconds", 1), ("peak_bytes", 2**30)):
-            row += [f"{costs[model].get(stage, {}).get(key, 0) / scale:.2f}" for model in ("frame", "spherical")]
+            row += [
+                f"{costs[surface].get(stage, {}).get(key, 0) / scale:.2f}" for surface in ("frame", "spherical")
+            ]
         rows.append(row)
     totals = {m: np.sum([[c["seconds"], c["cpu_seconds"]] for c in costs[m].values()], axis=0) for m in costs}
     peaks = {m: max(c["peak_bytes"] for c in costs[m].values()) / 2**30 for m in costs}

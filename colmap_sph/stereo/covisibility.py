@@ -1,0 +1,172 @@
+"""Scene → what its views have in common: shared points and their parallax, as a graph of candidates.
+
+Candidates share sparse points. Without tracks the verified matches of COLMAP's database stand in for these, and
+without matches the overlap of the viewing frusta.
+"""
+
+import logging
+from collections.abc import Mapping
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from colmap_sph.scene import Scene
+from colmap_sph.stereo.frusta import observe_frusta, observe_points
+from colmap_sph.stereo.partner_choice import triangulation_angles, worth_of
+
+logger = logging.getLogger(__name__)
+
+CovisibilitySource = Literal["tracks", "database", "frusta"]
+"""What tells which views see the same."""
+
+# Points that tell a pair's angle and its worth.
+_MAX_ANGLE_POINTS = 512
+_MAX_WORTH_POINTS = 512
+_ANGLE_PERCENTILE = 75
+
+
+class Covisibility:
+    """Candidates of every view with the weight of each, and the angles of pairs, computed when asked for.
+
+    Parameters
+    ----------
+    scene : Scene
+    source : "tracks", "database" or "frusta"
+        What the weights rest on.
+    weights : (V, V) sparse array of int
+        What two views share.
+    points : (N, 3) float64 ndarray
+        World frame: the scene's, or samples of the frusta.
+    observed : list of (n,) int64 ndarray
+        For every view the ascending rows of `points` that it observes or has in view.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        source: CovisibilitySource,
+        weights: sparse.csr_array,
+        points: NDArray[np.float64],
+        observed: list[NDArray[np.int64]],
+    ) -> None:
+        self.scene = scene
+        self.source = source
+        self.centers = np.array([view.center for view in scene.views])
+        self._weights = weights
+        self._points = points
+        self._observed = observed
+        self._angles: dict[tuple[int, int], float] = {}
+        self._is_observed = np.zeros(len(points), dtype=bool)
+
+    def weight(self, i: int, j: int) -> int:
+        """Return what views `i` and `j` share."""
+        return int(self._weights[i, j])
+
+    def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the views that share something with view `i`, most first, and how much it is."""
+        row = slice(self._weights.indptr[i], self._weights.indptr[i + 1])
+        views = self._weights.indices[row]
+        weights = self._weights.data[row]
+        order = np.lexsort((views, -weights))
+        return views[order].astype(np.int64), weights[order].astype(np.int64)
+
+    def angle(self, i: int, j: int) -> float:
+        """Return the 75th percentile of the triangulation angles in degrees; NaN without common points."""
+        key = (min(i, j), max(i, j))
+        if key not in self._angles:
+            self._angles[key] = self._compute_angle(*key)
+        return self._angles[key]
+
+    def worth(self, i: int, j: int) -> NDArray[np.float32]:
+        """Return how well view `j` would serve the points of view `i`, or an even part of them."""
+        rows = self._observed[i]
+        rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
+        believed: NDArray[np.bool_] | float
+        if self.source == "database":
+            believed = float(self.weight(i, j) / self._weights[[i]].max())
+        else:
+            believed = self._observes(j, rows)
+        views = self.scene.views
+        return worth_of(views[i], views[j], self._points[rows], believed)
+
+    def _observes(self, i: int, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Return which of the points view `i` observes."""
+        self._is_observed[self._observed[i]] = True
+        result = self._is_observed[rows]
+        self._is_observed[self._observed[i]] = False
+        return result
+
+    def _compute_angle(self, i: int, j: int) -> float:
+        shared = self._observed[j][self._observes(i, self._observed[j])]
+        if len(shared) == 0:
+            return float("nan")
+        # Spread evenly over the points, whose order says nothing about where they are.
+        points = self._points[shared[:: -(-len(shared) // _MAX_ANGLE_POINTS)]]
+        angles = triangulation_angles(points, self.centers[i], self.centers[j])
+        return float(np.percentile(angles, _ANGLE_PERCENTILE))
+
+
+def find_covisibility(
+    scene: Scene, min_shared_points: int, matches: Mapping[tuple[str, str], int] | None
+) -> Covisibility:
+    """Find what views have in common: tracks, else verified matches, else samples of the frusta.
+
+    Parameters
+    ----------
+    scene : Scene
+    min_shared_points : int
+        Least number of points, or matches, that two views must share to be candidates of each other.
+    matches : mapping or None
+        Names of two images → number of their verified matches; serves where the model has no tracks.
+
+    Returns
+    -------
+    Covisibility
+    """
+    finite = np.asarray(np.isfinite(scene.points).all(axis=1))
+    posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
+    observed = [
+        view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
+        for view, good in zip(scene.views, posed, strict=True)
+    ]
+    if any(len(indices) for indices in observed):
+        weights = _shared_points(observed, len(scene.points), min_shared_points)
+        return Covisibility(scene, "tracks", weights, scene.points, observed)
+    points = scene.points[finite]
+    if len(points):
+        observed = observe_points(scene, points)
+    else:
+        points, observed = observe_frusta(scene)
+    if matches is not None:
+        weights = _match_counts(scene, matches, min_shared_points)
+        if weights.nnz:
+            return Covisibility(scene, "database", weights, points, observed)
+        logger.warning("the database has no verified matches of the model's images")
+    return Covisibility(scene, "frusta", _shared_points(observed, len(points), 1), points, observed)
+
+
+def _shared_points(observed: list[NDArray[np.int64]], num_points: int, least: int) -> sparse.csr_array:
+    """Count the points that two views share, as a (V, V) matrix of counts of at least `least`."""
+    indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
+    indices = np.concatenate([*observed, np.empty(0, np.int64)])
+    ones = np.ones(len(indices), dtype=np.int32)
+    seen = sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
+    return _without_self_and_few(seen @ seen.T, least)
+
+
+def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_array:
+    entries = counts.tocoo()
+    keep = (entries.row != entries.col) & (entries.data >= least)
+    kept = (entries.data[keep], (entries.row[keep], entries.col[keep]))
+    return sparse.csr_array(kept, shape=counts.shape)
+
+
+def _match_counts(scene: Scene, matches: Mapping[tuple[str, str], int], least: int) -> sparse.csr_array:
+    """Numbers of verified matches between views, as a (V, V) matrix of those of at least `least`."""
+    index_of = scene.index_of
+    known = [(index_of[a], index_of[b], n) for (a, b), n in matches.items() if a in index_of and b in index_of]
+    first, second, counts = np.array(known, dtype=np.int64).reshape(-1, 3).T
+    both = (np.tile(counts, 2), (np.concatenate([first, second]), np.concatenate([second, first])))
+    return _without_self_and_few(sparse.csr_array(both, shape=(len(scene.views),) * 2), least)
