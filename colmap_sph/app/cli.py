@@ -21,7 +21,7 @@ from colmap_sph.app.demo import run_demo
 from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
-from colmap_sph.errors import ColmapSphError, OutOfMemoryError, OutputError
+from colmap_sph.errors import ColmapSphError, OutOfMemoryError, OutputError, reason_of
 from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
@@ -152,7 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
             if error.errno is None or isinstance(error, BrokenPipeError):
                 raise
             what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
-            return _print_error(OutputError(f"{what} ({error.strerror}); check space and permissions."), console)
+            return _print_error(OutputError(f"{what} ({reason_of(error)}); check space and permissions."), console)
 
 
 def run_command(command: RunCommand, console: Console) -> int:

@@ -15,7 +15,7 @@ import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 
-from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
+from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError, reason_of
 from colmap_sph.evaluation import (
     CloudScores,
     DepthMapScores,
@@ -256,7 +256,9 @@ def _read_array(path: Path) -> NDArray[np.generic]:
         try:
             return np.asarray(np.load(path, allow_pickle=False))
         except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path} cannot be read as a NumPy array ({error}); write it again.") from error
+            raise InputError(
+                f"{path} cannot be read as a NumPy array ({reason_of(error)}); write it again."
+            ) from error
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(f"{path} cannot be read as an image, it may be damaged; write it again.")

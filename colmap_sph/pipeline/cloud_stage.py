@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from colmap_sph.errors import InputError, NoResultError, OutputError
+from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
 from colmap_sph.pipeline.context import Context, Done
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.memory import MemoryGate, format_memory, resident
@@ -165,9 +165,8 @@ def _put_together(context: Context, scratch: Path, stems: list[Path], points: in
             link_workspace(workspace, load_model(workspace.sparse_dir), origin, scratch)
         move_into_place(scratch, workspace, origin)
     except (OSError, RuntimeError) as error:
-        reason = getattr(error, "strerror", None) or error
         raise OutputError(
-            f"{workspace.fused_path} cannot be written ({reason}); check space and permissions."
+            f"{workspace.fused_path} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from colmap_sph.errors import InputError, OutputError
+from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.cloud_files import check_places, link_workspace, move_into_place
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.map_coordinates import local_origin
@@ -84,9 +84,9 @@ def fuse_by_colmap(
             _check_written(scratch / "fused.ply", scratch / "fused.ply.vis", cloud.num_points3D())
             move_into_place(scratch, workspace, origin)
         except (OSError, RuntimeError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
             raise OutputError(
-                f"COLMAP's fusion cannot write {workspace.fused_path} ({reason}); check space and permissions."
+                f"COLMAP's fusion cannot write {workspace.fused_path} ({reason_of(error)}); "
+                "check space and permissions."
             ) from error
     return int(cloud.num_points3D())
 
@@ -121,7 +121,7 @@ def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
         names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{workspace.fusion_cfg_path} cannot be read ({error}); list the images in it."
+            f"{workspace.fusion_cfg_path} cannot be read ({reason_of(error)}); list the images in it."
         ) from error
     model = load_model(workspace.sparse_dir)
     cameras = cameras_of_images(model)

@@ -7,7 +7,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from colmap_sph.errors import OutputError
+from colmap_sph.errors import OutputError, reason_of
 
 
 def make_dir(folder: Path) -> None:
@@ -16,7 +16,7 @@ def make_dir(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"The folder {folder} cannot be created ({error.strerror or error}); choose another --output."
+            f"The folder {folder} cannot be created ({reason_of(error)}); choose another --output."
         ) from error
 
 
@@ -40,7 +40,7 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
         temporary.replace(path)
     except OSError as error:
         raise OutputError(
-            f"{path} cannot be written ({error.strerror or error}); check space and permissions."
+            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
     finally:
         with suppress(OSError):  # not there, or on a disk that has become read-only

@@ -11,6 +11,8 @@ from pathlib import Path
 import cv2
 import pycolmap
 
+from colmap_sph.errors import reason_of
+
 _JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
 # Start-of-frame markers; 0xC4, 0xC8 and 0xCC among them have other meanings.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -41,7 +43,7 @@ def image_problem(path: Path, width: int, height: int) -> str | None:
     try:
         found = _image_size(path)
     except OSError as error:
-        return f"cannot be read ({error.strerror or error})"
+        return f"cannot be read ({reason_of(error)})"
     except (_DamagedError, struct.error, IndexError):
         return "is damaged or cut off"
     if found != (width, height):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 
 _POSE_BYTES = 7 * 8
 
@@ -34,7 +34,7 @@ def check_binary_file(path: Path) -> None:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 end = _walk(data, _RECORD_END[path.name])
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror or error}); check its permissions.") from error
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); check its permissions.") from error
     if end != size:
         raise InputError(f"{path} is truncated or damaged; export the model from COLMAP again.")
 

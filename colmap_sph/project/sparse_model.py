@@ -5,7 +5,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 import pycolmap
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.model_check import check_binary_file
 
 MODEL_FILES = ("cameras", "images", "points3D")
@@ -51,7 +51,7 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         ) from error
     except (RuntimeError, ValueError, IndexError, KeyError, MemoryError) as error:
         raise InputError(
-            f"The model in {sparse_dir} is damaged ({_one_line(error)}); export it from COLMAP again."
+            f"The model in {sparse_dir} is damaged ({reason_of(error)}); export it from COLMAP again."
         ) from error
     if not registered:
         raise InputError(
@@ -130,7 +130,3 @@ def model_files(sparse_dir: Path) -> list[Path]:
     raise InputError(
         f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
     )
-
-
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__

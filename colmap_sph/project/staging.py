@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, get_args
 
-from colmap_sph.errors import InputError, OutputError
+from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
 from colmap_sph.project.workspace import MapKind, Workspace
@@ -132,7 +132,7 @@ def _remove(path: Path) -> None:
         else:
             path.unlink(missing_ok=True)
     except OSError as error:
-        raise OutputError(f"{path} cannot be removed ({error.strerror or error}); check permissions.") from error
+        raise OutputError(f"{path} cannot be removed ({reason_of(error)}); check permissions.") from error
 
 
 def move_into_place(scratch: Path, workspace: Workspace) -> None:
@@ -144,7 +144,7 @@ def move_into_place(scratch: Path, workspace: Workspace) -> None:
         (scratch / _MARKER).rename(workspace.state_dir / _MARKER)
     except OSError as error:
         raise OutputError(
-            f"The undistorted images cannot be moved into {workspace.root} ({error.strerror or error}); "
+            f"The undistorted images cannot be moved into {workspace.root} ({reason_of(error)}); "
             "choose another --output."
         ) from error
     shutil.rmtree(scratch, ignore_errors=True)

@@ -13,7 +13,7 @@ from typing import Any
 
 import pycolmap
 
-from colmap_sph.errors import InputError, OptionError, OutputError
+from colmap_sph.errors import InputError, OptionError, OutputError, reason_of
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.image_check import image_problem
@@ -247,7 +247,7 @@ def _undistort(originals: Originals, names: list[str], scratch: Path, options: U
             )
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
-        raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {error}") from error
+        raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {reason_of(error)}") from error
     return _mend_workspace(Workspace(scratch), names)
 
 
