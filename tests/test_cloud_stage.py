@@ -411,7 +411,7 @@ def test_unwritable_output(workspace, blocked, monkeypatch):
         def refuse(*_):
             raise PermissionError(13, "Permission denied")
 
-        monkeypatch.setattr(cloud_stage, "move_into_place", refuse)
+        monkeypatch.setattr(cloud_stage, "move_cloud_into_place", refuse)
     else:
         path.mkdir()
     before = sorted(workspace.root.rglob("*"))

@@ -16,6 +16,7 @@ from colmap_sph.project.originals import find_images
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import (
     UndistortionOptions,
+    foresee_workspace,
     leave_out_bad_images,
     open_workspace,
     prepare_workspace,
@@ -193,6 +194,11 @@ def test_interrupted_move_is_finished(tmp_path: Path, monkeypatch: pytest.Monkey
     for index, part in enumerate(staging._PARTS):
         (finished.root / part).rename((dense if index < num_moved else scratch) / part)
     monkeypatch.setattr(pycolmap, "undistort_images", None)
+    assert foresee_workspace(sparse, None, dense, OPTIONS, masks, overwrite=False) is not None
+    assert foresee_workspace(sparse, None, dense, OPTIONS, masks, overwrite=True) is not None
+    if num_moved:
+        with pytest.raises(InputError, match=r"different masks.*--overwrite"):
+            prepare_workspace(sparse, None, dense, OPTIONS)
     workspace = prepare_workspace(sparse, None, dense, OPTIONS, masks)
     assert workspace.mask_path("a.png").is_file()
     assert len(leave_out_bad_images(read_scene(workspace.sparse_dir), workspace).views) == 4

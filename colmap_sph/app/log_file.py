@@ -56,7 +56,7 @@ class _WorkspaceLog(logging.Handler):
             self._file.emit(record)
 
     def _open(self) -> logging.FileHandler:
-        path = self._workspace.state_dir / "log.txt"
+        path = self._workspace.log_path
         try:
             file = _LogFile(path, encoding="utf-8")
         except OSError as error:

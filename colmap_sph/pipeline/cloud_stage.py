@@ -13,7 +13,13 @@ from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.memory import MemoryGate, format_memory, resident
 from colmap_sph.pipeline.records import forget, vouch, vouched_facts
 from colmap_sph.pipeline.view_maps import read_view_maps
-from colmap_sph.project.cloud_files import check_places, join_parts, link_workspace, move_into_place, write_part
+from colmap_sph.project.cloud_files import (
+    check_places,
+    join_parts,
+    link_workspace,
+    move_cloud_into_place,
+    write_part,
+)
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.pair_lists import write_fusion_cfg
@@ -133,7 +139,7 @@ def _fuse_by_pixel(context: Context, state: CloudState) -> tuple[int, bool]:
         return read_view_maps(workspace, view, index_of[view.image_id], options.fusion_input, masks)
 
     maps = LoadCache(load, lambda view_maps: view_maps.nbytes, cache_bytes)
-    scratch = workspace.state_dir / "fusion"
+    scratch = workspace.fusion_scratch_dir
     with scratch_folder(scratch):
         stems = {name: scratch / f"{scene.view(name).image_id}" for name in state.names}
 
@@ -163,7 +169,7 @@ def _put_together(context: Context, scratch: Path, stems: list[Path], points: in
         join_parts(stems, scratch, points)
         if origin.any():
             link_workspace(workspace, load_model(workspace.sparse_dir), origin, scratch)
-        move_into_place(scratch, workspace, origin)
+        move_cloud_into_place(scratch, workspace, origin)
     except (OSError, RuntimeError) as error:
         raise OutputError(
             f"{workspace.fused_path} cannot be written ({reason_of(error)}); check space and permissions."

@@ -204,5 +204,5 @@ def _write_report(context: Context) -> None:
     unit = 1 if sys.platform == "darwin" else 1024
     report.peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
     content = {"options": asdict(context.options), **asdict(report)}
-    with atomic_file(context.workspace.state_dir / "report.json") as file:
+    with atomic_file(context.workspace.report_path) as file:
         file.write(json.dumps(content, indent=1, default=str).encode())

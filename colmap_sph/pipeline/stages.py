@@ -85,7 +85,7 @@ def match_pairs(context: Context, pairs: Sequence[Pair]) -> dict[Pair, str]:
     Writes their disparity maps; returns the keys of the pairs that could be matched, by pair.
     """
     report = context.report
-    make_dir(context.pairs_dir)
+    make_dir(context.workspace.pairs_dir)
     thread, threads = threading.local(), context.options.num_threads
     gate = MemoryGate(context.options.memory_budget)
     # Scratch memory and caches take of what the largest pair leaves, but never starve.

@@ -25,11 +25,10 @@ from colmap_sph.project.sparse_model import cameras_of_images, is_pinhole, load_
 from colmap_sph.project.staging import (
     check_discardable,
     discard_workspace,
+    finish_move,
     is_finished,
-    move_into_place,
-    read_marker,
+    move_workspace_into_place,
     scratch_folder,
-    write_marker,
 )
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.scene import Scene
@@ -101,8 +100,8 @@ def prepare_workspace(
     options.check()
     originals = read_originals(model_dir, image_dir, masks)
     marker, workspace = _marker(originals, options), Workspace(output)
-    scratch = workspace.state_dir / "undistorting"
-    if not overwrite and _is_made(workspace, scratch, marker):
+    scratch = workspace.undistortion_scratch_dir
+    if not overwrite and _is_made(workspace, marker):
         return workspace
     usable = originals.usable()
     if overwrite:
@@ -113,8 +112,7 @@ def prepare_workspace(
         _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
         Workspace(scratch).create_stereo_dirs(kept)
         shutil.rmtree(Workspace(scratch).state_dir)
-        write_marker(scratch, marker)
-        move_into_place(scratch, workspace)
+        move_workspace_into_place(workspace, marker)
     logger.info("Undistorted %d of %d images into %s", len(kept), originals.model.num_reg_images(), output)
     return workspace
 
@@ -213,10 +211,9 @@ def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
     return replace(scene, views=tuple(good))
 
 
-def _is_made(workspace: Workspace, scratch: Path, marker: dict[str, Any]) -> bool:
+def _is_made(workspace: Workspace, marker: dict[str, Any]) -> bool:
     """Whether the workspace is there, once a move into place that was interrupted is finished."""
-    if read_marker(scratch) == marker:
-        move_into_place(scratch, workspace)
+    finish_move(workspace, marker)
     finished = is_finished(workspace, marker)
     if finished:
         logger.info("The undistorted images in %s are up to date", workspace.root)

@@ -50,6 +50,16 @@ class Workspace:
         return self.root / "fused.ply"
 
     @property
+    def visibility_path(self) -> Path:
+        """Which images see each point of the cloud; COLMAP derives its name from the cloud's."""
+        return self.root / "fused.ply.vis"
+
+    @property
+    def cloud_paths(self) -> tuple[Path, Path]:
+        """The two files of the cloud."""
+        return self.fused_path, self.visibility_path
+
+    @property
     def fusion_cfg_path(self) -> Path:
         """Names of the images that take part in fusion."""
         return self.stereo_dir / "fusion.cfg"
@@ -65,9 +75,59 @@ class Workspace:
         return self.root / "colmap_sph"
 
     @property
+    def log_path(self) -> Path:
+        """The log of all runs."""
+        return self.state_dir / "log.txt"
+
+    @property
+    def report_path(self) -> Path:
+        """What the last run did."""
+        return self.state_dir / "report.json"
+
+    @property
+    def marker_path(self) -> Path:
+        """What the undistorted images and their model were made from."""
+        return self.state_dir / "undistortion.json"
+
+    @property
+    def undistortion_scratch_dir(self) -> Path:
+        """While images are undistorted: what there is of the workspace so far."""
+        return self.state_dir / "undistorting"
+
+    @property
+    def pairs_dir(self) -> Path:
+        """Disparity maps of the pairs."""
+        return self.state_dir / "pairs"
+
+    @property
+    def photometric_dir(self) -> Path:
+        """Photometric depth of the images, with its standard deviation and number of votes."""
+        return self.state_dir / "photometric"
+
+    @property
+    def records_dir(self) -> Path:
+        """Records that vouch for depth and normal maps."""
+        return self.state_dir / "state"
+
+    @property
+    def cloud_record_path(self) -> Path:
+        """Record that vouches for the cloud; its name is none of an image's."""
+        return self.state_dir / "cloud.json"
+
+    @property
+    def fusion_scratch_dir(self) -> Path:
+        """While maps are fused: parts of the cloud."""
+        return self.state_dir / "fusion"
+
+    @property
     def local_dir(self) -> Path:
         """For a model in map coordinates: a workspace near its origin, for COLMAP's own programs to go on."""
         return self.state_dir / "local"
+
+    @property
+    def local_origin_path(self) -> Path:
+        """Map coordinates of that origin."""
+        return self.local_dir / "origin.txt"
 
     def image_path(self, name: str) -> Path:
         """Undistorted image `name`."""
