@@ -10,14 +10,12 @@ import pytest
 
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.project import staging
-from colmap_sph.project.image_check import image_problem
-from colmap_sph.project.images import read_grey
+from colmap_sph.project.images import image_problem, read_grey
 from colmap_sph.project.originals import find_images
-from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
 from colmap_sph.project.undistortion import (
     UndistortionOptions,
     foresee_workspace,
-    leave_out_bad_images,
     open_workspace,
     prepare_workspace,
 )
@@ -112,6 +110,15 @@ def test_panorama_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="panorama"):
         prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
     assert not (tmp_path / "dense").exists()
+
+
+def test_a_panorama_leaves_the_workspace_that_is_there(tmp_path: Path) -> None:
+    prepare_workspace(make_project(tmp_path / "good"), None, tmp_path / "dense", OPTIONS)
+    sparse = make_project(tmp_path / "bad", "EQUIRECTANGULAR")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match="panorama"):
+        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS, overwrite=True)
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def damage(path: Path, kind: str) -> None:

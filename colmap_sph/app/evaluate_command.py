@@ -33,8 +33,9 @@ from colmap_sph.evaluation import (
     truth_normals_at_pixel_origin,
     write_json,
 )
+from colmap_sph.project.cameras import is_pinhole
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
-from colmap_sph.project.sparse_model import is_pinhole, load_model
+from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import MapKind, Workspace
 
 logger = logging.getLogger(__name__)

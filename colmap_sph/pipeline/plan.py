@@ -19,8 +19,8 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import check_arguments, choose_pairs, matches_for, wanted_scene
 from colmap_sph.pipeline.stages import PairState, check_state, pair_state, vote_state
 from colmap_sph.project.database import find_database
-from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.undistortion import foresee_workspace, leave_out_bad_images, open_workspace
+from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
+from colmap_sph.project.undistortion import foresee_workspace, open_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import MAX_PARTNERS

@@ -24,12 +24,11 @@ from colmap_sph.project.claim import claimed
 from colmap_sph.project.database import find_database, read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
-from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
 from colmap_sph.project.sparse_model import image_names, load_model, model_files
 from colmap_sph.project.staging import discard_results
 from colmap_sph.project.undistortion import (
     UndistortionOptions,
-    leave_out_bad_images,
     open_workspace,
     prepare_workspace,
 )

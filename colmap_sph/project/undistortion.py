@@ -7,21 +7,22 @@ not undistort, and cameras without distortion but of a distorted model, in the m
 
 import logging
 import shutil
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
 from colmap_sph.errors import InputError, OptionError, OutputError, reason_of
+from colmap_sph.project.cameras import make_pinhole, replace_ideal_fisheyes, undistort_cameras
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.image_check import image_problem
+from colmap_sph.project.images import image_problem
 from colmap_sph.project.masks import check_masks, undistort_mask
 from colmap_sph.project.originals import Originals, read_originals
 from colmap_sph.project.pair_lists import write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.scene_reader import scene_of_model
-from colmap_sph.project.sparse_model import cameras_of_images, is_pinhole, load_model, make_pinhole, model_files
+from colmap_sph.project.sparse_model import cameras_of_images, load_model, model_files, submodel
 from colmap_sph.project.staging import (
     check_discardable,
     discard_workspace,
@@ -53,6 +54,12 @@ class UndistortionOptions:
             raise OptionError(
                 f"max_image_size must be -1 (keep the size) or at least 16, not {self.max_image_size}."
             )
+
+    def for_colmap(self) -> pycolmap.UndistortCameraOptions:
+        """The same as COLMAP's options."""
+        options = pycolmap.UndistortCameraOptions()
+        options.max_image_size = self.max_image_size
+        return options
 
 
 def prepare_workspace(
@@ -149,14 +156,10 @@ def foresee_workspace(
         check_discardable(Workspace(output))
     elif is_finished(Workspace(output), _marker(originals, options)):
         return None
-    model = _submodel(originals.model, set(originals.usable().images))
+    model = submodel(originals.model, set(originals.usable().images))
     cameras = [model.camera(image.camera_id) for image in model.images.values()]
     pixels = sum(camera.width * camera.height for camera in cameras)
-    _replace_ideal_fisheyes(model)
-    for camera in model.cameras.values():
-        undistorted = pycolmap.undistort_camera(_camera_options(options), camera)
-        camera.model, camera.params = undistorted.model, undistorted.params
-        camera.width, camera.height = undistorted.width, undistorted.height
+    undistort_cameras(model, options.for_colmap())
     return Foreseen(scene_of_model(model, model_dir), pixels)
 
 
@@ -189,28 +192,6 @@ def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
     return workspace
 
 
-def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
-    """Return the scene without the views whose undistorted image is missing, damaged or of another size.
-
-    Each of them is reported by a warning.
-
-    Raises
-    ------
-    InputError
-        No view is left.
-    """
-    good = []
-    for view in scene.views:
-        problem = image_problem(workspace.image_path(view.name), view.width, view.height)
-        if problem is None:
-            good.append(view)
-        else:
-            logger.warning("%s %s; left out", workspace.image_path(view.name), problem)
-    if not good:
-        raise InputError(f"None of the {len(scene.views)} images in {workspace.images_dir} is usable.")
-    return replace(scene, views=tuple(good))
-
-
 def _is_made(workspace: Workspace, marker: dict[str, Any]) -> bool:
     """Whether the workspace is there, once a move into place that was interrupted is finished."""
     finish_move(workspace, marker)
@@ -228,7 +209,7 @@ def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any
 def _undistort(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> list[str]:
     """Let COLMAP undistort images `names` into `scratch`; return the names that came out well."""
     model_dir = originals.model_dir
-    if _replace_ideal_fisheyes(originals.model):
+    if replace_ideal_fisheyes(originals.model):
         model_dir = scratch / "model"
         make_dir(model_dir)
         originals.model.write_binary(model_dir)
@@ -240,19 +221,12 @@ def _undistort(originals: Originals, names: list[str], scratch: Path, options: U
                 model_dir,
                 originals.image_dir,
                 image_names=names,
-                undistort_options=_camera_options(options),
+                undistort_options=options.for_colmap(),
             )
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
         raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {reason_of(error)}") from error
     return _mend_workspace(Workspace(scratch), names)
-
-
-def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
-    """Our options as COLMAP's."""
-    camera_options = pycolmap.UndistortCameraOptions()
-    camera_options.max_image_size = options.max_image_size
-    return camera_options
 
 
 def _undistort_masks(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> None:
@@ -263,28 +237,7 @@ def _undistort_masks(originals: Originals, names: list[str], scratch: Path, opti
     cameras = cameras_of_images(originals.model)
     for name in names:
         target = Workspace(scratch).mask_path(name)
-        undistort_mask(mask_path(originals.mask_dir, name), cameras[name], _camera_options(options), target)
-
-
-def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
-    """Make COLMAP undistort fisheye cameras whose coefficients are all zero.
-
-    COLMAP takes any camera without distortion coefficients for a pinhole and copies its images. A coefficient
-    just above its threshold (1e-8) changes nothing: at 1 rad and f = 4000 px it is 4e-4 px.
-    """
-    changed = False
-    for camera in model.cameras.values():
-        if camera.is_spherical():
-            raise InputError(
-                f"Camera {camera.camera_id} is a panorama ({camera.model_name}); "
-                "render perspective images from it and register those."
-            )
-        if camera.is_undistorted() and not is_pinhole(camera):
-            K = camera.calibration_matrix()
-            camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
-            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 1e-7, 0.0, 0.0, 0.0]
-            changed = True
-    return changed
+        undistort_mask(mask_path(originals.mask_dir, name), cameras[name], options.for_colmap(), target)
 
 
 def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
@@ -301,7 +254,7 @@ def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     if not kept:
         raise InputError("COLMAP could not undistort any of the images; see its messages above.")
     if len(kept) < model.num_reg_images():
-        model = _submodel(model, set(kept))
+        model = submodel(model, set(kept))
     for camera in model.cameras.values():
         make_pinhole(camera)
     shutil.rmtree(workspace.sparse_dir)
@@ -311,27 +264,6 @@ def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     write_fusion_cfg(workspace.fusion_cfg_path, kept)
     write_patch_match_cfg(workspace.patch_match_cfg_path, dict.fromkeys(kept, 20))
     return kept
-
-
-def _submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Reconstruction:
-    """Return the model of images `names` alone, with the tracks of two or more observations they share."""
-    part = pycolmap.Reconstruction()
-    images = [model.image(i) for i in model.reg_image_ids() if model.image(i).name in names]
-    for camera_id in sorted({image.camera_id for image in images}):
-        part.add_camera_with_trivial_rig(model.camera(camera_id))
-    for image in images:
-        keypoints = [point.xy for point in image.points2D]
-        copy = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
-        part.add_image_with_trivial_frame(copy, image.cam_from_world())
-    ids = {image.image_id for image in images}
-    for point_id, point in model.points3D.items():
-        elements = [element for element in point.track.elements if element.image_id in ids]
-        if len(elements) >= 2:
-            kept = pycolmap.Point3D()
-            kept.xyz, kept.color, kept.error = point.xyz, point.color, point.error
-            kept.track = pycolmap.Track(elements)
-            part.add_point3D_with_id(point_id, kept)
-    return part
 
 
 def _check_space(originals: Originals, names: list[str], output: Path, options: UndistortionOptions) -> None:

@@ -131,7 +131,7 @@ class Workspace:
 
     def image_path(self, name: str) -> Path:
         """Undistorted image `name`."""
-        return self.images_dir / _checked_name(name)
+        return self.images_dir / checked_name(name)
 
     @property
     def masks_dir(self) -> Path:
@@ -144,11 +144,11 @@ class Workspace:
 
     def depth_map_path(self, name: str, kind: MapKind) -> Path:
         """Depth map of image `name`."""
-        return self.stereo_dir / "depth_maps" / f"{_checked_name(name)}.{kind}.bin"
+        return self.stereo_dir / "depth_maps" / f"{checked_name(name)}.{kind}.bin"
 
     def normal_map_path(self, name: str, kind: MapKind) -> Path:
         """Normal map of image `name`."""
-        return self.stereo_dir / "normal_maps" / f"{_checked_name(name)}.{kind}.bin"
+        return self.stereo_dir / "normal_maps" / f"{checked_name(name)}.{kind}.bin"
 
     def create_stereo_dirs(self, names: Iterable[str]) -> None:
         """Create the folders that the maps of images `names` and our own state go to.
@@ -173,11 +173,17 @@ class Workspace:
 
 def mask_path(folder: Path, name: str) -> Path:
     """Where COLMAP looks for the mask of image `name` in a folder of masks."""
-    return folder / f"{_checked_name(name)}.png"
+    return folder / f"{checked_name(name)}.png"
 
 
-def _checked_name(name: str) -> str:
-    """Refuse a name that would lead out of the workspace, or that leaves no room for the endings of our files."""
+def checked_name(name: str) -> str:
+    """Return the name of an image that may be the name of files.
+
+    Raises
+    ------
+    InputError
+        It would lead out of the workspace, or leaves no room for the endings of our files.
+    """
     parts = PurePosixPath(name)
     if not name or parts.is_absolute() or ".." in parts.parts:
         raise InputError(f"The image name {name!r} leads out of the workspace; rename the image in the model.")
