@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,10 +20,10 @@ from colmap_sph.pipeline.cloud_stage import fuse_views
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.reconstruct import find_database, workspace_root
 from colmap_sph.pipeline.stages import _MATCH_BYTES, check_views, estimate_views, match_pairs
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_patch_match_cfg
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
@@ -56,6 +55,11 @@ def median_scores(block: DemoBlock, dense: Path) -> tuple[float, float]:
             truth, _ = block.truth(name)
             scores.append(compare_depth_map(read_depth_map(path), truth, gsd=truth / camera.K[0, 0]))
     return float(np.median([s.coverage for s in scores])), float(np.median([s.within[0] for s in scores]))
+
+
+def prepare(project: Path, output: Path) -> Workspace:
+    """The workspace of a project's undistorted images."""
+    return prepare_workspace(Project(project / "sparse/0", output=output), UndistortionOptions()).workspace
 
 
 # ---- what a run gives --------------------------------------------------------------------------------------
@@ -143,7 +147,7 @@ def test_stages_one_by_one(project: Path) -> None:
     """The public stages give what `run` gives."""
     keep_images(project, NADIR)
     whole = colmap_sph.run(project / "sparse/0", output=project / "whole", options=FEW_PAIRS)
-    workspace = prepare_workspace(project / "sparse/0", None, project / "stages", UndistortionOptions())
+    workspace = prepare(project, project / "stages")
     scene = anchored(read_scene(workspace.sparse_dir))
     selection = select_pairs(scene, FEW_PAIRS.pairs)
     context = Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS))
@@ -203,7 +207,7 @@ def test_workspace_of_colmap(project: Path) -> None:
 
 def test_explicit_patch_match_cfg_is_obeyed(project: Path) -> None:
     dense = project / "dense"
-    workspace = prepare_workspace(project / "sparse/0", None, dense, UndistortionOptions())
+    workspace = prepare(project, dense)
     sources = {"N_0_1.jpg": ["N_0_0.jpg", "N_0_2.jpg"], "N_1_1.jpg": ["N_0_1.jpg"], "R_0.jpg": 1}
     write_patch_match_cfg(workspace.patch_match_cfg_path, sources)
     report = colmap_sph.run(workspace=dense, options=FEW_PAIRS)
@@ -319,7 +323,7 @@ def test_one_unreadable_image_is_skipped(project: Path, caplog: pytest.LogCaptur
 def test_one_unreadable_image_of_a_workspace_is_skipped(project: Path) -> None:
     keep_images(project, NADIR)
     dense = project / "dense"
-    prepare_workspace(project / "sparse/0", None, dense, UndistortionOptions())
+    prepare(project, dense)
     (dense / "images" / NADIR[3]).write_bytes(b"\xff\xd8 not an image")
     report = colmap_sph.run(workspace=dense, options=FEW_PAIRS)
     assert list(report.skipped_images) == [NADIR[3]]
@@ -374,7 +378,7 @@ def test_few_points_are_explained(project: Path) -> None:
 def test_a_map_that_cannot_be_written(project: Path) -> None:
     keep_images(project, NADIR)
     in_the_way = project / f"dense/stereo/normal_maps/{NADIR[1]}.photometric.bin"
-    prepare_workspace(project / "sparse/0", None, project / "dense", UndistortionOptions())
+    prepare(project, project / "dense")
     in_the_way.mkdir()
     with pytest.raises(OutputError, match=in_the_way.name):
         colmap_sph.run(project / "sparse/0", options=FEW_PAIRS)
@@ -392,28 +396,6 @@ def test_the_number_of_opencv_threads_is_restored(project: Path) -> None:
         assert cv2.getNumThreads() == 2
     finally:
         cv2.setNumThreads(before)
-
-
-@pytest.mark.parametrize(
-    ("model", "expected"),
-    [
-        ("project/sparse/0", "project/dense"),
-        ("project/sparse/12", "project/dense"),
-        ("project/sparse", "project/dense"),
-        ("2024/sparse/0", "2024/dense"),
-        ("2024", "dense"),
-        ("project/model", "project/model/dense"),
-    ],
-)
-def test_default_output(tmp_path: Path, model: str, expected: str) -> None:
-    root = workspace_root(tmp_path / model, images=None, output=None, workspace=None)
-    assert root == tmp_path / expected
-
-
-def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:
-    given = dict.fromkeys(("model", "images", "output", "workspace"))
-    assert workspace_root(**(given | {"model": "sparse/0", "output": "x"})) == Path("x")
-    assert workspace_root(**(given | {"workspace": tmp_path})) == tmp_path
 
 
 @pytest.mark.parametrize(
@@ -443,14 +425,6 @@ def test_contradictions_and_bad_values(arguments: dict, tmp_path: Path, monkeypa
 def test_all_cores_by_default() -> None:
     assert RunOptions().num_threads == len(os.sched_getaffinity(0))
     assert RunOptions(threads=3).num_threads == 3
-
-
-def test_find_database(project: Path) -> None:
-    assert find_database(project / "sparse/0") is None
-    (project / "database.db").write_bytes(b"")
-    assert find_database(project / "sparse/0") == project.resolve() / "database.db"
-    shutil.copy(project / "database.db", project / "sparse/0/database.db")
-    assert find_database(project / "sparse/0") == project / "sparse/0/database.db"
 
 
 def test_a_pair_may_take_most_of_the_budget(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -25,9 +25,10 @@ from colmap_sph.errors import ColmapSphError, OutOfMemoryError, OutputError, rea
 from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
-from colmap_sph.pipeline.reconstruct import run, workspace_root
+from colmap_sph.pipeline.reconstruct import run
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.workers import is_memory_error
+from colmap_sph.project.project import Project
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.stereo.confirm import ConfirmOptions
@@ -157,8 +158,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 def run_command(command: RunCommand, console: Console) -> int:
     """`colmap_sph run`."""
-    root = workspace_root(command.model, images=command.images, output=command.output, workspace=command.workspace)
-    options = command.options()
+    project = Project(command.model, command.images, command.masks, command.output, command.workspace)
+    project.check()
+    root, options = project.root, command.options()
     options.check()
     if command.dry_run:
         print_plan(make_plan(options=options, **command.sources()), Workspace(root), console)

@@ -18,9 +18,9 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import check_arguments, choose_pairs, matches_for, wanted_scene
 from colmap_sph.pipeline.stages import PairState, check_state, pair_state, vote_state
-from colmap_sph.project.database import find_database
+from colmap_sph.project.project import open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
-from colmap_sph.project.undistortion import foresee_workspace, open_workspace
+from colmap_sph.project.undistortion import foresee_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import MAX_PARTNERS
@@ -112,16 +112,15 @@ def make_plan(
     Plan
     """
     options = options or RunOptions()
-    root = check_arguments(model, images=images, output=output, workspace=workspace, options=options)
-    mask_dir, database, foreseen = None if masks is None else Path(masks), None, None
-    if model is None:
-        dense = open_workspace(root, mask_dir)
+    project = check_arguments(
+        model, images=images, masks=masks, output=output, workspace=workspace, options=options
+    )
+    root, database, foreseen = project.root, project.database(), None
+    if project.model is None:
+        dense = open_workspace(project)
     else:
-        dense, database = Workspace(root), find_database(Path(model))
-        image_dir = None if images is None else Path(images)
-        foreseen = foresee_workspace(
-            Path(model), image_dir, root, options.undistortion, mask_dir, overwrite=overwrite
-        )
+        dense = Workspace(root)
+        foreseen = foresee_workspace(project, options.undistortion, overwrite=overwrite)
     if foreseen is None:
         scene = leave_out_bad_images(anchored(read_scene(dense.sparse_dir)), dense)
         selection = choose_pairs(dense, scene, options, database)

@@ -21,15 +21,14 @@ from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages import check_views, estimate_views, match_pairs
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import claimed
-from colmap_sph.project.database import find_database, read_verified_matches
+from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
+from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
-from colmap_sph.project.sparse_model import image_names, load_model, model_files
 from colmap_sph.project.staging import discard_results
 from colmap_sph.project.undistortion import (
     UndistortionOptions,
-    open_workspace,
     prepare_workspace,
 )
 from colmap_sph.project.workspace import Workspace
@@ -83,64 +82,46 @@ def run(
     """
     options, report = options or RunOptions(), RunReport()
     progress = Silent() if progress is None else progress
-    root = check_arguments(model, images=images, output=output, workspace=workspace, options=options)
-    masks = None if masks is None else Path(masks)
-    if model is None:
-        dense = open_workspace(root, masks)
+    project = check_arguments(
+        model, images=images, masks=masks, output=output, workspace=workspace, options=options
+    )
+    if project.model is None:
+        dense = open_workspace(project)
         with claimed(dense):
             if overwrite:
                 discard_results(dense)
             return reconstruct(dense, options, progress=progress, report=report)
-    model, images = Path(model), None if images is None else Path(images)
-    with claimed(Workspace(root)):
+    with claimed(Workspace(project.root)):
         with timed_stage("undistort", 1, progress, report):
-            dense = prepare_workspace(model, images, root, options.undistortion, masks, overwrite=overwrite)
+            prepared = prepare_workspace(project, options.undistortion, overwrite=overwrite)
             progress.advance()
-        database, names = find_database(model), image_names(load_model(model))
-        return reconstruct(dense, options, progress=progress, report=report, database=database, expected=names)
+        return reconstruct(
+            prepared.workspace,
+            options,
+            progress=progress,
+            report=report,
+            database=project.database(),
+            expected=prepared.expected,
+        )
 
 
 def check_arguments(
     model: Path | str | None,
     *,
     images: Path | str | None,
+    masks: Path | str | None,
     output: Path | str | None,
     workspace: Path | str | None,
     options: RunOptions,
-) -> Path:
-    """Return the workspace's folder, see `workspace_root`; raise for what is wrong before anything is touched."""
+) -> Project:
+    """Return the arguments as a project; raise for what is wrong before anything is touched."""
     options.check()
-    root = workspace_root(model, images=images, output=output, workspace=workspace)
-    if model is not None:
-        model_files(Path(model))
-    elif options.undistortion != UndistortionOptions():
+    given = (model, images, masks, output, workspace)
+    project = Project(*(None if path is None else Path(path) for path in given))
+    project.check()
+    if project.model is None and options.undistortion != UndistortionOptions():
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
-    return root
-
-
-def workspace_root(
-    model: Path | str | None,
-    *,
-    images: Path | str | None,
-    output: Path | str | None,
-    workspace: Path | str | None,
-) -> Path:
-    """Folder of the dense workspace that `run` with these arguments works in; `OptionError` for contradictions."""
-    if (model is None) == (workspace is None):
-        raise OptionError("give either --model (a sparse model) or --workspace (a dense workspace), not both.")
-    if workspace is not None:
-        if output is not None or images is not None:
-            raise OptionError("--workspace is complete in itself; leave out --images and --output.")
-        return Path(workspace)
-    assert model is not None
-    if output is not None:
-        return Path(output)
-    project = Path(model).resolve()
-    if project.name.isdigit():  # sparse/0, but not a project that is called 2024
-        project = project.parent
-    if project.name == "sparse":
-        project = project.parent
-    return project / "dense"
+    return project
 
 
 def reconstruct(

@@ -13,6 +13,7 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import refuse_panoramas
 from colmap_sph.project.images import image_problem
 from colmap_sph.project.masks import check_masks
+from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, image_names, load_model, model_files
 from colmap_sph.project.workspace import checked_name
 
@@ -75,24 +76,35 @@ class Originals:
         return Usable(list(good), [] if self.mask_dir is None else check_masks(self.mask_dir, good))
 
 
-def read_originals(model_dir: Path, image_dir: Path | None, mask_dir: Path | None) -> Originals:
-    """Read a sparse model; where its images are is found out, if not given.
+def read_originals(project: Project) -> Originals:
+    """Read a project's sparse model; where its images are is found out, if not given.
+
+    Parameters
+    ----------
+    project : Project
+        With a model.
+
+    Returns
+    -------
+    Originals
 
     Raises
     ------
     InputError
         No readable model, a camera without pinhole equivalent, or no images.
     """
-    model = load_model(model_dir)
+    assert project.model is not None
+    model = load_model(project.model)
     refuse_panoramas(model)
-    if image_dir is None:
-        image_dir = find_images(model_dir, image_names(model))
-    elif not image_dir.is_dir():
-        is_file = image_dir.is_file()
+    images = project.images
+    if images is None:
+        images = find_images(project.model, image_names(model))
+    elif not images.is_dir():
+        is_file = images.is_file()
         raise InputError(
-            f"The image folder {image_dir} {'is a file' if is_file else 'does not exist'}; check --images."
+            f"The image folder {images} {'is a file' if is_file else 'does not exist'}; check --images."
         )
-    return Originals(model_dir, image_dir, mask_dir, model)
+    return Originals(project.model, images, project.masks, model)
 
 
 def find_images(model_dir: Path, names: Sequence[str]) -> Path:

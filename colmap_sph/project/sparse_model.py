@@ -10,6 +10,7 @@ from colmap_sph.project.model_check import check_binary_file
 MODEL_FILES = ("cameras", "images", "points3D")
 # Files that COLMAP 3.12 added; older models do not have them.
 RIG_FILES = ("rigs", "frames")
+_EXTENSIONS = (".bin", ".txt")
 
 
 def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
@@ -92,19 +93,36 @@ def model_files(sparse_dir: Path) -> list[Path]:
             f"The model folder {sparse_dir} {'is a file' if is_file else 'does not exist'}; "
             "give the folder of a COLMAP model."
         )
-    for extension in (".bin", ".txt"):
-        if all((sparse_dir / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
-            files = [sparse_dir / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
-            return [path for path in files if path.is_file()]
+    files = _files_in(sparse_dir)
+    if not files:
+        inside = models_inside(sparse_dir)
+        hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
+        raise InputError(
+            f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
+        )
+    return files
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder has all files of a model."""
+    return bool(_files_in(folder))
+
+
+def models_inside(folder: Path) -> list[Path]:
+    """Folders with models, one or two levels below a folder; first the one that is most likely meant."""
+    names = [f"{depth}/cameras{extension}" for depth in ("*", "*/*") for extension in _EXTENSIONS]
+    folders = {path.parent for name in names for path in folder.glob(name) if has_model(path.parent)}
     # A workspace's own model, `dense/sparse`, last: it is what undistortion made of the one that is meant.
-    inside = sorted(
-        (path.parent for depth in ("*", "*/*") for path in sparse_dir.glob(f"{depth}/cameras.bin")),
-        key=lambda path: (path.name == "sparse" and path.parent != sparse_dir, path),
-    )
-    hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
-    raise InputError(
-        f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
-    )
+    return sorted(folders, key=lambda path: (path.name == "sparse" and path.parent != folder, path))
+
+
+def _files_in(folder: Path) -> list[Path]:
+    """The files of the model in a folder, binary preferred to text; none where they are not complete."""
+    for extension in _EXTENSIONS:
+        if all((folder / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
+            files = [folder / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
+            return [path for path in files if path.is_file()]
+    return []
 
 
 def submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Reconstruction:

@@ -1,4 +1,4 @@
-"""Sparse model and original images → COLMAP dense workspace of undistorted images; or open an existing one.
+"""Project → COLMAP dense workspace of its undistorted images; or what that will be.
 
 COLMAP itself undistorts (`pycolmap.undistort_images`). What goes in is checked before (see `originals`), because
 COLMAP ends the process at some bad input. What comes out is mended here, because COLMAP leaves images which it did
@@ -18,11 +18,18 @@ from colmap_sph.project.cameras import make_pinhole, replace_ideal_fisheyes, und
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images import image_problem
-from colmap_sph.project.masks import check_masks, undistort_mask
+from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.originals import Originals, read_originals
 from colmap_sph.project.pair_lists import write_fusion_cfg, write_patch_match_cfg
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import scene_of_model
-from colmap_sph.project.sparse_model import cameras_of_images, load_model, model_files, submodel
+from colmap_sph.project.sparse_model import (
+    cameras_of_images,
+    image_names,
+    load_model,
+    model_files,
+    submodel,
+)
 from colmap_sph.project.staging import (
     check_discardable,
     discard_workspace,
@@ -62,66 +69,56 @@ class UndistortionOptions:
         return options
 
 
-def prepare_workspace(
-    model_dir: Path,
-    image_dir: Path | None,
-    output: Path,
-    options: UndistortionOptions,
-    masks: Path | None = None,
-    *,
-    overwrite: bool = False,
-) -> Workspace:
+@dataclass(frozen=True)
+class Prepared:
+    """A dense workspace that is complete, and what to expect in it.
+
+    Attributes
+    ----------
+    workspace : Workspace
+        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
+    expected : tuple of str
+        Sorted names of all registered images of the original model: those that the workspace does not have were
+        left out.
+    """
+
+    workspace: Workspace
+    expected: tuple[str, ...]
+
+
+def prepare_workspace(project: Project, options: UndistortionOptions, *, overwrite: bool = False) -> Prepared:
     """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
 
-    Everything is made inside ``output/colmap_sph`` and moved to its place when complete, so that an
+    Everything is made inside the workspace's ``colmap_sph`` and moved to its place when complete, so that an
     interrupted undistortion is never taken for a workspace. An image that is missing, unreadable or not of
     its camera's size is reported and left out of the workspace and its model.
 
     Parameters
     ----------
-    model_dir : Path
-        COLMAP model, binary or text, any camera model that has a pinhole equivalent.
-    image_dir : Path or None
-        Original images; None: found by `originals.find_images`.
-    output : Path
-        The dense workspace; created where missing.
+    project : Project
+        With a model, of any camera model that has a pinhole equivalent.
     options : UndistortionOptions
-    masks : Path, optional
-        Folder of masks of the original images, see `colmap_sph.masks`; they are undistorted, too.
     overwrite : bool
         Discard what an earlier run has made, once it is clear that this one can start.
 
     Returns
     -------
-    Workspace
-        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
+    Prepared
 
     Raises
     ------
     InputError
-        No usable model or image, a mask that does not fit its image, or `output` holds a workspace made from
+        No usable model or image, a mask that does not fit its image, or the folder holds a workspace made from
         something else.
     OutputError
-        `output` cannot be written.
+        The workspace cannot be written.
     """
     options.check()
-    originals = read_originals(model_dir, image_dir, masks)
-    marker, workspace = _marker(originals, options), Workspace(output)
-    scratch = workspace.undistortion_scratch_dir
-    if not overwrite and _is_made(workspace, marker):
-        return workspace
-    usable = originals.usable()
-    if overwrite:
-        discard_workspace(workspace)
-    _check_space(originals, usable.images, output, options)
-    with scratch_folder(scratch):
-        kept = _undistort(originals, usable.images, scratch, options)
-        _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
-        Workspace(scratch).create_stereo_dirs(kept)
-        shutil.rmtree(Workspace(scratch).state_dir)
-        move_workspace_into_place(workspace, marker)
-    logger.info("Undistorted %d of %d images into %s", len(kept), originals.model.num_reg_images(), output)
-    return workspace
+    originals = read_originals(project)
+    workspace = Workspace(project.root)
+    if overwrite or not _is_made(workspace, _marker(originals, options)):
+        _make_workspace(originals, workspace, options, overwrite=overwrite)
+    return Prepared(workspace, tuple(image_names(originals.model)))
 
 
 @dataclass(frozen=True)
@@ -132,64 +129,38 @@ class Foreseen:
     original_pixels: int
 
 
-def foresee_workspace(
-    model_dir: Path,
-    image_dir: Path | None,
-    output: Path,
-    options: UndistortionOptions,
-    masks: Path | None = None,
-    *,
-    overwrite: bool,
-) -> Foreseen | None:
-    """Return what `prepare_workspace` would make, without making it; None where it is made already.
+def foresee_workspace(project: Project, options: UndistortionOptions, *, overwrite: bool) -> Foreseen | None:
+    """Find what `prepare_workspace` would make, without making it.
 
     Parameters
     ----------
-    model_dir, image_dir, output, options, masks
+    project, options
         As for `prepare_workspace`, which raises the same.
     overwrite : bool
         The workspace that is there will be discarded first.
+
+    Returns
+    -------
+    Foreseen or None
+        None where it is made already.
+
+    Raises
+    ------
+    InputError
+        See `prepare_workspace`.
     """
     options.check()
-    originals = read_originals(model_dir, image_dir, masks)
+    originals = read_originals(project)
+    workspace = Workspace(project.root)
     if overwrite:
-        check_discardable(Workspace(output))
-    elif is_finished(Workspace(output), _marker(originals, options)):
+        check_discardable(workspace)
+    elif is_finished(workspace, _marker(originals, options)):
         return None
     model = submodel(originals.model, set(originals.usable().images))
     cameras = [model.camera(image.camera_id) for image in model.images.values()]
     pixels = sum(camera.width * camera.height for camera in cameras)
     undistort_cameras(model, options.for_colmap())
-    return Foreseen(scene_of_model(model, model_dir), pixels)
-
-
-def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
-    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and write nothing there.
-
-    Parameters
-    ----------
-    root : Path
-    masks : Path, optional
-        Folder of masks of the undistorted images; without it those in the workspace's own ``masks``.
-
-    Raises
-    ------
-    InputError
-        The folder is missing or is not a dense workspace, or a mask does not fit its image.
-    """
-    workspace = Workspace(root, masks)
-    if not root.is_dir():
-        raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
-    for folder in (workspace.images_dir, workspace.sparse_dir):
-        if not folder.is_dir():
-            raise InputError(
-                f"{root} is not a dense workspace: it has no {folder.name} folder; "
-                "run COLMAP's image_undistorter, or give the sparse model with --model."
-            )
-    model = load_model(workspace.sparse_dir)
-    if masks is not None or workspace.masks_dir.is_dir():
-        check_masks(workspace.masks_dir, cameras_of_images(model))
-    return workspace
+    return Foreseen(scene_of_model(model, originals.model_dir), pixels)
 
 
 def _is_made(workspace: Workspace, marker: dict[str, Any]) -> bool:
@@ -199,6 +170,25 @@ def _is_made(workspace: Workspace, marker: dict[str, Any]) -> bool:
     if finished:
         logger.info("The undistorted images in %s are up to date", workspace.root)
     return finished
+
+
+def _make_workspace(
+    originals: Originals, workspace: Workspace, options: UndistortionOptions, *, overwrite: bool
+) -> None:
+    usable = originals.usable()
+    if overwrite:
+        discard_workspace(workspace)
+    _check_space(originals, usable.images, workspace.root, options)
+    marker = _marker(originals, options)
+    scratch = workspace.undistortion_scratch_dir
+    with scratch_folder(scratch):
+        kept = _undistort(originals, usable.images, scratch, options)
+        _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
+        Workspace(scratch).create_stereo_dirs(kept)
+        shutil.rmtree(Workspace(scratch).state_dir)
+        move_workspace_into_place(workspace, marker)
+    number = originals.model.num_reg_images()
+    logger.info("Undistorted %d of %d images into %s", len(kept), number, workspace.root)
 
 
 def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any]:
@@ -243,7 +233,8 @@ def _undistort_masks(originals: Originals, names: list[str], scratch: Path, opti
 def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     """Leave only undistorted images and PINHOLE cameras in the model; write the configuration for them."""
     model = _load_written_model(workspace)
-    cameras, kept = cameras_of_images(model), []
+    cameras = cameras_of_images(model)
+    kept = []
     for name in names:
         problem = image_problem(workspace.image_path(name), cameras[name].width, cameras[name].height)
         if problem is None:
@@ -269,7 +260,8 @@ def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
 def _check_space(originals: Originals, names: list[str], output: Path, options: UndistortionOptions) -> None:
     """Raise `OutputError` unless the undistorted images will fit: COLMAP may not notice a full disk."""
     needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
-    cameras, limit = cameras_of_images(originals.model), options.max_image_size
+    cameras = cameras_of_images(originals.model)
+    limit = options.max_image_size
     for name in names:
         longest = max(cameras[name].width, cameras[name].height)
         scale = min(1.0, limit / longest) if limit > 0 else 1.0
