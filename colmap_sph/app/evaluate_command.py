@@ -104,8 +104,8 @@ def evaluate_command(command: EvaluateCommand, console: Console) -> int:
     depth_maps: dict[str, DepthMapScores] = {}
     if command.workspace is not None:
         with console.status(f"depth maps of {command.workspace}"):
-            workspace, options = Workspace(command.workspace), command.options
-            depth_maps = score_depth_maps(workspace, views, kind=command.map_kind, gsd=options.gsd)
+            workspace = Workspace(command.workspace)
+            depth_maps = score_depth_maps(workspace, views, kind=command.map_kind, gsd=command.options.gsd)
     clouds = _score_clouds(command, views, console)
     blocks = [format_clouds(clouds)] if clouds else []
     if depth_maps:
@@ -176,7 +176,8 @@ def exact_depth_views(folder: Path, model_dir: Path, depth_scale: float | None =
         No readable model, no depth map for any of its images, or a distorted camera.
     """
     model = load_model(model_dir)
-    views, missing = [], []
+    views = []
+    missing = []
     for image in sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: str(image.name)):
         path = _depth_file(folder, image.name)
         pose = np.array(image.cam_from_world().matrix(), dtype=np.float64)

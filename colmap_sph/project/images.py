@@ -17,7 +17,9 @@ from colmap_sph.errors import InputError, reason_of
 
 # Rows of colours that are floating-point numbers at a time.
 _BAND_ROWS = 256
-_JPEG_START, _JPEG_SCAN, _JPEG_END = b"\xff\xd8", 0xDA, b"\xff\xd9"
+_JPEG_START = b"\xff\xd8"
+_JPEG_SCAN = 0xDA
+_JPEG_END = b"\xff\xd9"
 # Start-of-frame markers; 0xC4, 0xC8 and 0xCC among them have other meanings.
 _JPEG_FRAMES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 _PNG_START = b"\x89PNG\r\n\x1a\n"

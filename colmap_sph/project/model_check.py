@@ -42,7 +42,8 @@ def check_binary_file(path: Path) -> None:
 def _walk(data: mmap.mmap, record_end: Callable[[mmap.mmap, int], int]) -> int:
     """Return the offset behind the last announced record, or -1 where a record does not fit."""
     (count,) = struct.unpack_from("<Q", data)
-    offset, size = 8, len(data)
+    size = len(data)
+    offset = 8
     try:
         for _ in range(count):
             offset = record_end(data, offset)

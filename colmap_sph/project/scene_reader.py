@@ -103,7 +103,8 @@ def _read_view(
 
 
 def _is_possible(view: View) -> bool:
-    size, focal = max(view.width, view.height), np.array([view.K[0, 0], view.K[1, 1]])
+    size = max(view.width, view.height)
+    focal = np.array([view.K[0, 0], view.K[1, 1]])
     return bool(
         min(view.width, view.height) > 0
         # Fields of view from half a second of arc to just under 180 degrees.
