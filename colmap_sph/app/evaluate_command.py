@@ -134,7 +134,21 @@ def _score_clouds(command: EvaluateCommand, views: list[DepthView], console: Con
 def as_plain_values(
     command: EvaluateCommand, clouds: list[CloudScores], depth_maps: dict[str, DepthMapScores]
 ) -> dict[str, object]:
-    """All results of an evaluation, for `write_json`."""
+    """Put all results of an evaluation into what `write_json` can write.
+
+    Parameters
+    ----------
+    command : EvaluateCommand
+        What was asked for.
+    clouds : list of CloudScores
+    depth_maps : dict
+        Image name → scores of its depth map; may be empty.
+
+    Returns
+    -------
+    dict
+        Plain values by name.
+    """
     content: dict[str, object] = {
         "reference": str(command.reference),
         "clouds": [cloud.as_dict() for cloud in clouds],

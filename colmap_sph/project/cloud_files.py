@@ -103,6 +103,13 @@ def link_workspace(
         World coordinates.
     folder : Path
         The workspace to make; exists.
+
+    Raises
+    ------
+    OSError, RuntimeError
+        The system's, or COLMAP's, where something cannot be written; for the caller to put into a sentence.
+    OutputError
+        The model's folder cannot be created.
     """
     linked = Workspace(folder)
     make_dir(linked.sparse_dir)
@@ -125,6 +132,13 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
     workspace : Workspace
     origin : (3,) float64 ndarray
         Map coordinates of what the cloud's points are relative to; zero for any other model.
+
+    Raises
+    ------
+    OSError
+        A file cannot be moved; for the caller to put into a sentence.
+    OutputError
+        The cloud in map coordinates cannot be written.
     """
     shutil.rmtree(workspace.local_dir, ignore_errors=True)
     if origin.any():
