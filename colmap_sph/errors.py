@@ -72,3 +72,12 @@ class OutOfMemoryError(ColmapSphError):
 
 class RectificationError(ColmapSphError):
     """A pair that cannot be rectified on the chosen surface; the pair is skipped and reported."""
+
+
+def reason_of(error: BaseException | None) -> str:
+    """Say in one line why something failed, for the brackets of a message that names the file itself.
+
+    Of the system's errors these are its own words, such as "Permission denied", without number and path.
+    """
+    words = getattr(error, "strerror", None) or " ".join(str(error).split())
+    return words or type(error).__name__

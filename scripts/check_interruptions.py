@@ -22,7 +22,7 @@ from pathlib import Path
 import tyro
 
 from colmap_sph.app.cli import PARTIAL_EXIT_CODE
-from colmap_sph.project.cloud_files import CLOUD_FILES
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.synthetic import make_demo_block
 
 
@@ -152,7 +152,7 @@ def finished_files(workspace: Path) -> dict[Path, int]:
         name = record.relative_to(state / "state").with_suffix(".bin")
         files += [stereo / "depth_maps" / name, stereo / "normal_maps" / name]
     if (state / "cloud.json").exists():
-        files += [workspace / name for name in CLOUD_FILES]
+        files += Workspace(workspace).cloud_paths
     return {path: path.stat().st_mtime_ns for path in files}
 
 
@@ -173,7 +173,7 @@ def num_different(workspace: Path, whole: Path) -> int:
         }
         for root in (workspace, whole)
     ]
-    missing = {Path(name) for name in CLOUD_FILES} - files[1]
+    missing = {path.relative_to(whole) for path in Workspace(whole).cloud_paths} - files[1]
     assert not missing, f"{whole} has no {missing}"
     same = [filecmp.cmp(workspace / name, whole / name, shallow=False) for name in files[0] & files[1]]
     leftovers = [*workspace.rglob(".*.tmp"), *workspace.glob("colmap_sph/fusion")]

@@ -420,7 +420,7 @@ def test_unwritable_output(workspace, blocked, monkeypatch):
         def refuse(*_):
             raise PermissionError(13, "Permission denied")
 
-        monkeypatch.setattr(fuse_module, "move_into_place", refuse)
+        monkeypatch.setattr(fuse_module, "move_cloud_into_place", refuse)
     else:
         path.mkdir()
     before = sorted(workspace.root.rglob("*"))

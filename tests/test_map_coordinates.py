@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from clouds import read_fused, read_visibility
 from conftest import keep_images
-from test_undistortion import make_project
+from test_undistortion import make_project, prepare
 
 import colmap_sph
 from colmap_sph.evaluation import read_geometry
@@ -19,7 +19,7 @@ from colmap_sph.project.map_coordinates import local_origin, move_cloud
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.staging import discard_workspace
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.pairs import PairOptions
 
@@ -158,7 +158,7 @@ def test_undistortion_keeps_the_digits(tmp_path: Path) -> None:
     sparse = make_project(tmp_path, "OPENCV", (0.1, 0.01, 1e-3, -1e-3))
     far = move(sparse, ECEF, tmp_path / "far" / "0")
     scenes = [
-        read_scene(prepare_workspace(model, tmp_path / "images", output, UndistortionOptions()).sparse_dir)
+        read_scene(prepare(model, output).sparse_dir)
         for model, output in ((sparse, tmp_path / "dense"), (far, tmp_path / "far dense"))
     ]
     assert not scenes[0].origin.any()

@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from conftest import keep_images
 from PIL import Image
-from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
+from test_undistortion import HEIGHT, NAMES, WIDTH, make_project, prepare
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -18,7 +18,7 @@ from colmap_sph.evaluation import compare_depth_map, read_geometry
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.masks import read_mask, undistort_mask
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.pairs import PairOptions
 from colmap_sph.synthetic import Camera, DemoBlock
@@ -85,7 +85,7 @@ def test_masks_of_a_workspace(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / "images" / name), image)
     for size in (-1, 48):
         output = tmp_path / f"dense{size}"
-        workspace = prepare_workspace(sparse, None, output, UndistortionOptions(size), tmp_path / "masks")
+        workspace = prepare(sparse, output, UndistortionOptions(size), masks=tmp_path / "masks")
         found = sorted(str(path.relative_to(output / "masks")) for path in (output / "masks").rglob("*.png"))
         assert found == [f"{name}.png" for name in masked]
         for name in masked:
@@ -100,7 +100,7 @@ def test_a_mask_undistorts_with_ideal_fisheyes(tmp_path: Path) -> None:
     """COLMAP copies images of such cameras; ours are undistorted, and their masks with them."""
     sparse = make_project(tmp_path, "OPENCV_FISHEYE", (0.0, 0.0, 0.0, 0.0))
     write_masks(tmp_path / "masks", NAMES)
-    workspace = prepare_workspace(sparse, None, tmp_path / "dense", UndistortionOptions(), tmp_path / "masks")
+    workspace = prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
     for seed, name in enumerate(NAMES):
         image = cv2.imread(str(workspace.image_path(name)), cv2.IMREAD_GRAYSCALE)
         mask = cv2.imread(str(workspace.mask_path(name)), cv2.IMREAD_GRAYSCALE)
@@ -109,15 +109,15 @@ def test_a_mask_undistorts_with_ideal_fisheyes(tmp_path: Path) -> None:
 
 
 def test_other_masks_are_another_workspace(tmp_path: Path) -> None:
-    sparse, options = make_project(tmp_path), UndistortionOptions()
+    sparse = make_project(tmp_path)
     write_masks(tmp_path / "masks", NAMES)
-    prepare_workspace(sparse, None, tmp_path / "dense", options, tmp_path / "masks")
-    prepare_workspace(sparse, None, tmp_path / "dense", options, tmp_path / "masks")
+    prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
+    prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
     with pytest.raises(InputError, match="different masks"):
-        prepare_workspace(sparse, None, tmp_path / "dense", options)
+        prepare(sparse, tmp_path / "dense")
     (tmp_path / "masks" / f"{NAMES[0]}.png").unlink()
     with pytest.raises(InputError, match="different masks"):
-        prepare_workspace(sparse, None, tmp_path / "dense", options, tmp_path / "masks")
+        prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
 
 
 @pytest.mark.parametrize("kind", ["grey", "16 bits", "colour", "alpha", "palette"])

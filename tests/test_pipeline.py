@@ -2,7 +2,6 @@
 
 import json
 import os
-import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,7 +25,6 @@ from colmap_sph.pipeline.match import _MATCH_BYTES, MatchStage
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stage import keys_of
 from colmap_sph.pipeline.vote import VoteStage
-from colmap_sph.project.database import find_database
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project
@@ -407,26 +405,6 @@ def test_the_number_of_opencv_threads_is_restored(project: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("model", "expected"),
-    [
-        ("project/sparse/0", "project/dense"),
-        ("project/sparse/12", "project/dense"),
-        ("project/sparse", "project/dense"),
-        ("2024/sparse/0", "2024/dense"),
-        ("2024", "dense"),
-        ("project/model", "project/model/dense"),
-    ],
-)
-def test_default_output(tmp_path: Path, model: str, expected: str) -> None:
-    assert Project(tmp_path / model).root == tmp_path / expected
-
-
-def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:
-    assert Project(Path("sparse/0"), output=Path("x")).root == Path("x")
-    assert Project(workspace=tmp_path).root == tmp_path
-
-
-@pytest.mark.parametrize(
     "arguments",
     [
         {},
@@ -453,14 +431,6 @@ def test_contradictions_and_bad_values(arguments: dict, tmp_path: Path, monkeypa
 def test_all_cores_by_default() -> None:
     assert RunOptions().num_threads == len(os.sched_getaffinity(0))
     assert RunOptions(threads=3).num_threads == 3
-
-
-def test_find_database(project: Path) -> None:
-    assert find_database(project / "sparse/0") is None
-    (project / "database.db").write_bytes(b"")
-    assert find_database(project / "sparse/0") == project.resolve() / "database.db"
-    shutil.copy(project / "database.db", project / "sparse/0/database.db")
-    assert find_database(project / "sparse/0") == project / "sparse/0/database.db"
 
 
 def test_a_pair_may_take_most_of_the_budget(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,16 +10,12 @@ import pytest
 
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.project import staging
-from colmap_sph.project.image_check import image_problem
-from colmap_sph.project.images import read_grey
+from colmap_sph.project.images import image_problem, read_grey
 from colmap_sph.project.originals import find_images
-from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.undistortion import (
-    UndistortionOptions,
-    leave_out_bad_images,
-    open_workspace,
-    prepare_workspace,
-)
+from colmap_sph.project.project import Project, open_workspace
+from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
+from colmap_sph.project.undistortion import UndistortionOptions, foresee_workspace, prepare_workspace
+from colmap_sph.project.workspace import Workspace
 
 WIDTH, HEIGHT, FOCAL = 96, 64, 90.0
 NAMES = ["a.png", "b.png", "cam/c.png", "cam/d.png"]
@@ -56,10 +52,23 @@ def make_project(
     return sparse
 
 
+def prepare(
+    model: Path,
+    output: Path,
+    options: UndistortionOptions = OPTIONS,
+    *,
+    masks: Path | None = None,
+    overwrite: bool = False,
+) -> Workspace:
+    """The workspace of a model's undistorted images, which are found."""
+    project = Project(model, masks=masks, output=output)
+    return prepare_workspace(project, options, overwrite=overwrite).workspace
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_workspace_of_undistorted_images(tmp_path: Path, text: bool) -> None:
     sparse = make_project(tmp_path, text=text)
-    workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    workspace = prepare(sparse, tmp_path / "dense")
     assert [view.name for view in read_scene(workspace.sparse_dir).views] == NAMES
     for name in NAMES:
         assert workspace.image_path(name).read_bytes() == (tmp_path / "images" / name).read_bytes()
@@ -72,7 +81,7 @@ def test_workspace_of_undistorted_images(tmp_path: Path, text: bool) -> None:
 
 def test_max_image_size(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
-    workspace = prepare_workspace(sparse, None, tmp_path / "dense", UndistortionOptions(48))
+    workspace = prepare(sparse, tmp_path / "dense", UndistortionOptions(48))
     view = read_scene(workspace.sparse_dir).views[0]
     assert (view.width, view.height) == (48, 32)
     np.testing.assert_allclose(view.K, [[45, 0, 24], [0, 45, 16], [0, 0, 1]])
@@ -94,7 +103,7 @@ def test_max_image_size(tmp_path: Path) -> None:
 )
 def test_any_camera_model_becomes_pinhole(tmp_path: Path, camera_model: str, extra: tuple[float, ...]) -> None:
     sparse = make_project(tmp_path, camera_model, extra)
-    workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    workspace = prepare(sparse, tmp_path / "dense")
     scene = read_scene(workspace.sparse_dir)
     model = pycolmap.Reconstruction(workspace.sparse_dir)
     assert {camera.model.name for camera in model.cameras.values()} == {"PINHOLE"}
@@ -109,8 +118,17 @@ def test_any_camera_model_becomes_pinhole(tmp_path: Path, camera_model: str, ext
 def test_panorama_is_refused(tmp_path: Path) -> None:
     sparse = make_project(tmp_path, "EQUIRECTANGULAR")
     with pytest.raises(InputError, match="panorama"):
-        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+        prepare(sparse, tmp_path / "dense")
     assert not (tmp_path / "dense").exists()
+
+
+def test_a_panorama_leaves_the_workspace_that_is_there(tmp_path: Path) -> None:
+    prepare(make_project(tmp_path / "good"), tmp_path / "dense")
+    sparse = make_project(tmp_path / "bad", "EQUIRECTANGULAR")
+    before = sorted(tmp_path.rglob("*"))
+    with pytest.raises(InputError, match="panorama"):
+        prepare(sparse, tmp_path / "dense", overwrite=True)
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def damage(path: Path, kind: str) -> None:
@@ -127,7 +145,7 @@ def damage(path: Path, kind: str) -> None:
 def test_bad_image_is_reported_and_left_out(tmp_path: Path, kind: str, caplog: pytest.LogCaptureFixture) -> None:
     sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
     damage(tmp_path / "images" / "b.png", kind)
-    workspace = prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    workspace = prepare(sparse, tmp_path / "dense")
     warnings = [record.getMessage() for record in caplog.records if record.levelno == logging.WARNING]
     assert len(warnings) == 1 and "b.png" in warnings[0]
     rest = ["a.png", "cam/c.png", "cam/d.png"]
@@ -147,20 +165,20 @@ def test_no_usable_image(tmp_path: Path) -> None:
     for name in NAMES:
         damage(tmp_path / "images" / name, "size")
     with pytest.raises(InputError, match="None of the model's 4 images"):
-        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+        prepare(sparse, tmp_path / "dense")
     assert not (tmp_path / "dense").exists()
 
 
 def test_finished_workspace_is_reused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sparse = make_project(tmp_path)
-    prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    prepare(sparse, tmp_path / "dense")
     monkeypatch.setattr(pycolmap, "undistort_images", None)
-    prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+    prepare(sparse, tmp_path / "dense")
     with pytest.raises(InputError, match="different options"):
-        prepare_workspace(sparse, None, tmp_path / "dense", UndistortionOptions(48))
+        prepare(sparse, tmp_path / "dense", UndistortionOptions(48))
     (tmp_path / "images" / "a.png").unlink()
     with pytest.raises(InputError, match="different images"):
-        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+        prepare(sparse, tmp_path / "dense")
 
 
 def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -172,11 +190,11 @@ def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytes
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(pycolmap, "undistort_images", interrupted)
-        prepare_workspace(sparse, None, dense, OPTIONS)
+        prepare(sparse, dense)
     assert not dense.exists()
     # A killed process cleans nothing up.
     (dense / "colmap_sph" / "undistorting" / "images").mkdir(parents=True)
-    workspace = prepare_workspace(sparse, None, dense, OPTIONS)
+    workspace = prepare(sparse, dense)
     assert len(read_scene(workspace.sparse_dir).views) == 4
 
 
@@ -186,14 +204,19 @@ def test_interrupted_move_is_finished(tmp_path: Path, monkeypatch: pytest.Monkey
     masks = tmp_path / "masks"
     masks.mkdir()
     assert cv2.imwrite(str(masks / "a.png.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
-    finished = prepare_workspace(sparse, None, tmp_path / "other", OPTIONS, masks)
+    finished = prepare(sparse, tmp_path / "other", masks=masks)
     scratch = dense / "colmap_sph" / "undistorting"
     scratch.mkdir(parents=True)
     (finished.state_dir / "undistortion.json").rename(scratch / "undistortion.json")
     for index, part in enumerate(staging._PARTS):
         (finished.root / part).rename((dense if index < num_moved else scratch) / part)
     monkeypatch.setattr(pycolmap, "undistort_images", None)
-    workspace = prepare_workspace(sparse, None, dense, OPTIONS, masks)
+    assert foresee_workspace(Project(sparse, masks=masks, output=dense), OPTIONS, overwrite=False) is not None
+    assert foresee_workspace(Project(sparse, masks=masks, output=dense), OPTIONS, overwrite=True) is not None
+    if num_moved:
+        with pytest.raises(InputError, match=r"different masks.*--overwrite"):
+            prepare(sparse, dense)
+    workspace = prepare(sparse, dense, masks=masks)
     assert workspace.mask_path("a.png").is_file()
     assert len(leave_out_bad_images(read_scene(workspace.sparse_dir), workspace).views) == 4
     assert not scratch.exists()
@@ -203,7 +226,7 @@ def test_folder_of_someone_else_is_left_alone(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     # The project folder itself, whose images are the originals.
     with pytest.raises(InputError, match="did not make"):
-        prepare_workspace(sparse, None, tmp_path, OPTIONS)
+        prepare(sparse, tmp_path)
     assert (tmp_path / "images" / "a.png").is_file()
     assert not (tmp_path / "colmap_sph").exists()
 
@@ -212,7 +235,7 @@ def test_output_that_cannot_be_made(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     (tmp_path / "dense").write_text("a file in the way")
     with pytest.raises(OutputError, match="dense"):
-        prepare_workspace(sparse, None, tmp_path / "dense", OPTIONS)
+        prepare(sparse, tmp_path / "dense")
 
 
 @pytest.mark.parametrize("folder", ["images", "sparse/images", "sparse/0/images"])
@@ -241,7 +264,7 @@ def test_images_not_found_lists_the_folders(tmp_path: Path) -> None:
 def test_wrong_image_folder(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     with pytest.raises(InputError, match="--images"):
-        prepare_workspace(sparse, tmp_path / "nowhere", tmp_path / "dense", OPTIONS)
+        prepare_workspace(Project(sparse, tmp_path / "nowhere", output=tmp_path / "dense"), OPTIONS)
 
 
 def test_options() -> None:
@@ -253,7 +276,7 @@ def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCapture
     sparse = make_project(tmp_path, "OPENCV", (0.0, 0.0, 0.0, 0.0))
     pycolmap.undistort_images(tmp_path / "dense", sparse, tmp_path / "images")
     before = sorted(tmp_path.rglob("*"))
-    workspace = open_workspace(tmp_path / "dense")
+    workspace = open_workspace(Project(workspace=tmp_path / "dense"))
     assert sorted(tmp_path.rglob("*")) == before
     scene = read_scene(workspace.sparse_dir)  # an OPENCV camera without distortion
     workspace.image_path("a.png").unlink()
@@ -263,15 +286,15 @@ def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCapture
 
 def test_what_is_no_workspace_is_told(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
-        open_workspace(tmp_path / "nowhere")
+        open_workspace(Project(workspace=tmp_path / "nowhere"))
     with pytest.raises(InputError, match="no images folder"):
-        open_workspace(tmp_path)
+        open_workspace(Project(workspace=tmp_path))
     (tmp_path / "images").mkdir()
     with pytest.raises(InputError, match="no sparse folder"):
-        open_workspace(tmp_path)
+        open_workspace(Project(workspace=tmp_path))
     (tmp_path / "sparse").mkdir()
     with pytest.raises(InputError, match="No COLMAP model"):
-        open_workspace(tmp_path)
+        open_workspace(Project(workspace=tmp_path))
 
 
 @pytest.mark.parametrize("extension", ["jpg", "png", "tif", "bmp"])

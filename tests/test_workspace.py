@@ -9,12 +9,24 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from colmap_sph.errors import InputError, OutputError
+from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.files import atomic_file
 from colmap_sph.project.map_files import read_depth_map, read_normal_map, write_depth_map, write_normal_map
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import SourceImages
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (PermissionError(13, "Permission denied", "some/file"), "Permission denied"),
+        (ValueError("two\n  lines"), "two lines"),
+        (MemoryError(), "MemoryError"),
+    ],
+)
+def test_why_a_file_failed_is_said_in_one_line(error: Exception, words: str) -> None:
+    assert reason_of(error) == words
 
 
 @pytest.fixture

@@ -18,7 +18,7 @@ from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, in_full
-from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError
+from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError, reason_of
 from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.workers import is_memory_error
@@ -74,7 +74,7 @@ def main(arguments: list[str] | None = None) -> int:
             if error.errno is None or isinstance(error, BrokenPipeError):
                 raise
             what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
-            return _print_error(OutputError(f"{what} ({error.strerror}); check space and permissions."), console)
+            return _print_error(OutputError(f"{what} ({reason_of(error)}); check space and permissions."), console)
 
 
 def _parsed(arguments: Sequence[str]) -> Command:

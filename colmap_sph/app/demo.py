@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import OutputError
+from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.evaluation import (
     CloudScores,
     DepthMapScores,
@@ -107,7 +107,7 @@ def _make_room(output: Path) -> None:
             shutil.rmtree(output / "dense")
     except OSError as error:
         raise OutputError(
-            f"The folder {output} cannot be used ({error.strerror or error}); choose another --output."
+            f"The folder {output} cannot be used ({reason_of(error)}); choose another --output."
         ) from error
 
 

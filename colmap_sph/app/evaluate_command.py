@@ -15,7 +15,7 @@ import tyro
 from numpy.typing import NDArray
 from rich.console import Console
 
-from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
+from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError, reason_of
 from colmap_sph.evaluation import (
     CloudScores,
     DepthMapScores,
@@ -33,8 +33,9 @@ from colmap_sph.evaluation import (
     truth_normals_at_pixel_origin,
     write_json,
 )
+from colmap_sph.project.cameras import is_pinhole
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
-from colmap_sph.project.sparse_model import is_pinhole, load_model
+from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import MapKind, Workspace
 
 logger = logging.getLogger(__name__)
@@ -103,8 +104,8 @@ def evaluate_command(command: EvaluateCommand, console: Console) -> int:
     depth_maps: dict[str, DepthMapScores] = {}
     if command.workspace is not None:
         with console.status(f"depth maps of {command.workspace}"):
-            workspace, options = Workspace(command.workspace), command.options
-            depth_maps = score_depth_maps(workspace, views, kind=command.map_kind, gsd=options.gsd)
+            workspace = Workspace(command.workspace)
+            depth_maps = score_depth_maps(workspace, views, kind=command.map_kind, gsd=command.options.gsd)
     clouds = _score_clouds(command, views, console)
     blocks = [format_clouds(clouds)] if clouds else []
     if depth_maps:
@@ -133,7 +134,21 @@ def _score_clouds(command: EvaluateCommand, views: list[DepthView], console: Con
 def as_plain_values(
     command: EvaluateCommand, clouds: list[CloudScores], depth_maps: dict[str, DepthMapScores]
 ) -> dict[str, object]:
-    """All results of an evaluation, for `write_json`."""
+    """Put all results of an evaluation into what `write_json` can write.
+
+    Parameters
+    ----------
+    command : EvaluateCommand
+        What was asked for.
+    clouds : list of CloudScores
+    depth_maps : dict
+        Image name → scores of its depth map; may be empty.
+
+    Returns
+    -------
+    dict
+        Plain values by name.
+    """
     content: dict[str, object] = {
         "reference": str(command.reference),
         "clouds": [cloud.as_dict() for cloud in clouds],
@@ -175,7 +190,8 @@ def exact_depth_views(folder: Path, model_dir: Path, depth_scale: float | None =
         No readable model, no depth map for any of its images, or a distorted camera.
     """
     model = load_model(model_dir)
-    views, missing = [], []
+    views = []
+    missing = []
     for image in sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: str(image.name)):
         path = _depth_file(folder, image.name)
         pose = np.array(image.cam_from_world().matrix(), dtype=np.float64)
@@ -256,7 +272,9 @@ def _read_array(path: Path) -> NDArray[np.generic]:
         try:
             return np.asarray(np.load(path, allow_pickle=False))
         except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path} cannot be read as a NumPy array ({error}); write it again.") from error
+            raise InputError(
+                f"{path} cannot be read as a NumPy array ({reason_of(error)}); write it again."
+            ) from error
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if image is None:
         raise InputError(f"{path} cannot be read as an image, it may be damaged; write it again.")

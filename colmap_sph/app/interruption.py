@@ -54,7 +54,8 @@ def stop_on_signals(last_words: Callable[[Interrupted], None]) -> Iterator[None]
         return
     receiver, sender = socket.socketpair()
     sender.setblocking(False)
-    finished, told = threading.Event(), threading.Event()
+    finished = threading.Event()
+    told = threading.Event()
 
     def stop(number: int, _: FrameType | None) -> None:
         if not told.is_set():  # once is enough: a second one would only disturb the orderly end

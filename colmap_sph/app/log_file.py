@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from colmap_sph.errors import OutputError
+from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -23,7 +23,9 @@ class _LogFile(logging.FileHandler):
         """Instead of a traceback on the terminal."""
         if not self._has_failed:
             self._has_failed = True
-            logger.warning("%s cannot be written (%s); the log is incomplete", self.baseFilename, sys.exception())
+            logger.warning(
+                "%s cannot be written (%s); the log is incomplete", self.baseFilename, reason_of(sys.exception())
+            )
 
     def close(self) -> None:
         """Close the file; what is buffered on a full disk is lost."""
@@ -54,12 +56,12 @@ class _WorkspaceLog(logging.Handler):
             self._file.emit(record)
 
     def _open(self) -> logging.FileHandler:
-        path = self._workspace.state_dir / "log.txt"
+        path = self._workspace.log_path
         try:
             file = _LogFile(path, encoding="utf-8")
         except OSError as error:
             raise OutputError(
-                f"{path} cannot be written ({error.strerror or error}); check space and permissions."
+                f"{path} cannot be written ({reason_of(error)}); check space and permissions."
             ) from error
         file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         for record in self._early:

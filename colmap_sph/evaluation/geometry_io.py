@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.evaluation.neighbours import Points
 
 logger = logging.getLogger(__name__)
@@ -84,7 +84,7 @@ def require(module: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(f"this needs {module}: pip install {module} ({error})") from error
+        raise InputError(f"this needs {module}: pip install {module} ({reason_of(error)})") from error
 
 
 def _check_points(name: str, points: Points) -> None:
@@ -106,7 +106,7 @@ def _read_ply_or_obj(path: Path) -> PointCloud | Mesh:
         loaded = trimesh.load(path, process=False, skip_materials=True)
     except (ValueError, KeyError, IndexError, TypeError, EOFError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{path} cannot be read as {path.suffix[1:].upper()}, it may be damaged: {error}"
+            f"{path} cannot be read as {path.suffix[1:].upper()}, it may be damaged: {reason_of(error)}"
         ) from error
     if isinstance(loaded, trimesh.Scene):
         if not loaded.geometry:
@@ -144,7 +144,7 @@ def _read_las(path: Path) -> PointCloud:
                 start += len(chunk)
             crs = _las_crs(file.header)
     except (laspy.errors.LaspyException, ValueError, EOFError, OSError, RuntimeError) as error:
-        raise InputError(f"{path} cannot be read as LAS/LAZ, it may be damaged: {error}") from error
+        raise InputError(f"{path} cannot be read as LAS/LAZ, it may be damaged: {reason_of(error)}") from error
     if start < len(points):
         raise InputError(f"{path} is cut off: its header states {len(points)} points, it has {start}")
     return PointCloud(str(path), points, crs, z_is_up=True)

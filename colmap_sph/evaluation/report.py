@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.errors import NoResultError, OutputError
+from colmap_sph.errors import NoResultError, OutputError, reason_of
 from colmap_sph.evaluation.cloud_scores import CloudScores
 from colmap_sph.evaluation.depth_maps import DepthMapScores
 
@@ -91,7 +91,9 @@ def write_json(path: Path, content: object) -> None:
         temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
         temporary.replace(path)
     except OSError as error:
-        raise OutputError(f"{path} cannot be written: {error.strerror}") from error
+        raise OutputError(
+            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
+        ) from error
 
 
 def _mean_of_known(values: Sequence[float | None]) -> float | None:

@@ -33,13 +33,13 @@ class CloudFacts:
 
 def known_cloud(context: "Context", key: str) -> CloudFacts | None:
     """What is known of the cloud, or None where it must be made."""
-    known = vouched_facts(context.cloud_record, key, context.cloud_paths)
+    known = vouched_facts(context.workspace.cloud_record_path, key, context.cloud_paths)
     return None if known is None else CloudFacts(**known)
 
 
 def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts) -> None:
     """Record that the cloud is complete."""
-    vouch(context.cloud_record, key, context.cloud_paths, **asdict(facts))
+    vouch(context.workspace.cloud_record_path, key, context.cloud_paths, **asdict(facts))
 
 
 def report_cloud(context: "Context", facts: CloudFacts) -> None:

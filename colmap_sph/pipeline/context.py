@@ -39,38 +39,28 @@ class Context:
     progress: Progress = field(default_factory=Silent)
     report: RunReport = field(default_factory=RunReport)
 
-    @property
-    def pairs_dir(self) -> Path:
-        """Folder of the disparity maps."""
-        return self.workspace.state_dir / "pairs"
-
     def pair_path(self, a: str, b: str) -> Path:
         """Disparity map of a pair: named by COLMAP's image ids, since names may hold anything."""
         low, high = sorted((self.scene.view(a).image_id, self.scene.view(b).image_id))
-        return self.pairs_dir / f"{low:06d}-{high:06d}.npz"
+        return self.workspace.pairs_dir / f"{low:06d}-{high:06d}.npz"
 
     def estimate_path(self, name: str) -> Path:
         """Photometric depth of an image with its standard deviation and support."""
-        return self.workspace.state_dir / "photometric" / f"{name}.npz"
+        return self.workspace.photometric_dir / f"{name}.npz"
 
     def map_files(self, name: str, kind: MapKind) -> MapFiles:
         """Depth and normal map of an image, and the record that vouches for them."""
         return MapFiles(
             self.workspace.depth_map_path(name, kind),
             self.workspace.normal_map_path(name, kind),
-            self.workspace.state_dir / "state" / f"{name}.{kind}.json",
+            self.workspace.records_dir / f"{name}.{kind}.json",
         )
 
     @property
     def cloud_paths(self) -> list[Path]:
         """The cloud and its visibility, and for a model in map coordinates the cloud near its origin."""
-        local = [self.workspace.local_dir / "fused.ply"] if self.scene.origin.any() else []
-        return [self.workspace.fused_path, self.workspace.fused_path.with_name("fused.ply.vis"), *local]
-
-    @property
-    def cloud_record(self) -> Path:
-        """Record that vouches for the cloud; its name is none of an image's."""
-        return self.workspace.state_dir / "cloud.json"
+        local = [Workspace(self.workspace.local_dir).fused_path] if self.scene.origin.any() else []
+        return [*self.workspace.cloud_paths, *local]
 
     def stage(self, name: str, total: int) -> AbstractContextManager[None]:
         """Announce a stage of `total` steps, and report its wall time."""

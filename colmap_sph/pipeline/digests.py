@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 
 _DIGEST_BYTES = 16
 
@@ -58,4 +58,4 @@ def file_digest(path: Path) -> str:
         with path.open("rb") as file:
             return hashlib.file_digest(file, new_digest).hexdigest()
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror or error}); check its permissions.") from error
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); check its permissions.") from error

@@ -13,14 +13,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, NoResultError, OutputError
+from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
 from colmap_sph.pipeline.cloud import facts_of_cloud, known_cloud, report_cloud, vouch_for_cloud
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.memory import format_memory, resident
 from colmap_sph.pipeline.records import forget
 from colmap_sph.pipeline.stage import Cost, Facts, Job, Kept, Result, Stage
 from colmap_sph.pipeline.view_maps import MapSources, read_view_maps
-from colmap_sph.project.cloud_files import check_places, join_parts, link_workspace, move_into_place, write_part
+from colmap_sph.project.cloud_files import (
+    check_places,
+    join_parts,
+    link_workspace,
+    move_cloud_into_place,
+    write_part,
+)
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
 from colmap_sph.project.pair_lists import write_fusion_cfg
 from colmap_sph.project.sparse_model import load_model
@@ -123,7 +129,7 @@ class FuseStage(Stage[str, FuseTask]):
         )
         self._known = known_cloud(context, self._key)
         self._index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
-        self._scratch = context.workspace.state_dir / "fusion"
+        self._scratch = context.workspace.fusion_scratch_dir
 
     def job(self, item: str) -> Job[FuseTask]:
         """See `Stage.job`; all parts are done where the cloud is."""
@@ -177,7 +183,7 @@ class FuseStage(Stage[str, FuseTask]):
             yield
             return
         check_places(self.context.workspace)
-        forget(self.context.cloud_record)
+        forget(self.context.workspace.cloud_record_path)
         with scratch_folder(self._scratch), _maps.holding(kept.cache):
             yield
 
@@ -202,11 +208,10 @@ class FuseStage(Stage[str, FuseTask]):
             join_parts(stems, self._scratch, points)
             if origin.any():
                 link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
-            move_into_place(self._scratch, workspace, origin)
+            move_cloud_into_place(self._scratch, workspace, origin)
         except (OSError, RuntimeError) as error:
-            reason = getattr(error, "strerror", None) or error
             raise OutputError(
-                f"{workspace.fused_path} cannot be written ({reason}); check space and permissions."
+                f"{workspace.fused_path} cannot be written ({reason_of(error)}); check space and permissions."
             ) from error
 
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
@@ -269,7 +274,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         """Begin the cloud anew where it must be made."""
         write_fusion_cfg(self.context.workspace.fusion_cfg_path, self._names)
         if self._known is None:
-            forget(self.context.cloud_record)
+            forget(self.context.workspace.cloud_record_path)
             self._warn_of_memory()
         yield
 

@@ -156,7 +156,7 @@ class MatchStage(Stage[Pair, MatchTask]):
     @contextmanager
     def opened(self, kept: Kept) -> Iterator[None]:
         """See `Stage.opened`."""
-        make_dir(self.context.pairs_dir)
+        make_dir(self.context.workspace.pairs_dir)
         self._scratch_bytes = kept.scratch
         with _images.holding(kept.cache), _masks.holding(kept.cache):
             yield

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
 
@@ -56,7 +56,9 @@ def read_pair(path: Path) -> PairDisparity:
         geometry = RectifiedPair(**(metadata["geometry"] | {"rectified_from_world": rotation}))
     except (ValueError, KeyError, TypeError, RuntimeError) as error:
         path.unlink(missing_ok=True)
-        raise InputError(f"{path} does not describe a pair ({error}); it was removed, run again.") from error
+        raise InputError(
+            f"{path} does not describe a pair ({reason_of(error)}); it was removed, run again."
+        ) from error
     disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
     disparity[codes == 0] = np.nan
     return PairDisparity(left, right, geometry, disparity)
@@ -84,7 +86,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
         if damaged:
             path.unlink(missing_ok=True)
         remedy = "it was removed, run again" if damaged else "run again, or check its permissions"
-        raise InputError(f"{path} cannot be read ({error}); {remedy}.") from error
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); {remedy}.") from error
 
 
 def stored_key(path: Path) -> str | None:

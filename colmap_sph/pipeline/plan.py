@@ -19,9 +19,9 @@ from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions, num_cores
 from colmap_sph.pipeline.reconstruct import check_input, choose_pairs, go_through_stages, wanted_scene
 from colmap_sph.pipeline.stage import Cost, Facts, Kept, Result, Stage
-from colmap_sph.project.project import Project
-from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.undistortion import foresee_workspace, leave_out_bad_images, open_workspace
+from colmap_sph.project.project import Project, open_workspace
+from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
+from colmap_sph.project.undistortion import foresee_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 
@@ -117,7 +117,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     """
     check_input(project, options)
     foreseen = None
-    dense = open_workspace(project.root, project.masks) if project.model is None else Workspace(project.root)
+    dense = open_workspace(project) if project.model is None else Workspace(project.root)
     if project.model is not None:
         foreseen = foresee_workspace(project, options.undistortion, overwrite=overwrite)
     if foreseen is None:

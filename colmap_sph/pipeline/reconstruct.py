@@ -29,15 +29,10 @@ from colmap_sph.project.claim import claimed
 from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
-from colmap_sph.project.project import Project
-from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.project import Project, open_workspace
+from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
 from colmap_sph.project.staging import discard_results
-from colmap_sph.project.undistortion import (
-    UndistortionOptions,
-    leave_out_bad_images,
-    open_workspace,
-    prepare_workspace,
-)
+from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
@@ -104,7 +99,7 @@ def run_project(
     progress = Silent() if progress is None else progress
     report = RunReport()
     if project.model is None:
-        dense = open_workspace(project.root, project.masks)
+        dense = open_workspace(project)
         with claimed(dense):
             if overwrite:
                 discard_results(dense)
@@ -230,5 +225,5 @@ def _write_report(context: Context) -> None:
     unit = 1 if sys.platform == "darwin" else 1024
     report.peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
     content = {"options": asdict(context.options), **asdict(report)}
-    with atomic_file(context.workspace.state_dir / "report.json") as file:
+    with atomic_file(context.workspace.report_path) as file:
         file.write(json.dumps(content, indent=1, default=str).encode())

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from colmap_sph.errors import OutputError
+from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.pipeline.digests import digest, new_digest
 from colmap_sph.project.files import atomic_file, make_dir
 
@@ -61,7 +61,7 @@ def forget(record: Path) -> None:
         with suppress(FileNotFoundError):
             record.unlink()
     except OSError as error:
-        raise OutputError(f"{record} cannot be removed ({error.strerror or error}); check permissions.") from error
+        raise OutputError(f"{record} cannot be removed ({reason_of(error)}); check permissions.") from error
 
 
 def _stamp(path: Path) -> str:
@@ -75,5 +75,5 @@ def _stamp(path: Path) -> str:
                 file.seek(last * index // (_STAMP_BLOCKS - 1))
                 state.update(file.read(_BLOCK_BYTES))
     except OSError as error:
-        raise OutputError(f"{path} cannot be read back ({error.strerror or error}); run again.") from error
+        raise OutputError(f"{path} cannot be read back ({reason_of(error)}); run again.") from error
     return f"{size} {state.hexdigest()}"

@@ -2,18 +2,13 @@
 
 import fcntl
 import os
-import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from pathlib import Path
 
 from colmap_sph.errors import OutputError
-from colmap_sph.project.files import make_dir
+from colmap_sph.project.files import make_dir, remove_temporary_files
 from colmap_sph.project.workspace import Workspace
-
-# The names that `workspace.atomic_file` gives.
-_TEMPORARY = re.compile(r"\.\d+-\d+\.tmp")
 
 
 @contextmanager
@@ -55,13 +50,6 @@ def _lock(descriptor: int, workspace: Workspace) -> None:
 
 
 def _remove_leftovers(workspace: Workspace) -> None:
-    shutil.rmtree(workspace.state_dir / "fusion", ignore_errors=True)
+    shutil.rmtree(workspace.fusion_scratch_dir, ignore_errors=True)
     for folder in (workspace.stereo_dir, workspace.state_dir):
-        for path in folder.rglob(".*.tmp"):
-            if _TEMPORARY.fullmatch(path.name):
-                _remove(path)
-
-
-def _remove(path: Path) -> None:
-    with suppress(OSError):
-        path.unlink()
+        remove_temporary_files(folder)

@@ -14,8 +14,6 @@ from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.map_coordinates import move_cloud, move_model
 from colmap_sph.project.workspace import Workspace
 
-# COLMAP derives the name of the visibility file from the cloud's.
-CLOUD_FILES = ("fused.ply", "fused.ply.vis")
 _HEADER = "\n".join(
     [
         "ply",
@@ -53,28 +51,66 @@ def write_part(stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.ui
 
 
 def join_parts(stems: Sequence[Path], folder: Path, count: int) -> None:
-    """Join parts, in this order, to the cloud of `count` points in `folder`; remove them."""
-    starts = _HEADER.format(count=count).encode(), np.array(count, "<u8").tobytes()
-    for name, start, suffix in zip(CLOUD_FILES, starts, (".points", ".vis"), strict=True):
-        with atomic_file(folder / name) as file:
-            file.write(start)
-            for stem in stems:
-                with stem.with_suffix(suffix).open("rb") as part:
-                    shutil.copyfileobj(part, file)
-                stem.with_suffix(suffix).unlink()
+    """Join parts of a cloud, and remove them.
+
+    Parameters
+    ----------
+    stems : sequence of Path
+        Parts as `write_part` left them, in the order in which they are joined.
+    folder : Path
+        Where ``fused.ply`` and ``fused.ply.vis`` go.
+    count : int
+        Number of points of all parts together.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written.
+    """
+    cloud, visible = Workspace(folder).cloud_paths
+    _join(stems, ".points", cloud, _HEADER.format(count=count).encode())
+    _join(stems, ".vis", visible, np.array(count, "<u8").tobytes())
+
+
+def _join(stems: Sequence[Path], suffix: str, target: Path, start: bytes) -> None:
+    with atomic_file(target) as file:
+        file.write(start)
+        for stem in stems:
+            with stem.with_suffix(suffix).open("rb") as part:
+                shutil.copyfileobj(part, file)
+            stem.with_suffix(suffix).unlink()
 
 
 def check_places(workspace: Workspace) -> None:
     """Raise `OutputError` where a folder is in the cloud's place."""
-    for name in CLOUD_FILES:
-        if (workspace.root / name).is_dir():
-            raise OutputError(f"{workspace.root / name} is a folder; remove it, the cloud goes there.")
+    for path in workspace.cloud_paths:
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder; remove it, the cloud goes there.")
 
 
 def link_workspace(
     workspace: Workspace, model: pycolmap.Reconstruction, origin: NDArray[np.float64], folder: Path
 ) -> None:
-    """Make `folder` a workspace of links, but for its model: `model`, moved to `origin`."""
+    """Make a workspace of links, but for its model.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        Whose images and maps are linked to.
+    model : pycolmap.Reconstruction
+        Written there, moved so that `origin` is its origin; this object is moved, too.
+    origin : (3,) float64 ndarray
+        World coordinates.
+    folder : Path
+        The workspace to make; exists.
+
+    Raises
+    ------
+    OSError, RuntimeError
+        The system's, or COLMAP's, where something cannot be written; for the caller to put into a sentence.
+    OutputError
+        The model's folder cannot be created.
+    """
     linked = Workspace(folder)
     make_dir(linked.sparse_dir)
     if origin.any():
@@ -85,25 +121,46 @@ def link_workspace(
         link.symlink_to(os.path.relpath(target.resolve(), folder.resolve()))
 
 
-def move_into_place(scratch: Path, workspace: Workspace, origin: NDArray[np.float64]) -> None:
-    """Move the cloud that was made in `scratch` to its place, in the coordinates of the workspace's model.
+def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[np.float64]) -> None:
+    """Move a cloud to its place, in the coordinates of the workspace's model.
 
-    Where these are map coordinates, `scratch` is a linked workspace, and is kept as ``colmap_sph/local``.
+    Parameters
+    ----------
+    scratch : Path
+        Folder in which the cloud was made. For a model in map coordinates it is a linked workspace, see
+        `link_workspace`, and is kept as ``colmap_sph/local``.
+    workspace : Workspace
+    origin : (3,) float64 ndarray
+        Map coordinates of what the cloud's points are relative to; zero for any other model.
+
+    Raises
+    ------
+    OSError
+        A file cannot be moved; for the caller to put into a sentence.
+    OutputError
+        The cloud in map coordinates cannot be written.
     """
     shutil.rmtree(workspace.local_dir, ignore_errors=True)
     if origin.any():
-        _keep_local_workspace(workspace.local_dir, scratch, origin)
+        _keep_local_workspace(workspace, Workspace(scratch), origin)
     # A kill in between must not leave a cloud beside the visibility of another.
-    (workspace.root / CLOUD_FILES[1]).unlink(missing_ok=True)
-    for name in CLOUD_FILES:
-        (scratch / name).replace(workspace.root / name)
+    workspace.visibility_path.unlink(missing_ok=True)
+    for made, place in zip(Workspace(scratch).cloud_paths, workspace.cloud_paths, strict=True):
+        made.replace(place)
 
 
-def _keep_local_workspace(local: Path, scratch: Path, origin: NDArray[np.float64]) -> None:
-    """Keep what was fused near the origin as `local`, and leave the cloud in map coordinates in `scratch`."""
-    local.mkdir()
-    for name in ("fused.ply", "images", "stereo", "sparse"):
-        (scratch / name).rename(local / name)
-    (local / "fused.ply.vis").symlink_to(Path("..", "..", "fused.ply.vis"))
-    (local / "origin.txt").write_text(" ".join(map(repr, origin.tolist())) + "\n")
-    move_cloud(local / "fused.ply", scratch / "fused.ply", origin)
+def _keep_local_workspace(workspace: Workspace, linked: Workspace, origin: NDArray[np.float64]) -> None:
+    """Keep what was fused near the origin, and leave the cloud in map coordinates in its place."""
+    local = Workspace(workspace.local_dir)
+    local.root.mkdir()
+    for made, kept in (
+        (linked.fused_path, local.fused_path),
+        (linked.images_dir, local.images_dir),
+        (linked.stereo_dir, local.stereo_dir),
+        (linked.sparse_dir, local.sparse_dir),
+    ):
+        made.rename(kept)
+    # Relative, so that the workspace can be moved as a whole.
+    local.visibility_path.symlink_to(os.path.relpath(workspace.visibility_path, local.root))
+    workspace.local_origin_path.write_text(" ".join(map(repr, origin.tolist())) + "\n")
+    move_cloud(local.fused_path, linked.fused_path, origin)

@@ -7,14 +7,13 @@ back afterwards.
 import errno
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
-from colmap_sph.errors import InputError, OutputError
-from colmap_sph.project.cloud_files import check_places, link_workspace, move_into_place
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.cloud_files import check_places, link_workspace, move_cloud_into_place
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.map_coordinates import local_origin
 from colmap_sph.project.map_files import check_map
@@ -67,9 +66,10 @@ def fuse_by_colmap(
         The cloud cannot be written.
     """
     check_places(workspace)
-    model, colmap_options = _check_maps(workspace, kind), _colmap_options(options, threads)
+    model = _check_maps(workspace, kind)
+    colmap_options = _colmap_options(options, threads)
     origin = local_origin(model)
-    scratch = workspace.state_dir / "fusion"
+    scratch = workspace.fusion_scratch_dir
     with scratch_folder(scratch):
         try:
             source = workspace.root
@@ -77,16 +77,17 @@ def fuse_by_colmap(
                 linked = model if partners is None else _with_tracks(model, partners)
                 link_workspace(workspace, linked, origin, scratch)
                 source = scratch
+            made = Workspace(scratch)
             with quiet_colmap():
                 cloud = pycolmap.stereo_fusion(
-                    scratch / "fused.ply", source, input_type=kind, options=colmap_options, output_type="PLY"
+                    made.fused_path, source, input_type=kind, options=colmap_options, output_type="PLY"
                 )
-            _check_written(scratch / "fused.ply", scratch / "fused.ply.vis", cloud.num_points3D())
-            move_into_place(scratch, workspace, origin)
+            _check_written(made, cloud.num_points3D())
+            move_cloud_into_place(scratch, workspace, origin)
         except (OSError, RuntimeError, ValueError) as error:
-            reason = getattr(error, "strerror", None) or error
             raise OutputError(
-                f"COLMAP's fusion cannot write {workspace.fused_path} ({reason}); check space and permissions."
+                f"COLMAP's fusion cannot write {workspace.fused_path} ({reason_of(error)}); "
+                "check space and permissions."
             ) from error
     return int(cloud.num_points3D())
 
@@ -99,13 +100,14 @@ def _colmap_options(options: Mapping[str, Any], threads: int) -> pycolmap.Stereo
     return colmap_options
 
 
-def _check_written(cloud: Path, visibility: Path, num_points: int) -> None:
-    """Raise `OSError` for files that are cut off: COLMAP does not notice a full disk."""
-    with cloud.open("rb") as file:
+def _check_written(made: Workspace, num_points: int) -> None:
+    """Raise `OSError` for a cloud that is cut off: COLMAP does not notice a full disk."""
+    with made.fused_path.open("rb") as file:
         header_bytes = file.read(1000).find(_PLY_END) + len(_PLY_END)
-    is_whole = cloud.stat().st_size == header_bytes + POINT.itemsize * num_points
+    is_whole = made.fused_path.stat().st_size == header_bytes + POINT.itemsize * num_points
+    words = np.fromfile(made.visibility_path, dtype="<u4").data
     # Behind their number, each point has its number of images, and then these.
-    words, position = np.fromfile(visibility, dtype="<u4").data, 2
+    position = 2
     try:
         for _ in range(num_points):
             position += 1 + words[position]
@@ -121,7 +123,7 @@ def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
         names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
-            f"{workspace.fusion_cfg_path} cannot be read ({error}); list the images in it."
+            f"{workspace.fusion_cfg_path} cannot be read ({reason_of(error)}); list the images in it."
         ) from error
     model = load_model(workspace.sparse_dir)
     cameras = cameras_of_images(model)

@@ -3,7 +3,7 @@
 import sqlite3
 from pathlib import Path
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 
 # COLMAP numbers a pair `image_id1 * 2147483647 + image_id2`.
 _MAX_NUM_IMAGES = 2147483647
@@ -43,7 +43,7 @@ def read_verified_matches(database: Path) -> dict[tuple[str, str], int]:
             connection.close()
     except sqlite3.Error as error:
         raise InputError(
-            f"The database {database} cannot be read ({error}); give a COLMAP database or none."
+            f"The database {database} cannot be read ({reason_of(error)}); give a COLMAP database or none."
         ) from error
     matches = {}
     for pair_id, count in rows:

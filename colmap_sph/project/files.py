@@ -1,13 +1,20 @@
-"""Folders and files made for the user: errors are sentences, and no file is ever half-written."""
+"""Folders and files made and removed for the user: errors are sentences, and no file is ever half-written."""
 
 import os
+import re
+import shutil
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from colmap_sph.errors import OutputError
+from colmap_sph.errors import OutputError, reason_of
+
+# What a file is called until it is complete: short, so that it fits wherever the real name fits; one per thread,
+# which writes one file at a time.
+_TEMPORARY_NAME = ".{process}-{thread}.tmp"
+_TEMPORARY = re.compile(r"\.\d+-\d+\.tmp")
 
 
 def make_dir(folder: Path) -> None:
@@ -16,7 +23,7 @@ def make_dir(folder: Path) -> None:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise OutputError(
-            f"The folder {folder} cannot be created ({error.strerror or error}); choose another --output."
+            f"The folder {folder} cannot be created ({reason_of(error)}); choose another --output."
         ) from error
 
 
@@ -32,16 +39,35 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     OutputError
         The file cannot be written: permissions, a full disk, a folder in the way.
     """
-    # Short, so that it fits wherever the real name fits; one per thread, which writes one file at a time.
-    temporary = path.parent / f".{os.getpid()}-{threading.get_ident()}.tmp"
+    name = _TEMPORARY_NAME.format(process=os.getpid(), thread=threading.get_ident())
+    temporary = path.parent / name
     try:
         with temporary.open("wb") as file:
             yield file
         temporary.replace(path)
     except OSError as error:
         raise OutputError(
-            f"{path} cannot be written ({error.strerror or error}); check space and permissions."
+            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
     finally:
         with suppress(OSError):  # not there, or on a disk that has become read-only
             temporary.unlink()
+
+
+def remove_temporary_files(folder: Path) -> None:
+    """Remove what `atomic_file` left half-written below a folder, in a process that was killed."""
+    for path in folder.rglob(".*.tmp"):
+        if _TEMPORARY.fullmatch(path.name):
+            with suppress(OSError):  # nothing takes it for the file itself
+                path.unlink()
+
+
+def remove(path: Path) -> None:
+    """Remove a file, a link, or a folder with all that is in it; `OutputError` where that is impossible."""
+    try:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be removed ({reason_of(error)}); check permissions.") from error

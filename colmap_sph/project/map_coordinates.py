@@ -78,7 +78,8 @@ def move_cloud(source: Path, target: Path, origin: NDArray[np.float64]) -> None:
         `target` cannot be written.
     """
     with source.open("rb") as file, atomic_file(target) as output:
-        names, lines = [], []
+        names = []
+        lines = []
         for line in iter(file.readline, b"end_header\n"):
             words = line.decode().split()
             if words[0] == "property":

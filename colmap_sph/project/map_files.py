@@ -11,12 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file
 
 _MAX_HEADER = 30
-
-
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
 
 
@@ -94,11 +92,10 @@ def check_map(path: Path, shape: tuple[int, ...]) -> None:
     """
     try:
         with path.open("rb") as file:
-            start, size = file.read(_MAX_HEADER), path.stat().st_size
+            start = file.read(_MAX_HEADER)
+            size = path.stat().st_size
     except OSError as error:
-        raise InputError(
-            f"The map {path} cannot be read ({error.strerror or error}); compute it again."
-        ) from error
+        raise InputError(f"The map {path} cannot be read ({reason_of(error)}); compute it again.") from error
     channels = shape[2] if len(shape) == 3 else 1
     found, _ = _parse_header(path, start, size, channels)
     if found != shape[:2]:
@@ -125,14 +122,13 @@ def _read_planes(path: Path, *, channels: int) -> NDArray[np.float32]:
     """Read a map file as a (channels, H, W) array."""
     try:
         with path.open("rb") as file:
-            start, size = file.read(_MAX_HEADER), path.stat().st_size
+            start = file.read(_MAX_HEADER)
+            size = path.stat().st_size
             (height, width), header = _parse_header(path, start, size, channels)
             file.seek(header)
             values = np.fromfile(file, "<f4", channels * height * width)
     except OSError as error:
-        raise InputError(
-            f"The map {path} cannot be read ({error.strerror or error}); compute it again."
-        ) from error
+        raise InputError(f"The map {path} cannot be read ({reason_of(error)}); compute it again.") from error
     if len(values) < channels * height * width:
         raise InputError(f"{path} is truncated or damaged; delete it and compute it again.")
     return values.astype(np.float32, copy=False).reshape(channels, height, width)

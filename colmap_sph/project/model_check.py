@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 
 _POSE_BYTES = 7 * 8
 
@@ -34,7 +34,7 @@ def check_binary_file(path: Path) -> None:
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 end = _walk(data, _RECORD_END[path.name])
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({error.strerror or error}); check its permissions.") from error
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); check its permissions.") from error
     if end != size:
         raise InputError(f"{path} is truncated or damaged; export the model from COLMAP again.")
 
@@ -42,7 +42,8 @@ def check_binary_file(path: Path) -> None:
 def _walk(data: mmap.mmap, record_end: Callable[[mmap.mmap, int], int]) -> int:
     """Return the offset behind the last announced record, or -1 where a record does not fit."""
     (count,) = struct.unpack_from("<Q", data)
-    offset, size = 8, len(data)
+    size = len(data)
+    offset = 8
     try:
         for _ in range(count):
             offset = record_end(data, offset)

@@ -10,10 +10,12 @@ from pathlib import Path
 import pycolmap
 
 from colmap_sph.errors import InputError
-from colmap_sph.project.image_check import image_problem
+from colmap_sph.project.cameras import refuse_panoramas
+from colmap_sph.project.images import image_problem
 from colmap_sph.project.masks import check_masks
+from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, image_names, load_model, model_files
-from colmap_sph.project.workspace import Workspace
+from colmap_sph.project.workspace import checked_name
 
 logger = logging.getLogger(__name__)
 
@@ -58,14 +60,15 @@ class Originals:
         InputError
             No image is usable, or a mask does not fit its image.
         """
-        source, cameras, good = Workspace(self.image_dir), cameras_of_images(self.model), {}
+        cameras = cameras_of_images(self.model)
+        good = {}
         for name, camera in sorted(cameras.items()):
-            source.image_path(name)  # refuses a name that leads out of the folder
-            problem = image_problem(self.image_dir / name, camera.width, camera.height)
+            path = self.image_dir / checked_name(name)
+            problem = image_problem(path, camera.width, camera.height)
             if problem is None:
                 good[name] = camera
             else:
-                logger.warning("%s %s; left out", self.image_dir / name, problem)
+                logger.warning("%s %s; left out", path, problem)
         if not good:
             raise InputError(
                 f"None of the model's {len(cameras)} images in {self.image_dir} is usable; check --images."
@@ -73,23 +76,35 @@ class Originals:
         return Usable(list(good), [] if self.mask_dir is None else check_masks(self.mask_dir, good))
 
 
-def read_originals(model_dir: Path, image_dir: Path | None, mask_dir: Path | None) -> Originals:
-    """Read a sparse model; where its images are is found out, if not given.
+def read_originals(project: Project) -> Originals:
+    """Read a project's sparse model; where its images are is found out, if not given.
+
+    Parameters
+    ----------
+    project : Project
+        With a model.
+
+    Returns
+    -------
+    Originals
 
     Raises
     ------
     InputError
-        No readable model, or no images.
+        No readable model, a camera without pinhole equivalent, or no images.
     """
-    model = load_model(model_dir)
-    if image_dir is None:
-        image_dir = find_images(model_dir, image_names(model))
-    elif not image_dir.is_dir():
-        is_file = image_dir.is_file()
+    assert project.model is not None
+    model = load_model(project.model)
+    refuse_panoramas(model)
+    images = project.images
+    if images is None:
+        images = find_images(project.model, image_names(model))
+    elif not images.is_dir():
+        is_file = images.is_file()
         raise InputError(
-            f"The image folder {image_dir} {'is a file' if is_file else 'does not exist'}; check --images."
+            f"The image folder {images} {'is a file' if is_file else 'does not exist'}; check --images."
         )
-    return Originals(model_dir, image_dir, mask_dir, model)
+    return Originals(project.model, images, project.masks, model)
 
 
 def find_images(model_dir: Path, names: Sequence[str]) -> Path:
@@ -103,8 +118,9 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     InputError
         None of the folders holds any image of the model; the message lists them.
     """
-    absolute, resolved = Path.cwd() / model_dir, Path(model_dir).resolve()
-    parents = [p for model in (absolute, resolved) for p in (model.parent.parent, model.parent, model)]
+    # Of a link to a model both where it is and where it leads to.
+    places = (Path.cwd() / model_dir, model_dir.resolve())
+    parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
     folders = list(dict.fromkeys(parent / "images" for parent in parents))
     found = [sum((folder / name).is_file() for name in names) for folder in folders]
     if max(found) == 0:

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file
 from colmap_sph.scene import SourceImages
 
@@ -55,7 +55,7 @@ def read_patch_match_cfg(path: Path) -> dict[str, SourceImages]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}); mend or delete it.") from error
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); mend or delete it.") from error
     numbered = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
     lines = [(number, line) for number, line in numbered if line and not line.startswith("#")]
     if len(lines) % 2:

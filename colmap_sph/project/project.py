@@ -1,41 +1,67 @@
-"""What a run works on: one record for all that the user brings."""
+"""What a run works on, as the user gives it: one record, checked; a dense workspace given is opened."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
-from colmap_sph.errors import OptionError
+from colmap_sph.errors import InputError, OptionError
 from colmap_sph.project.database import find_database
-from colmap_sph.project.sparse_model import model_files
+from colmap_sph.project.masks import check_masks
+from colmap_sph.project.sparse_model import cameras_of_images, has_model, load_model, model_files, models_inside
+from colmap_sph.project.workspace import Workspace
 
 
 @dataclass(frozen=True)
 class Project:
-    """A sparse model and its images, or a dense workspace that is there already."""
+    """What a run works on: a sparse model and its images, or a dense workspace that is there already."""
 
     model: Path | None = None
-    """Sparse model (binary or text), such as sparse/0. Its images are undistorted into the output."""
+    """Sparse model (binary or text), such as sparse/0. Its images are undistorted into --output."""
     images: Path | None = None
-    """Original images. Without it the folder `images` beside or above the model."""
+    """Original images. Default: the folder `images` beside or above the model."""
     masks: Path | None = None
-    """Masks: NAME.png for image NAME with its folders, black = ignored. They are of the original images, or with a
-    workspace of the undistorted ones."""
+    """Masks: NAME.png for image NAME with its folders, black = ignored. Of the original images, or with
+    --workspace of the undistorted ones."""
     output: Path | None = None
-    """Dense workspace to create. Without it the folder `dense` beside the model's `sparse`."""
+    """Dense workspace to create. Default: the folder `dense` beside the model's `sparse`."""
     workspace: Path | None = None
-    """Existing dense workspace, instead of model, images and output."""
+    """Existing dense workspace, instead of --model, --images and --output."""
 
     def check(self) -> None:
-        """Raise `OptionError` for contradictions and what is missing."""
-        if (self.model is None) == (self.workspace is None):
-            raise OptionError("give either --model (a sparse model) or --workspace (a dense workspace), not both.")
-        if self.workspace is not None and (self.output is not None or self.images is not None):
-            raise OptionError("--workspace is complete in itself; leave out --images and --output.")
-        if self.model is not None:
-            model_files(self.model)
+        """Raise for what is wrong before anything is read or written.
+
+        Raises
+        ------
+        OptionError
+            Nothing to work on, options that contradict each other, or a workspace where a model belongs and the
+            other way round.
+        InputError
+            The sparse model is not there, or not complete.
+        """
+        if self.model is not None and self.workspace is not None:
+            raise OptionError(
+                "--model and --workspace are both given; give a sparse model to begin with, or a dense workspace "
+                "that is there already, not both."
+            )
+        if self.workspace is not None:
+            self._check_workspace(self.workspace)
+        elif self.model is not None:
+            _check_model(self.model)
+        else:
+            raise OptionError(f"There is nothing to work on: {_what_to_give()}")
+
+    def _check_workspace(self, workspace: Path) -> None:
+        given = {"--images": self.images, "--output": self.output}
+        surplus = [option for option, value in given.items() if value is not None]
+        if surplus:
+            raise OptionError(f"--workspace is complete in itself; leave out {' and '.join(surplus)}.")
+        if has_model(workspace) and not Workspace(workspace).sparse_dir.is_dir():
+            raise OptionError(
+                f"{workspace} is a sparse model, not a dense workspace; give it as --model {workspace}."
+            )
 
     @property
     def root(self) -> Path:
-        """Folder of the dense workspace."""
+        """Folder of the dense workspace, of a project without contradictions."""
         if self.workspace is not None:
             return self.workspace
         if self.output is not None:
@@ -49,5 +75,73 @@ class Project:
         return project / "dense"
 
     def database(self) -> Path | None:
-        """COLMAP's database beside the model; None with a workspace."""
+        """COLMAP's ``database.db`` beside or above the model, if there is one; None with a workspace."""
         return None if self.model is None else find_database(self.model)
+
+
+def open_workspace(project: Project) -> Workspace:
+    """Open a dense workspace that is there already, and write nothing there.
+
+    Parameters
+    ----------
+    project : Project
+        With a workspace, which COLMAP's ``image_undistorter`` or this program made. Without masks of its own those
+        in the workspace's ``masks`` are used.
+
+    Returns
+    -------
+    Workspace
+
+    Raises
+    ------
+    InputError
+        The folder is missing or is not a dense workspace, or a mask does not fit its image.
+    """
+    workspace = Workspace(project.root, project.masks)
+    _check_folders(workspace)
+    model = load_model(workspace.sparse_dir)
+    if project.masks is not None or workspace.masks_dir.is_dir():
+        check_masks(workspace.masks_dir, cameras_of_images(model))
+    return workspace
+
+
+def _check_folders(workspace: Workspace) -> None:
+    root = workspace.root
+    if not root.is_dir():
+        wrong = "is a file" if root.is_file() else "does not exist"
+        raise InputError(f"The workspace {root} {wrong}; give the folder COLMAP undistorted into.")
+    for folder in (workspace.images_dir, workspace.sparse_dir):
+        if not folder.is_dir():
+            raise InputError(_no_workspace(root, f"it has no {folder.name} folder"))
+    if not has_model(workspace.sparse_dir) and models_inside(workspace.sparse_dir):
+        raise InputError(_no_workspace(root, "its sparse folder holds no model itself"))
+
+
+def _no_workspace(root: Path, lack: str) -> str:
+    found = models_inside(root)
+    remedy = f"give the sparse model as --model {found[0]}" if found else "give the sparse model with --model"
+    return f"{root} is not a dense workspace: {lack}; run COLMAP's image_undistorter, or {remedy}."
+
+
+def _check_model(model: Path) -> None:
+    if _is_dense_workspace(model) and not has_model(model):
+        raise OptionError(f"{model} is a dense workspace, not a sparse model; give it as --workspace {model}.")
+    model_files(model)
+
+
+def _is_dense_workspace(folder: Path) -> bool:
+    """Whether COLMAP or this program has undistorted into a folder."""
+    workspace = Workspace(folder)
+    # A project with its model in `sparse` itself has no `stereo`.
+    return workspace.images_dir.is_dir() and workspace.stereo_dir.is_dir() and has_model(workspace.sparse_dir)
+
+
+def _what_to_give() -> str:
+    """The end of a sentence: options, where possible with what the current folder has for them."""
+    models = [Path("sparse", "0"), Path("sparse")]
+    workspaces = [Path(), Path("dense")]
+    found = [f"--workspace {folder}" for folder in workspaces if _is_dense_workspace(folder)][:1]
+    if found != [f"--workspace {Path()}"]:  # whose `sparse` is no model to begin with
+        found = [f"--model {folder}" for folder in models if has_model(folder)][:1] + found
+    words = "--model names a sparse model such as sparse/0, --workspace a dense workspace"
+    return f"{words}; did you mean {' or '.join(found)}?" if found else f"{words}; give one of them."

@@ -1,18 +1,16 @@
-"""COLMAP sparse models on disk, found, checked and read; and their cameras."""
+"""COLMAP sparse models: found on disk, checked, read, and reduced to some of their images."""
 
 from pathlib import Path, PurePosixPath
 
-import numpy as np
 import pycolmap
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.model_check import check_binary_file
 
 MODEL_FILES = ("cameras", "images", "points3D")
-
-
 # Files that COLMAP 3.12 added; older models do not have them.
 RIG_FILES = ("rigs", "frames")
+_EXTENSIONS = (".bin", ".txt")
 
 
 def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
@@ -51,7 +49,7 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         ) from error
     except (RuntimeError, ValueError, IndexError, KeyError, MemoryError) as error:
         raise InputError(
-            f"The model in {sparse_dir} is damaged ({_one_line(error)}); export it from COLMAP again."
+            f"The model in {sparse_dir} is damaged ({reason_of(error)}); export it from COLMAP again."
         ) from error
     if not registered:
         raise InputError(
@@ -87,28 +85,6 @@ def cameras_of_images(model: pycolmap.Reconstruction) -> dict[str, pycolmap.Came
     return {image.name: model.camera(image.camera_id) for image in images}
 
 
-def is_pinhole(camera: pycolmap.Camera) -> bool:
-    """Whether a camera of any model maps as its calibration matrix does, to 0.001 px inside the image."""
-    if camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE):
-        return True
-    if not camera.is_perspective() or not np.all(np.isfinite(camera.params)) or camera.mean_focal_length() <= 0:
-        return False
-    u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))
-    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
-    rays = pixels @ np.linalg.inv(camera.calibration_matrix()).T
-    mapped = np.asarray(camera.img_from_cam(rays), dtype=np.float64)
-    return bool(np.abs(mapped - pixels[:, :2]).max() < 1e-3)
-
-
-def make_pinhole(camera: pycolmap.Camera) -> None:
-    """Turn a camera without distortion, of whatever model, into a PINHOLE one that maps alike."""
-    if not is_pinhole(camera):
-        raise ValueError(f"camera {camera.camera_id} ({camera.model_name}) is distorted")
-    K = camera.calibration_matrix()
-    camera.model = pycolmap.CameraModelId.PINHOLE
-    camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-
-
 def model_files(sparse_dir: Path) -> list[Path]:
     """Return the files that make up the model in a folder; `InputError` where they are not complete."""
     if not sparse_dir.is_dir():
@@ -117,20 +93,56 @@ def model_files(sparse_dir: Path) -> list[Path]:
             f"The model folder {sparse_dir} {'is a file' if is_file else 'does not exist'}; "
             "give the folder of a COLMAP model."
         )
-    for extension in (".bin", ".txt"):
-        if all((sparse_dir / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
-            files = [sparse_dir / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
-            return [path for path in files if path.is_file()]
+    files = _files_in(sparse_dir)
+    if not files:
+        inside = models_inside(sparse_dir)
+        hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
+        raise InputError(
+            f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
+        )
+    return files
+
+
+def has_model(folder: Path) -> bool:
+    """Whether a folder has all files of a model."""
+    return bool(_files_in(folder))
+
+
+def models_inside(folder: Path) -> list[Path]:
+    """Folders with models, one or two levels below a folder; first the one that is most likely meant."""
+    names = [f"{depth}/cameras{extension}" for depth in ("*", "*/*") for extension in _EXTENSIONS]
+    folders = {path.parent for name in names for path in folder.glob(name) if has_model(path.parent)}
     # A workspace's own model, `dense/sparse`, last: it is what undistortion made of the one that is meant.
-    inside = sorted(
-        (path.parent for depth in ("*", "*/*") for path in sparse_dir.glob(f"{depth}/cameras.bin")),
-        key=lambda path: (path.name == "sparse" and path.parent != sparse_dir, path),
-    )
-    hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
-    raise InputError(
-        f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
-    )
+    return sorted(folders, key=lambda path: (path.name == "sparse" and path.parent != folder, path))
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+def _files_in(folder: Path) -> list[Path]:
+    """The files of the model in a folder, binary preferred to text; none where they are not complete."""
+    for extension in _EXTENSIONS:
+        if all((folder / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
+            files = [folder / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
+            return [path for path in files if path.is_file()]
+    return []
+
+
+def submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Reconstruction:
+    """Return the model of images `names` alone, with the tracks of two or more observations they share."""
+    part = pycolmap.Reconstruction()
+    images = [model.image(i) for i in model.reg_image_ids() if model.image(i).name in names]
+    for camera_id in sorted({image.camera_id for image in images}):
+        part.add_camera_with_trivial_rig(model.camera(camera_id))
+    for image in images:
+        keypoints = [point.xy for point in image.points2D]
+        copy = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
+        part.add_image_with_trivial_frame(copy, image.cam_from_world())
+    ids = {image.image_id for image in images}
+    for point_id, point in model.points3D.items():
+        elements = [element for element in point.track.elements if element.image_id in ids]
+        if len(elements) >= 2:
+            kept = pycolmap.Point3D()
+            kept.xyz = point.xyz
+            kept.color = point.color
+            kept.error = point.error
+            kept.track = pycolmap.Track(elements)
+            part.add_point3D_with_id(point_id, kept)
+    return part

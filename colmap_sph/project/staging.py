@@ -15,14 +15,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, get_args
 
-from colmap_sph.errors import InputError, OutputError
-from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.files import atomic_file, make_dir, remove
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
 from colmap_sph.project.workspace import MapKind, Workspace
 
 # What COLMAP's undistortion makes; the model comes last, as it is what makes a folder look like a workspace.
 _PARTS = ("images", "masks", "stereo", "run-colmap-photometric.sh", "run-colmap-geometric.sh", "sparse")
-_MARKER = "undistortion.json"
 
 
 @contextmanager
@@ -42,10 +41,11 @@ def scratch_folder(scratch: Path) -> Iterator[None]:
 
 def is_finished(workspace: Workspace, marker: dict[str, Any]) -> bool:
     """Whether the workspace was made from these inputs; `InputError` where it was made from others."""
-    there = [part for part in _PARTS if (workspace.root / part).exists()]
-    found = read_marker(workspace.state_dir)
-    if found is None and not there:
+    there = _parts_in(workspace)
+    found = _read_marker(workspace.marker_path)
+    if found is None and (not there or is_being_moved(workspace, marker)):
         return False
+    found = found or _read_marker(_scratch_marker(workspace))
     if found is None:
         raise InputError(_foreign_workspace(workspace, there))
     remedy = "choose another --output, or start afresh with --overwrite"
@@ -68,15 +68,15 @@ def _foreign_workspace(workspace: Workspace, there: Iterable[str]) -> str:
 def discard_results(workspace: Workspace) -> None:
     """Make a run in a workspace forget what earlier ones computed there; maps and cloud stay until replaced."""
     # The records first: nothing may vouch for what is no longer whole.
-    _remove(workspace.state_dir / "cloud.json")
-    for name in ("state", "pairs", "photometric"):
-        _remove(workspace.state_dir / name)
+    remove(workspace.cloud_record_path)
+    for folder in (workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir):
+        remove(folder)
 
 
 def check_discardable(workspace: Workspace) -> None:
     """Raise `InputError` where a workspace, or a file in its folders, was made by something else."""
-    there = [part for part in _PARTS if (workspace.root / part).exists()]
-    if there and read_marker(workspace.state_dir) is None:
+    there = _parts_in(workspace)
+    if there and not any(map(_read_marker, (workspace.marker_path, _scratch_marker(workspace)))):
         raise InputError(_foreign_workspace(workspace, there))
     foreign = next(_foreign_files(workspace), None)
     if foreign is not None:
@@ -95,23 +95,19 @@ def discard_workspace(workspace: Workspace) -> None:
     """
     check_discardable(workspace)
     discard_results(workspace)
-    for name in ("fused.ply", "fused.ply.vis", *_PARTS):
-        _remove(workspace.root / name)
-    for name in (workspace.local_dir.name, "undistorting", _MARKER):
-        _remove(workspace.state_dir / name)
+    for path in (*workspace.cloud_paths, *(workspace.root / part for part in _PARTS)):
+        remove(path)
+    for path in (workspace.local_dir, workspace.undistortion_scratch_dir, workspace.marker_path):
+        remove(path)
 
 
 def _foreign_files(workspace: Workspace) -> Iterator[Path]:
     """Files and links in the workspace's folders under names that neither COLMAP nor this program uses."""
-    try:
-        names = image_names(load_model(workspace.sparse_dir))
-    except InputError:  # an interrupted removal has taken the model
-        names = []
     known = {workspace.fusion_cfg_path, workspace.patch_match_cfg_path}
     known |= {
         workspace.sparse_dir / f"{stem}{end}" for stem in (*MODEL_FILES, *RIG_FILES) for end in (".bin", ".txt")
     }
-    for name in names:
+    for name in _names_of_images(workspace):
         known |= {workspace.image_path(name), workspace.mask_path(name)}
         for kind in get_args(MapKind):
             known |= {workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)}
@@ -125,41 +121,71 @@ def _foreign_files(workspace: Workspace) -> Iterator[Path]:
                 yield path
 
 
-def _remove(path: Path) -> None:
-    try:
-        if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
-        else:
-            path.unlink(missing_ok=True)
-    except OSError as error:
-        raise OutputError(f"{path} cannot be removed ({error.strerror or error}); check permissions.") from error
+def _names_of_images(workspace: Workspace) -> list[str]:
+    # The model comes last: an interrupted move has left it behind, an interrupted removal has taken it.
+    for folder in (workspace.sparse_dir, Workspace(workspace.undistortion_scratch_dir).sparse_dir):
+        with suppress(InputError):
+            return image_names(load_model(folder))
+    return []
 
 
-def move_into_place(scratch: Path, workspace: Workspace) -> None:
-    """Move the finished parts from `scratch`, the marker last; can be repeated after an interruption."""
+def move_workspace_into_place(workspace: Workspace, marker: dict[str, Any]) -> None:
+    """Declare what is in the scratch folder complete, and move it to its place, the marker last.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    marker : dict
+        The inputs from which it was made: plain values.
+
+    Raises
+    ------
+    OutputError
+        The marker cannot be written, or a part cannot be moved.
+    """
+    with atomic_file(_scratch_marker(workspace)) as file:
+        file.write(json.dumps(marker, indent=1).encode())
+    _move(workspace)
+
+
+def finish_move(workspace: Workspace, marker: dict[str, Any]) -> None:
+    """Finish a move of what was made from these inputs, where it was interrupted."""
+    if is_being_moved(workspace, marker):
+        _move(workspace)
+
+
+def is_being_moved(workspace: Workspace, marker: dict[str, Any]) -> bool:
+    """Whether a workspace made from these inputs is complete, but not, or not wholly, in its place."""
+    return _read_marker(_scratch_marker(workspace)) == marker
+
+
+def _move(workspace: Workspace) -> None:
+    scratch = workspace.undistortion_scratch_dir
     try:
         for part in _PARTS:
             if (scratch / part).exists():
                 (scratch / part).rename(workspace.root / part)
-        (scratch / _MARKER).rename(workspace.state_dir / _MARKER)
+        _scratch_marker(workspace).rename(workspace.marker_path)
     except OSError as error:
         raise OutputError(
-            f"The undistorted images cannot be moved into {workspace.root} ({error.strerror or error}); "
+            f"The undistorted images cannot be moved into {workspace.root} ({reason_of(error)}); "
             "choose another --output."
         ) from error
     shutil.rmtree(scratch, ignore_errors=True)
 
 
-def write_marker(folder: Path, marker: dict[str, Any]) -> None:
-    """Declare the contents of `folder` complete and made from the inputs that `marker` describes."""
-    with atomic_file(folder / _MARKER) as file:
-        file.write(json.dumps(marker, indent=1).encode())
+def _parts_in(workspace: Workspace) -> list[str]:
+    return [part for part in _PARTS if (workspace.root / part).exists()]
 
 
-def read_marker(folder: Path) -> dict[str, Any] | None:
-    """Return the marker in `folder`, or None where there is no readable one."""
+def _scratch_marker(workspace: Workspace) -> Path:
+    return workspace.undistortion_scratch_dir / workspace.marker_path.name
+
+
+def _read_marker(path: Path) -> dict[str, Any] | None:
+    """Return what a marker says, or None where there is no readable one."""
     try:
-        marker = json.loads((folder / _MARKER).read_text())
+        marker = json.loads(path.read_text())
     except (OSError, ValueError):
         return None
     return marker if isinstance(marker, dict) else None

@@ -1,4 +1,4 @@
-"""Sparse model and original images → COLMAP dense workspace of undistorted images; or open an existing one.
+"""Project → COLMAP dense workspace of its undistorted images; or what that will be.
 
 COLMAP itself undistorts (`pycolmap.undistort_images`). What goes in is checked before (see `originals`), because
 COLMAP ends the process at some bad input. What comes out is mended here, because COLMAP leaves images which it did
@@ -7,17 +7,18 @@ not undistort, and cameras without distortion but of a distorted model, in the m
 
 import logging
 import shutil
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import pycolmap
 
-from colmap_sph.errors import InputError, OptionError, OutputError
+from colmap_sph.errors import InputError, OptionError, OutputError, reason_of
+from colmap_sph.project.cameras import make_pinhole, replace_ideal_fisheyes, undistort_cameras
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.image_check import image_problem
-from colmap_sph.project.masks import check_masks, undistort_mask
+from colmap_sph.project.images import image_problem
+from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.originals import Originals, read_originals
 from colmap_sph.project.pair_lists import write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project
@@ -25,19 +26,17 @@ from colmap_sph.project.scene_reader import scene_of_model
 from colmap_sph.project.sparse_model import (
     cameras_of_images,
     image_names,
-    is_pinhole,
     load_model,
-    make_pinhole,
     model_files,
+    submodel,
 )
 from colmap_sph.project.staging import (
     check_discardable,
     discard_workspace,
+    finish_move,
     is_finished,
-    move_into_place,
-    read_marker,
+    move_workspace_into_place,
     scratch_folder,
-    write_marker,
 )
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.scene import Scene
@@ -60,74 +59,67 @@ class UndistortionOptions:
         """Raise `OptionError` for a value out of its bounds."""
         if self.max_image_size != -1 and self.max_image_size < 16:
             raise OptionError(
-                f"max_image_size must be -1 (keep the size) or at least 16, not {self.max_image_size}."
+                f"max_image_size must be -1 (keep the size) or at least 16, not {self.max_image_size}.",
+                "max_image_size",
             )
 
+    def for_colmap(self) -> pycolmap.UndistortCameraOptions:
+        """The same as COLMAP's options."""
+        options = pycolmap.UndistortCameraOptions()
+        options.max_image_size = self.max_image_size
+        return options
 
-def prepare_workspace(project: Project, options: UndistortionOptions, *, overwrite: bool = False) -> "Prepared":
+
+@dataclass(frozen=True)
+class Prepared:
+    """A dense workspace that is complete, and what to expect in it.
+
+    Attributes
+    ----------
+    workspace : Workspace
+        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
+    expected : tuple of str
+        Sorted names of all registered images of the original model: those that the workspace does not have were
+        left out.
+    """
+
+    workspace: Workspace
+    expected: tuple[str, ...]
+
+
+def prepare_workspace(project: Project, options: UndistortionOptions, *, overwrite: bool = False) -> Prepared:
     """Undistort the images of a sparse model into a COLMAP dense workspace, or reuse the finished one.
 
-    Everything is made inside ``output/colmap_sph`` and moved to its place when complete, so that an
+    Everything is made inside the workspace's ``colmap_sph`` and moved to its place when complete, so that an
     interrupted undistortion is never taken for a workspace. An image that is missing, unreadable or not of
     its camera's size is reported and left out of the workspace and its model.
 
     Parameters
     ----------
-    model_dir : Path
-        COLMAP model, binary or text, any camera model that has a pinhole equivalent.
-    image_dir : Path or None
-        Original images; None: found by `originals.find_images`.
-    output : Path
-        The dense workspace; created where missing.
+    project : Project
+        With a model, of any camera model that has a pinhole equivalent.
     options : UndistortionOptions
-    masks : Path, optional
-        Folder of masks of the original images, see `colmap_sph.masks`; they are undistorted, too.
     overwrite : bool
         Discard what an earlier run has made, once it is clear that this one can start.
 
     Returns
     -------
-    Workspace
-        With ``images``, ``sparse`` and ``stereo``, and ``masks`` where there are any.
+    Prepared
 
     Raises
     ------
     InputError
-        No usable model or image, a mask that does not fit its image, or `output` holds a workspace made from
+        No usable model or image, a mask that does not fit its image, or the folder holds a workspace made from
         something else.
     OutputError
-        `output` cannot be written.
+        The workspace cannot be written.
     """
     options.check()
-    assert project.model is not None
-    output = project.root
-    originals = read_originals(project.model, project.images, project.masks)
-    expected = tuple(image_names(originals.model))
-    marker, workspace = _marker(originals, options), Workspace(output)
-    scratch = workspace.state_dir / "undistorting"
-    if not overwrite and _is_made(workspace, scratch, marker):
-        return Prepared(workspace, expected)
-    usable = originals.usable()
-    if overwrite:
-        discard_workspace(workspace)
-    _check_space(originals, usable.images, output, options)
-    with scratch_folder(scratch):
-        kept = _undistort(originals, usable.images, scratch, options)
-        _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
-        Workspace(scratch).create_stereo_dirs(kept)
-        shutil.rmtree(Workspace(scratch).state_dir)
-        write_marker(scratch, marker)
-        move_into_place(scratch, workspace)
-    logger.info("Undistorted %d of %d images into %s", len(kept), originals.model.num_reg_images(), output)
-    return Prepared(workspace, expected)
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """A workspace that is ready, and the names of all images that its model had before undistortion."""
-
-    workspace: Workspace
-    expected: tuple[str, ...]
+    originals = read_originals(project)
+    workspace = Workspace(project.root)
+    if overwrite or not _is_made(workspace, _marker(originals, options)):
+        _make_workspace(originals, workspace, options, overwrite=overwrite)
+    return Prepared(workspace, tuple(image_names(originals.model)))
 
 
 @dataclass(frozen=True)
@@ -138,98 +130,66 @@ class Foreseen:
     original_pixels: int
 
 
-def foresee_workspace(
-    project: Project,
-    options: UndistortionOptions,
-    *,
-    overwrite: bool,
-) -> Foreseen | None:
-    """Return what `prepare_workspace` would make, without making it; None where it is made already.
+def foresee_workspace(project: Project, options: UndistortionOptions, *, overwrite: bool) -> Foreseen | None:
+    """Find what `prepare_workspace` would make, without making it.
 
     Parameters
     ----------
-    model_dir, image_dir, output, options, masks
+    project, options
         As for `prepare_workspace`, which raises the same.
     overwrite : bool
         The workspace that is there will be discarded first.
+
+    Returns
+    -------
+    Foreseen or None
+        None where it is made already.
+
+    Raises
+    ------
+    InputError
+        See `prepare_workspace`.
     """
     options.check()
-    assert project.model is not None
-    originals = read_originals(project.model, project.images, project.masks)
+    originals = read_originals(project)
+    workspace = Workspace(project.root)
     if overwrite:
-        check_discardable(Workspace(project.root))
-    elif is_finished(Workspace(project.root), _marker(originals, options)):
+        check_discardable(workspace)
+    elif is_finished(workspace, _marker(originals, options)):
         return None
-    model = _submodel(originals.model, set(originals.usable().images))
+    model = submodel(originals.model, set(originals.usable().images))
     cameras = [model.camera(image.camera_id) for image in model.images.values()]
     pixels = sum(camera.width * camera.height for camera in cameras)
-    _replace_ideal_fisheyes(model)
-    for camera in model.cameras.values():
-        undistorted = pycolmap.undistort_camera(_camera_options(options), camera)
-        camera.model, camera.params = undistorted.model, undistorted.params
-        camera.width, camera.height = undistorted.width, undistorted.height
-    return Foreseen(scene_of_model(model, project.model), pixels)
+    undistort_cameras(model, options.for_colmap())
+    return Foreseen(scene_of_model(model, originals.model_dir), pixels)
 
 
-def open_workspace(root: Path, masks: Path | None = None) -> Workspace:
-    """Open a dense workspace that COLMAP's ``image_undistorter`` made, and write nothing there.
-
-    Parameters
-    ----------
-    root : Path
-    masks : Path, optional
-        Folder of masks of the undistorted images; without it those in the workspace's own ``masks``.
-
-    Raises
-    ------
-    InputError
-        The folder is missing or is not a dense workspace, or a mask does not fit its image.
-    """
-    workspace = Workspace(root, masks)
-    if not root.is_dir():
-        raise InputError(f"The workspace {root} does not exist; give the folder COLMAP undistorted into.")
-    for folder in (workspace.images_dir, workspace.sparse_dir):
-        if not folder.is_dir():
-            raise InputError(
-                f"{root} is not a dense workspace: it has no {folder.name} folder; "
-                "run COLMAP's image_undistorter, or give the sparse model with --model."
-            )
-    model = load_model(workspace.sparse_dir)
-    if masks is not None or workspace.masks_dir.is_dir():
-        check_masks(workspace.masks_dir, cameras_of_images(model))
-    return workspace
-
-
-def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
-    """Return the scene without the views whose undistorted image is missing, damaged or of another size.
-
-    Each of them is reported by a warning.
-
-    Raises
-    ------
-    InputError
-        No view is left.
-    """
-    good = []
-    for view in scene.views:
-        problem = image_problem(workspace.image_path(view.name), view.width, view.height)
-        if problem is None:
-            good.append(view)
-        else:
-            logger.warning("%s %s; left out", workspace.image_path(view.name), problem)
-    if not good:
-        raise InputError(f"None of the {len(scene.views)} images in {workspace.images_dir} is usable.")
-    return replace(scene, views=tuple(good))
-
-
-def _is_made(workspace: Workspace, scratch: Path, marker: dict[str, Any]) -> bool:
+def _is_made(workspace: Workspace, marker: dict[str, Any]) -> bool:
     """Whether the workspace is there, once a move into place that was interrupted is finished."""
-    if read_marker(scratch) == marker:
-        move_into_place(scratch, workspace)
+    finish_move(workspace, marker)
     finished = is_finished(workspace, marker)
     if finished:
         logger.info("The undistorted images in %s are up to date", workspace.root)
     return finished
+
+
+def _make_workspace(
+    originals: Originals, workspace: Workspace, options: UndistortionOptions, *, overwrite: bool
+) -> None:
+    usable = originals.usable()
+    if overwrite:
+        discard_workspace(workspace)
+    _check_space(originals, usable.images, workspace.root, options)
+    marker = _marker(originals, options)
+    scratch = workspace.undistortion_scratch_dir
+    with scratch_folder(scratch):
+        kept = _undistort(originals, usable.images, scratch, options)
+        _undistort_masks(originals, sorted(set(kept) & set(usable.masked)), scratch, options)
+        Workspace(scratch).create_stereo_dirs(kept)
+        shutil.rmtree(Workspace(scratch).state_dir)
+        move_workspace_into_place(workspace, marker)
+    number = originals.model.num_reg_images()
+    logger.info("Undistorted %d of %d images into %s", len(kept), number, workspace.root)
 
 
 def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any]:
@@ -240,7 +200,7 @@ def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any
 def _undistort(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> list[str]:
     """Let COLMAP undistort images `names` into `scratch`; return the names that came out well."""
     model_dir = originals.model_dir
-    if _replace_ideal_fisheyes(originals.model):
+    if replace_ideal_fisheyes(originals.model):
         model_dir = scratch / "model"
         make_dir(model_dir)
         originals.model.write_binary(model_dir)
@@ -252,19 +212,12 @@ def _undistort(originals: Originals, names: list[str], scratch: Path, options: U
                 model_dir,
                 originals.image_dir,
                 image_names=names,
-                undistort_options=_camera_options(options),
+                undistort_options=options.for_colmap(),
             )
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
-        raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {error}") from error
+        raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {reason_of(error)}") from error
     return _mend_workspace(Workspace(scratch), names)
-
-
-def _camera_options(options: UndistortionOptions) -> pycolmap.UndistortCameraOptions:
-    """Our options as COLMAP's."""
-    camera_options = pycolmap.UndistortCameraOptions()
-    camera_options.max_image_size = options.max_image_size
-    return camera_options
 
 
 def _undistort_masks(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> None:
@@ -275,34 +228,14 @@ def _undistort_masks(originals: Originals, names: list[str], scratch: Path, opti
     cameras = cameras_of_images(originals.model)
     for name in names:
         target = Workspace(scratch).mask_path(name)
-        undistort_mask(mask_path(originals.mask_dir, name), cameras[name], _camera_options(options), target)
-
-
-def _replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
-    """Make COLMAP undistort fisheye cameras whose coefficients are all zero.
-
-    COLMAP takes any camera without distortion coefficients for a pinhole and copies its images. A coefficient
-    just above its threshold (1e-8) changes nothing: at 1 rad and f = 4000 px it is 4e-4 px.
-    """
-    changed = False
-    for camera in model.cameras.values():
-        if camera.is_spherical():
-            raise InputError(
-                f"Camera {camera.camera_id} is a panorama ({camera.model_name}); "
-                "render perspective images from it and register those."
-            )
-        if camera.is_undistorted() and not is_pinhole(camera):
-            K = camera.calibration_matrix()
-            camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
-            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 1e-7, 0.0, 0.0, 0.0]
-            changed = True
-    return changed
+        undistort_mask(mask_path(originals.mask_dir, name), cameras[name], options.for_colmap(), target)
 
 
 def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     """Leave only undistorted images and PINHOLE cameras in the model; write the configuration for them."""
     model = _load_written_model(workspace)
-    cameras, kept = cameras_of_images(model), []
+    cameras = cameras_of_images(model)
+    kept = []
     for name in names:
         problem = image_problem(workspace.image_path(name), cameras[name].width, cameras[name].height)
         if problem is None:
@@ -313,7 +246,7 @@ def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     if not kept:
         raise InputError("COLMAP could not undistort any of the images; see its messages above.")
     if len(kept) < model.num_reg_images():
-        model = _submodel(model, set(kept))
+        model = submodel(model, set(kept))
     for camera in model.cameras.values():
         make_pinhole(camera)
     shutil.rmtree(workspace.sparse_dir)
@@ -325,31 +258,11 @@ def _mend_workspace(workspace: Workspace, names: list[str]) -> list[str]:
     return kept
 
 
-def _submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Reconstruction:
-    """Return the model of images `names` alone, with the tracks of two or more observations they share."""
-    part = pycolmap.Reconstruction()
-    images = [model.image(i) for i in model.reg_image_ids() if model.image(i).name in names]
-    for camera_id in sorted({image.camera_id for image in images}):
-        part.add_camera_with_trivial_rig(model.camera(camera_id))
-    for image in images:
-        keypoints = [point.xy for point in image.points2D]
-        copy = pycolmap.Image(image.name, keypoints, image.camera_id, image.image_id)
-        part.add_image_with_trivial_frame(copy, image.cam_from_world())
-    ids = {image.image_id for image in images}
-    for point_id, point in model.points3D.items():
-        elements = [element for element in point.track.elements if element.image_id in ids]
-        if len(elements) >= 2:
-            kept = pycolmap.Point3D()
-            kept.xyz, kept.color, kept.error = point.xyz, point.color, point.error
-            kept.track = pycolmap.Track(elements)
-            part.add_point3D_with_id(point_id, kept)
-    return part
-
-
 def _check_space(originals: Originals, names: list[str], output: Path, options: UndistortionOptions) -> None:
     """Raise `OutputError` unless the undistorted images will fit: COLMAP may not notice a full disk."""
     needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
-    cameras, limit = cameras_of_images(originals.model), options.max_image_size
+    cameras = cameras_of_images(originals.model)
+    limit = options.max_image_size
     for name in names:
         longest = max(cameras[name].width, cameras[name].height)
         scale = min(1.0, limit / longest) if limit > 0 else 1.0

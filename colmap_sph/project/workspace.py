@@ -50,6 +50,16 @@ class Workspace:
         return self.root / "fused.ply"
 
     @property
+    def visibility_path(self) -> Path:
+        """Which images see each point of the cloud; COLMAP derives its name from the cloud's."""
+        return self.root / "fused.ply.vis"
+
+    @property
+    def cloud_paths(self) -> tuple[Path, Path]:
+        """The two files of the cloud."""
+        return self.fused_path, self.visibility_path
+
+    @property
     def fusion_cfg_path(self) -> Path:
         """Names of the images that take part in fusion."""
         return self.stereo_dir / "fusion.cfg"
@@ -65,13 +75,63 @@ class Workspace:
         return self.root / "colmap_sph"
 
     @property
+    def log_path(self) -> Path:
+        """The log of all runs."""
+        return self.state_dir / "log.txt"
+
+    @property
+    def report_path(self) -> Path:
+        """What the last run did."""
+        return self.state_dir / "report.json"
+
+    @property
+    def marker_path(self) -> Path:
+        """What the undistorted images and their model were made from."""
+        return self.state_dir / "undistortion.json"
+
+    @property
+    def undistortion_scratch_dir(self) -> Path:
+        """While images are undistorted: what there is of the workspace so far."""
+        return self.state_dir / "undistorting"
+
+    @property
+    def pairs_dir(self) -> Path:
+        """Disparity maps of the pairs."""
+        return self.state_dir / "pairs"
+
+    @property
+    def photometric_dir(self) -> Path:
+        """Photometric depth of the images, with its standard deviation and number of votes."""
+        return self.state_dir / "photometric"
+
+    @property
+    def records_dir(self) -> Path:
+        """Records that vouch for depth and normal maps."""
+        return self.state_dir / "state"
+
+    @property
+    def cloud_record_path(self) -> Path:
+        """Record that vouches for the cloud; its name is none of an image's."""
+        return self.state_dir / "cloud.json"
+
+    @property
+    def fusion_scratch_dir(self) -> Path:
+        """While maps are fused: parts of the cloud."""
+        return self.state_dir / "fusion"
+
+    @property
     def local_dir(self) -> Path:
         """For a model in map coordinates: a workspace near its origin, for COLMAP's own programs to go on."""
         return self.state_dir / "local"
 
+    @property
+    def local_origin_path(self) -> Path:
+        """Map coordinates of that origin."""
+        return self.local_dir / "origin.txt"
+
     def image_path(self, name: str) -> Path:
         """Undistorted image `name`."""
-        return self.images_dir / _checked_name(name)
+        return self.images_dir / checked_name(name)
 
     @property
     def masks_dir(self) -> Path:
@@ -84,11 +144,11 @@ class Workspace:
 
     def depth_map_path(self, name: str, kind: MapKind) -> Path:
         """Depth map of image `name`."""
-        return self.stereo_dir / "depth_maps" / f"{_checked_name(name)}.{kind}.bin"
+        return self.stereo_dir / "depth_maps" / f"{checked_name(name)}.{kind}.bin"
 
     def normal_map_path(self, name: str, kind: MapKind) -> Path:
         """Normal map of image `name`."""
-        return self.stereo_dir / "normal_maps" / f"{_checked_name(name)}.{kind}.bin"
+        return self.stereo_dir / "normal_maps" / f"{checked_name(name)}.{kind}.bin"
 
     def create_stereo_dirs(self, names: Iterable[str]) -> None:
         """Create the folders that the maps of images `names` and our own state go to.
@@ -113,11 +173,17 @@ class Workspace:
 
 def mask_path(folder: Path, name: str) -> Path:
     """Where COLMAP looks for the mask of image `name` in a folder of masks."""
-    return folder / f"{_checked_name(name)}.png"
+    return folder / f"{checked_name(name)}.png"
 
 
-def _checked_name(name: str) -> str:
-    """Refuse a name that would lead out of the workspace, or that leaves no room for the endings of our files."""
+def checked_name(name: str) -> str:
+    """Return the name of an image that may be the name of files.
+
+    Raises
+    ------
+    InputError
+        It would lead out of the workspace, or leaves no room for the endings of our files.
+    """
     parts = PurePosixPath(name)
     if not name or parts.is_absolute() or ".." in parts.parts:
         raise InputError(f"The image name {name!r} leads out of the workspace; rename the image in the model.")

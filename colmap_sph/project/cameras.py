@@ -1,0 +1,70 @@
+"""Cameras: all that this package knows of COLMAP's camera models.
+
+The method sees pinholes only. Every other model reaches it undistorted, by COLMAP, and here is what must be known
+of a model for that: whether it maps as a pinhole does, what to refuse, and where COLMAP needs help. A camera model
+that is new in COLMAP's library works where the answers here, which come from the library, are right for it; one
+that needs more (a panorama, say) enters here.
+"""
+
+import numpy as np
+import pycolmap
+
+from colmap_sph.errors import InputError
+
+
+def is_pinhole(camera: pycolmap.Camera) -> bool:
+    """Whether a camera of any model maps as its calibration matrix does, to 0.001 px inside the image."""
+    if camera.model in (pycolmap.CameraModelId.PINHOLE, pycolmap.CameraModelId.SIMPLE_PINHOLE):
+        return True
+    if not camera.is_perspective() or not np.all(np.isfinite(camera.params)) or camera.mean_focal_length() <= 0:
+        return False
+    u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))
+    pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
+    rays = pixels @ np.linalg.inv(camera.calibration_matrix()).T
+    mapped = np.asarray(camera.img_from_cam(rays), dtype=np.float64)
+    return bool(np.abs(mapped - pixels[:, :2]).max() < 1e-3)
+
+
+def make_pinhole(camera: pycolmap.Camera) -> None:
+    """Turn a camera without distortion, of whatever model, into a PINHOLE one that maps alike."""
+    if not is_pinhole(camera):
+        raise ValueError(f"camera {camera.camera_id} ({camera.model_name}) is distorted")
+    K = camera.calibration_matrix()
+    camera.model = pycolmap.CameraModelId.PINHOLE
+    camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+
+
+def refuse_panoramas(model: pycolmap.Reconstruction) -> None:
+    """Raise `InputError` where a camera of a model has no pinhole equivalent."""
+    for camera in model.cameras.values():
+        if camera.is_spherical():
+            raise InputError(
+                f"Camera {camera.camera_id} is a panorama ({camera.model_name}); "
+                "render perspective images from it and register those."
+            )
+
+
+def replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
+    """Make COLMAP undistort fisheye cameras whose coefficients are all zero; return whether there are any.
+
+    COLMAP takes any camera without distortion coefficients for a pinhole and copies its images. A coefficient
+    just above its threshold (1e-8) changes nothing: at 1 rad and f = 4000 px it is 4e-4 px.
+    """
+    changed = False
+    for camera in model.cameras.values():
+        if camera.is_undistorted() and not is_pinhole(camera):
+            K = camera.calibration_matrix()
+            camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 1e-7, 0.0, 0.0, 0.0]
+            changed = True
+    return changed
+
+
+def undistort_cameras(model: pycolmap.Reconstruction, options: pycolmap.UndistortCameraOptions) -> None:
+    """Give a model, in place, the cameras that its undistorted images will have."""
+    replace_ideal_fisheyes(model)
+    for camera in model.cameras.values():
+        undistorted = pycolmap.undistort_camera(options, camera)
+        camera.model = undistorted.model
+        camera.params = undistorted.params
+        camera.width, camera.height = undistorted.width, undistorted.height
