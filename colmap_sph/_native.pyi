@@ -1,4 +1,4 @@
-"""The compiled kernels; see `_native/kernels.h` for what they compute and `_native/module.c` for their checks."""
+"""The compiled kernels; see the headers of `_native`'s groups for what they compute and `_native/module.c` for their checks."""
 
 from typing import Any
 

@@ -4,7 +4,8 @@
 
 #include <string.h>
 
-#include "kernels.h"
+#include "dispatch.h"
+#include "fusion/fusion.h"
 
 #define F32 'f', (Py_ssize_t)sizeof(float)
 #define F64 'f', (Py_ssize_t)sizeof(double)
