@@ -1,57 +1,168 @@
-"""The compiled kernels; see `_native/kernels.h` for what they compute and `_native/module.c` for their checks."""
+"""The compiled kernels; `scripts/make_native_stub.py` writes this from their own tables of arguments."""
 
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[Any]
+_Size = tuple[tuple[str | None, int], ...]
+_Argument = tuple[str, str, str, _Size]
 
-def backends() -> list[str]: ...
-def census(backend: str, padded: Array, valid: Array, census: Array, /) -> None: ...
-def matching_cost(backend: str, reference: Array, target: Array, base: Array, cost: Array, /) -> None: ...
+def backends() -> list[str]:
+    """Names of the kernel versions this processor runs, fastest first."""
+
+def signatures() -> list[tuple[str, tuple[_Argument, ...]]]:
+    """Of all other functions (name, ((argument, role, type, ((symbol or None, number), ...)), ...)).
+
+    Roles are value, in, out, images and result; an array's size along an axis is that of the symbol, plus the
+    number.
+    """
+
+def census(
+    backend: str,
+    padded: NDArray[np.int16],
+    valid: NDArray[np.uint8],
+    census: NDArray[np.uint64],
+    /,
+) -> None:
+    """Census words: a bit for each neighbour that is darker, bit 63 where a pixel is not valid.
+
+    backend : str
+    padded : (H + 6, W + 8) int16
+    valid : (H, W) uint8
+    census : (H, W) uint64, written
+    """
+
+def matching_cost(
+    backend: str,
+    reference: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    base: NDArray[np.int32],
+    cost: NDArray[np.uint8],
+    /,
+) -> None:
+    """Bits in which census words differ from those of the target, `base` + 0 to D - 1 columns further.
+
+    backend : str
+    reference : (H, W) uint64
+    target : (H, TARGET_W) uint64
+    base : (H, W) int32
+    cost : (H, W, D) uint8, written
+    """
+
 def aggregation(
     backend: str,
-    cost: Array,
-    base: Array,
-    image: Array,
+    cost: NDArray[np.uint8],
+    base: NDArray[np.int32],
+    image: NDArray[np.uint8],
     p1: int,
-    p2: Array,
+    p2: NDArray[np.uint8],
     max_slant: int,
-    aggregated: Array,
+    detours: NDArray[np.uint8],
+    aggregated: NDArray[np.uint8],
     /,
-) -> None: ...
+) -> None:
+    """Half of the sums of costs over 8 paths, and on the way what the first four paths add to the costs.
+
+    backend : str
+    cost : (H, W, D) uint8
+    base : (H, W) int32
+    image : (H, W) uint8
+    p1 : int
+    p2 : (256) uint8
+    max_slant : int
+    detours : (H, W, D) uint8, written
+    aggregated : (H, W, D) uint8, written
+    """
+
 def selection(
     backend: str,
-    aggregated: Array,
-    base: Array,
-    reference: Array,
-    target: Array,
+    aggregated: NDArray[np.uint8],
+    base: NDArray[np.int32],
+    reference: NDArray[np.uint64],
+    target: NDArray[np.uint64],
     max_difference: int,
     max_excess: int,
-    offset: Array,
+    offset: NDArray[np.int32],
     /,
-) -> None: ...
+) -> None:
+    """Offsets of the least sums in 1/256 pixel, -2^31 where the left-right check or content lacks.
+
+    backend : str
+    aggregated : (H, W, D) uint8
+    base : (H, W) int32
+    reference : (H, W) uint64
+    target : (H, TARGET_W) uint64
+    max_difference : int
+    max_excess : int
+    offset : (H, W) int32, written
+    """
+
 def match(
     backend: str,
-    reference: Array,
-    target: Array,
-    base: Array,
-    image: Array,
+    reference: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    base: NDArray[np.int32],
+    image: NDArray[np.uint8],
     p1: int,
-    p2: Array,
+    p2: NDArray[np.uint8],
     max_slant: int,
     max_difference: int,
     max_excess: int,
-    scratch: Array,
-    offset: Array,
+    scratch: NDArray[np.uint8],
+    offset: NDArray[np.int32],
     /,
-) -> None: ...
-def refine_offsets(backend: str, offset: Array, reference: Array, target: Array, refined: Array, /) -> None: ...
-def transfer_disparity(left: Array, max_step: float, right: Array, /) -> None: ...
+) -> None:
+    """Matching cost, aggregation and selection in one, in bands of so many rows as BAND pixels are.
+
+    backend : str
+    reference : (H, W) uint64
+    target : (H, TARGET_W) uint64
+    base : (H, W) int32
+    image : (H, W) uint8
+    p1 : int
+    p2 : (256) uint8
+    max_slant : int
+    max_difference : int
+    max_excess : int
+    scratch : (2, BAND, D) uint8, written
+    offset : (H, W) int32, written
+    """
+
+def refine_offsets(
+    backend: str,
+    offset: NDArray[np.int32],
+    reference: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    refined: NDArray[np.int32],
+    /,
+) -> None:
+    """Offsets fitted to the raw costs of a window around each pixel, in 1/256 pixel.
+
+    backend : str
+    offset : (H, W) int32
+    reference : (H, W) uint64
+    target : (H, TARGET_W) uint64
+    refined : (H, W) int32, written
+    """
+
+def transfer_disparity(
+    left: NDArray[np.float32],
+    max_step: float,
+    right: NDArray[np.float32],
+    /,
+) -> None:
+    """Carry a disparity map from the left image's columns to the right image's (NaN = none).
+
+    left : (H, W) float32
+    max_step : float
+    right : (H, TARGET_W) float32, written
+    """
+
 def depth_candidates(
     backend: str,
-    disparity: Array,
-    rectified_from_pixel: Array,
+    disparity: NDArray[np.float32],
+    rectified_from_pixel: NDArray[np.floating[Any]],
     scales: tuple[float, float],
     origins: tuple[float, float],
     disparity_origin: float,
@@ -61,121 +172,290 @@ def depth_candidates(
     spherical: bool,
     is_left: bool,
     first_row: int,
-    depth: Array,
-    sigma: Array,
+    depth: NDArray[np.float32],
+    sigma: NDArray[np.float32],
     /,
-) -> None: ...
+) -> None:
+    """z-depth and its standard deviation (0 = none) from a pair's disparities, for rows of a view from
+    `first_row` on; `scales` and `origins` are of columns and rows of the disparity map.
+
+    backend : str
+    disparity : (MAP_H, MAP_W) float32
+    rectified_from_pixel : (3, 3) float64
+    scales : tuple[float, float]
+    origins : tuple[float, float]
+    disparity_origin : float
+    baseline : float
+    disparity_sigma : float
+    max_disparity_step : float
+    spherical : bool
+    is_left : bool
+    first_row : int
+    depth : (H, W) float32, written
+    sigma : (H, W) float32, written
+    """
+
 def vote_depth(
-    depths: Array, sigmas: Array, tolerance: float, depth: Array, sigma: Array, support: Array, /
-) -> None: ...
+    depths: NDArray[np.float32],
+    sigmas: NDArray[np.float32],
+    tolerance: float,
+    depth: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    support: NDArray[np.uint8],
+    /,
+) -> None:
+    """The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size.
+
+    depths : (PAIRS, H, W) float32
+    sigmas : (PAIRS, H, W) float32
+    tolerance : float
+    depth : (H, W) float32, written
+    sigma : (H, W) float32, written
+    support : (H, W) uint8, written
+    """
+
 def check_consistency(
     backend: str,
-    depth: Array,
-    sigma: Array,
-    partner_depth: Array,
-    partner_sigma: Array,
-    partner_support: Array,
-    partner_from_reference: Array,
-    reference_from_partner: Array,
+    depth: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    partner_depth: NDArray[np.float32],
+    partner_sigma: NDArray[np.float32],
+    partner_support: NDArray[np.uint8],
+    partner_from_reference: NDArray[np.floating[Any]],
+    reference_from_partner: NDArray[np.floating[Any]],
     max_reprojection_error: float,
     tolerance: float,
     min_support: int,
-    observing: Array,
-    agreeing: Array,
-    contradicting: Array,
-    weighted_depth: Array,
-    weight: Array,
+    observing: NDArray[np.uint8],
+    agreeing: NDArray[np.uint8],
+    contradicting: NDArray[np.uint8],
+    weighted_depth: NDArray[np.float32],
+    weight: NDArray[np.float32],
     /,
-) -> None: ...
+) -> None:
+    """Add what a partner's depth map says of a view's to the sums over all partners.
+
+    backend : str
+    depth : (H, W) float32
+    sigma : (H, W) float32
+    partner_depth : (PARTNER_H, PARTNER_W) float32
+    partner_sigma : (PARTNER_H, PARTNER_W) float32
+    partner_support : (PARTNER_H, PARTNER_W) uint8
+    partner_from_reference : (3, 4) float64
+    reference_from_partner : (3, 4) float64
+    max_reprojection_error : float
+    tolerance : float
+    min_support : int
+    observing : (H, W) uint8, written
+    agreeing : (H, W) uint8, written
+    contradicting : (H, W) uint8, written
+    weighted_depth : (H, W) float32, written
+    weight : (H, W) float32, written
+    """
+
 def confirm_depth(
-    depth: Array,
-    sigma: Array,
+    depth: NDArray[np.float32],
+    sigma: NDArray[np.float32],
     min_consistent: int,
     max_contradiction: float,
     min_surface: float,
     steepest: float,
-    observing: Array,
-    agreeing: Array,
-    contradicting: Array,
-    weighted_depth: Array,
-    weight: Array,
+    observing: NDArray[np.uint8],
+    agreeing: NDArray[np.uint8],
+    contradicting: NDArray[np.uint8],
+    weighted_depth: NDArray[np.float32],
+    weight: NDArray[np.float32],
     /,
-) -> None: ...
-def fuse_partner(
-    depth: Array,
-    normals: Array,
-    ray_from_pixel: Array,
-    partner_depth: Array,
-    partner_normals: Array,
-    partner_ray_from_pixel: Array,
-    partner_image: Array,
-    partner_from_reference: Array,
-    normal_from_partner: Array,
-    max_reprojection_error: float,
-    max_depth_error: float,
-    min_normal_cosine: float,
-    partner_wins: bool,
-    bit: int,
-    covered: Array,
-    agreeing: Array,
-    colour: Array,
-    /,
-) -> None: ...
-def count_points(
-    depth: Array,
-    normals: Array,
-    covered: Array,
-    agreeing: Array,
-    colour: Array,
-    min_views: int,
-    first_row: int,
-    end_row: int,
-    /,
-) -> tuple[int, int]: ...
-def write_points(
-    depth: Array,
-    normals: Array,
-    covered: Array,
-    agreeing: Array,
-    colour: Array,
-    min_views: int,
-    first_row: int,
-    end_row: int,
-    world_from_pixel: Array,
-    world_from_camera: Array,
-    centre: Array,
-    indices: Array,
-    points: Array,
-    visibility: Array,
-    /,
-) -> None: ...
+) -> None:
+    """Turn the sums of check_consistency into the geometric map: `weighted_depth` becomes depth, `weight` its
+    deviation, `agreeing` its support; `contradicting` is spoilt.
+
+    depth : (H, W) float32
+    sigma : (H, W) float32
+    min_consistent : int
+    max_contradiction : float
+    min_surface : float
+    steepest : float
+    observing : (H, W) uint8
+    agreeing : (H, W) uint8, written
+    contradicting : (H, W) uint8, written
+    weighted_depth : (H, W) float32, written
+    weight : (H, W) float32, written
+    """
+
 def fit_planes(
     backend: str,
-    inverse_depth: Array,
-    inverse_sigma: Array,
-    support: Array,
-    K: Array,
+    inverse_depth: NDArray[np.float32],
+    inverse_sigma: NDArray[np.float32],
+    support: NDArray[np.uint8],
+    K: NDArray[np.floating[Any]],
     radius: int,
     tolerance: float,
     max_shift: float,
     shift_sigma: float,
     min_cosine: float,
     supported: int,
-    normals: Array,
-    fitted_depth: Array,
+    normals: NDArray[np.float32],
+    fitted_depth: NDArray[np.float32],
     /,
-) -> None: ...
+) -> None:
+    """Normals and depths of planes fitted to each pixel's neighbours; zeros where none fits.
+
+    backend : str
+    inverse_depth : (H, W) float32
+    inverse_sigma : (H, W) float32
+    support : (H, W) uint8
+    K : (3, 3) float64
+    radius : int
+    tolerance : float
+    max_shift : float
+    shift_sigma : float
+    min_cosine : float
+    supported : int
+    normals : (H, W, 3) float32, written
+    fitted_depth : (H, W) float32, written
+    """
+
 def add_patch_equations(
     backend: str,
-    image: Array,
-    sources: tuple[Array, ...],
-    sources_from_reference: Array,
-    planes: Array,
+    image: NDArray[np.uint8],
+    sources: tuple[NDArray[np.uint8], ...],
+    sources_from_reference: NDArray[np.floating[Any]],
+    planes: NDArray[np.float32],
     first_row: int,
     row_step: int,
     contrast: float,
     min_score: float,
-    equations: Array,
+    equations: NDArray[np.float32],
     /,
-) -> None: ...
-def refine_planes(equations: Array, sigma: Array, slope_sigma: float, planes: Array, /) -> None: ...
+) -> None:
+    """Add the normal equations of matching planes of every `row_step`-th row in each of the sources.
+
+    backend : str
+    image : (H, W) uint8
+    sources : tuple of SOURCES images, uint8
+    sources_from_reference : (SOURCES, 3, 4) float64
+    planes : (3, ROWS, W) float32
+    first_row : int
+    row_step : int
+    contrast : float
+    min_score : float
+    equations : (12, ROWS, W) float32, written
+    """
+
+def refine_planes(
+    equations: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    slope_sigma: float,
+    planes: NDArray[np.float32],
+    /,
+) -> None:
+    """Move planes by the solution of their equations.
+
+    equations : (12, H, W) float32
+    sigma : (H, W) float32
+    slope_sigma : float
+    planes : (3, H, W) float32, written
+    """
+
+def fuse_partner(
+    depth: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    ray_from_pixel: NDArray[np.floating[Any]],
+    partner_depth: NDArray[np.float32],
+    partner_normals: NDArray[np.float32],
+    partner_ray_from_pixel: NDArray[np.floating[Any]],
+    partner_image: NDArray[np.uint8],
+    partner_from_reference: NDArray[np.floating[Any]],
+    normal_from_partner: NDArray[np.floating[Any]],
+    max_reprojection_error: float,
+    max_depth_error: float,
+    min_normal_cosine: float,
+    partner_wins: bool,
+    bit: int,
+    covered: NDArray[np.uint8],
+    agreeing: NDArray[np.uint64],
+    colour: NDArray[np.uint16],
+    /,
+) -> None:
+    """Add a partner's verdict on a view's pixels: covered by a finer pixel, or seen by it, too.
+
+    depth : (H, W) float32
+    normals : (3, H, W) float32
+    ray_from_pixel : (3, 3) float64
+    partner_depth : (PARTNER_H, PARTNER_W) float32
+    partner_normals : (3, PARTNER_H, PARTNER_W) float32
+    partner_ray_from_pixel : (3, 3) float64
+    partner_image : (PARTNER_H, PARTNER_W, 3) uint8
+    partner_from_reference : (3, 4) float64
+    normal_from_partner : (3, 3) float64
+    max_reprojection_error : float
+    max_depth_error : float
+    min_normal_cosine : float
+    partner_wins : bool
+    bit : int
+    covered : (H, W) uint8, written
+    agreeing : (H, W) uint64, written
+    colour : (H, W, 3) uint16, written
+    """
+
+def count_points(
+    depth: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    covered: NDArray[np.uint8],
+    agreeing: NDArray[np.uint64],
+    colour: NDArray[np.uint16],
+    min_views: int,
+    first_row: int,
+    end_row: int,
+    /,
+) -> tuple[int, int]:
+    """Points that the rows of a view become, and words that name the views which see them.
+
+    depth : (H, W) float32
+    normals : (3, H, W) float32
+    covered : (H, W) uint8
+    agreeing : (H, W) uint64
+    colour : (H, W, 3) uint16
+    min_views : int
+    first_row : int
+    end_row : int
+    returned: points
+    returned: words
+    """
+
+def write_points(
+    depth: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    covered: NDArray[np.uint8],
+    agreeing: NDArray[np.uint64],
+    colour: NDArray[np.uint16],
+    min_views: int,
+    first_row: int,
+    end_row: int,
+    world_from_pixel: NDArray[np.floating[Any]],
+    world_from_camera: NDArray[np.floating[Any]],
+    centre: NDArray[np.floating[Any]],
+    indices: NDArray[np.uint32],
+    points: NDArray[np.uint8],
+    visibility: NDArray[np.uint32],
+    /,
+) -> None:
+    """Points as in a PLY file: position and normal as float32, red, green, blue; and for each the number of
+    views that see it, and their indices. POINTS and WORDS are what count_points returns.
+
+    depth : (H, W) float32
+    normals : (3, H, W) float32
+    covered : (H, W) uint8
+    agreeing : (H, W) uint64
+    colour : (H, W, 3) uint16
+    min_views : int
+    first_row : int
+    end_row : int
+    world_from_pixel : (3, 3) float64
+    world_from_camera : (3, 3) float64
+    centre : (3) float64
+    indices : (65) uint32
+    points : (POINTS, 27) uint8, written
+    visibility : (WORDS) uint32, written
+    """

@@ -48,7 +48,7 @@ TRAFFIC = {"matching_cost": 1, "aggregation": 5, "selection": 1, "match": 4}
 
 
 def sweep_instructions(register: int, depth: int) -> float:
-    """Vector instructions per register of both sweeps, in aggregation.inc and the files that include it."""
+    """Vector instructions per register of both sweeps, in aggregation_vector.c and aggregation_vector.h."""
     # Each of 4 paths has 6 (3 min, 2 add, subtract), and from the second register on the running minimum; `one_up`
     # and `one_down` have 2 each; 3 adds sum what the paths add. The backward sweep's sums take 4 more (average, 3
     # adds).

@@ -347,7 +347,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first call (default: 0)")
     parser.add_argument("--calls", type=int, default=10**9, help="number of calls, at most")
     options = parser.parse_args()
-    missing = {name for name in dir(_native) if not name.startswith("_")} - {"backends", *FUNCTIONS}
+    missing = {name for name in dir(_native) if not name.startswith("_")} - {"backends", "signatures", *FUNCTIONS}
     if missing:
         print(f"{', '.join(sorted(missing))}: no entry in FUNCTIONS of {Path(__file__).name}")
         return 1

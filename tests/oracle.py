@@ -1,4 +1,4 @@
-"""Slow, readable NumPy versions of the kernels, written from the definitions in `_native/kernels.h`.
+"""Slow, readable NumPy versions of the kernels, written from the definitions in the headers of `_native`'s groups.
 
 Nothing here is shared with the C code: plain loops over pixels, 64-bit integers or float64 throughout.
 """
@@ -366,7 +366,7 @@ def _bilinear(image, u, v):
 
 
 def patch_equations(image, source, matrix, planes, contrast, min_score):
-    """Equations (12, H, W) float64 of matching small planes in one source; see `kernels.h` for their order.
+    """Equations (12, H, W) float64 of matching small planes in one source; see `depth.h` for their order.
 
     Every tap goes through the whole projection, not through an affine map at the window's middle, and the
     derivatives are differences of sampled windows. NaN where a window is too near to the source's rim to say.

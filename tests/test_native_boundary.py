@@ -1,5 +1,8 @@
 """The boundary between Python and C: wrong arguments raise, odd ones are survived, nothing crashes."""
 
+import inspect
+import re
+
 import numpy as np
 import oracle
 import pytest
@@ -107,7 +110,7 @@ def arguments(function):
             "partner_support": np.ones((5, 6), u8),
             "partner_from_reference": matrix,
             "reference_from_partner": matrix.copy(),
-            "max_error": 1.0,
+            "max_reprojection_error": 1.0,
             "tolerance": 4.0,
             "min_support": 2,
             "out observing": np.zeros((H, W), u8),
@@ -253,6 +256,101 @@ FREE = {
     ("depth_candidates", "disparity"): {0, 1},
     ("add_patch_equations", "image"): {0},
 }
+
+
+# ---- the tables of arguments -------------------------------------------------------------------------------
+
+SIGNATURES = dict(_native.signatures())
+
+
+def taken(function):
+    """(name, role, type, sizes) of what a function takes."""
+    return [argument for argument in SIGNATURES[function] if argument[1] != "result"]
+
+
+def test_the_tables_name_every_function_and_argument():
+    assert set(SIGNATURES) == set(FUNCTIONS)
+    for function in FUNCTIONS:
+        names = [("out " if role == "out" else "") + name for name, role, *_ in taken(function)]
+        assert names == list(arguments(function))
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_docstrings_describe_every_argument(function):
+    native = getattr(_native, function)
+    assert list(inspect.signature(native).parameters) == [name for name, *_ in taken(function)]
+    for name, role, kind, _ in SIGNATURES[function]:
+        line = f"\nreturned: {name}" if role == "result" else rf"\n{name} : .*{re.escape(kind)}"
+        assert re.search(line, native.__doc__)
+
+
+def test_the_stub_is_what_the_tables_say(scripts_on_path):
+    import make_native_stub as script
+
+    assert script.STUB.read_text() == script.stub(), "run scripts/make_native_stub.py"
+
+
+def refusals(function, place):
+    """What is wrong with an array and must be said with its name: (error, another array)."""
+    right = list(arguments(function).values())[place]
+    _, role, kind, size = SIGNATURES[function][place]
+    assert right.dtype == kind and right.ndim == len(size)
+    yield TypeError, right.astype(np.float32 if kind != "float32" else np.uint8)
+    yield TypeError, np.zeros((*right.shape[:-1], 2 * right.shape[-1]), kind)[..., ::2]
+    yield ValueError, right[None]
+    if role == "out":
+        right.flags.writeable = False
+        yield TypeError, right
+    before = {symbol for argument in SIGNATURES[function][:place] for symbol, _ in argument[3]}
+    for axis, (symbol, least) in enumerate(size):
+        if symbol is None or symbol in before:
+            for wrong in (right.shape[axis] + 1, right.shape[axis] - 1):
+                yield ValueError, np.zeros((*right.shape[:axis], wrong, *right.shape[axis + 1 :]), kind)
+        elif least:
+            yield ValueError, np.zeros((*right.shape[:axis], least - 1, *right.shape[axis + 1 :]), kind)
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_what_is_refused_is_named(function):
+    names = list(arguments(function))
+    for place, (name, role, kind, _) in enumerate(taken(function)):
+        if role in ("in", "out"):
+            wrongs = list(refusals(function, place))
+        elif kind == "bool":
+            continue  # anything is true or false
+        else:
+            wrongs = [(TypeError, object())]
+        if kind == "int":
+            wrongs += [(TypeError, 1.5), (OverflowError, 2**63), (OverflowError, -(2**63) - 1)]
+        if role == "images":
+            wrongs += [(TypeError, (None,))]
+        for error, wrong in wrongs:
+            with pytest.raises(error, match=rf"^{name}\b"):
+                call(function, {**arguments(function), names[place]: wrong})
+
+
+@pytest.mark.parametrize("function", FUNCTIONS)
+def test_arrays_are_let_go_of(function):
+    """After a call, and after one that is refused at each of the arguments."""
+    for wrong in (None, *(name for name, value in arguments(function).items() if not isinstance(value, bool))):
+        values = arguments(function)
+        views = [memoryview(value) for value in values.values() if isinstance(value, np.ndarray)]
+        kept = iter(views)
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                values[name] = next(kept)
+            if name == wrong:
+                values[name] = object()
+        if wrong is None:
+            call(function, values)
+        else:
+            with pytest.raises(TypeError):
+                call(function, values)
+        for view in views:
+            view.release()  # BufferError where C still has it
+
+
+# ---- wrong arguments ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("function", FUNCTIONS)

@@ -1,6 +1,8 @@
+#include "dispatch.h"
+
 #include <string.h>
 
-#include "rows.h"
+#include "matching/rows.h"
 
 /* The kernels on whole images that are made of row kernels. */
 #define WHOLE_IMAGES(version) \
@@ -66,6 +68,8 @@ static int has_avx512(void) {
            __builtin_cpu_supports("avx512vpopcntdq");
 }
 #endif
+
+const char *const kernel_names[] = {"avx512", "avx2", "scalar", NULL};
 
 const kernel_table *kernels_by_name(const char *name) {
     if (strcmp(name, "scalar") == 0) {

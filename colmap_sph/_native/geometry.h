@@ -12,4 +12,14 @@ static inline vector transform(const double *m, const double *t, double x, doubl
                     (m[6] * x + m[7] * y + m[8]) * z + t[2]};
 }
 
+/* [A | a], row by row, as A and a. */
+static inline void split_transfer(const double *matrix, double *left, double *last) {
+    for (int r = 0; r < 3; r++) {
+        for (int c = 0; c < 3; c++) {
+            left[3 * r + c] = matrix[4 * r + c];
+        }
+        last[r] = matrix[4 * r + 3];
+    }
+}
+
 #endif

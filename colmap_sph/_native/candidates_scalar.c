@@ -1,2 +1,0 @@
-#define DEPTH_CANDIDATES depth_candidates_scalar
-#include "candidates.inc"

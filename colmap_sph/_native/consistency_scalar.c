@@ -1,2 +1,0 @@
-#define CHECK_CONSISTENCY check_consistency_scalar
-#include "consistency.inc"

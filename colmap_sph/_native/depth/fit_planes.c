@@ -1,0 +1,176 @@
+/* Normals from local planes.
+ *
+ * On a plane, inverse depth is affine in pixel coordinates: 1/z = m . (col, row, 1) with m = K^-T n / d. A few
+ * reweighted least-squares rounds fit it to the neighbours that lie on the pixel's own surface. Neighbouring
+ * pixels are fitted side by side, each in a lane of its own, so that vector widths cannot change a result. */
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
+#include "depth/depth.h"
+#include "version.h"
+
+enum { ROUNDS = 3 };
+
+/* Bounds that keep squares and reciprocals of 32-bit floats finite. */
+#define SMALLEST 1e-30f   /* inverse depth */
+#define LEAST_NOISE 1e-8f /* relative */
+#define FARTHEST 1e6f     /* relative inverse depth of a neighbour */
+
+/* One value per pixel of a block; inverse depths are relative to the centre's: (w - centre) / centre. */
+typedef struct {
+    float centre[LANES], scale[LANES]; /* inverse depth and its reciprocal */
+    float noise[LANES];
+    float value[LANES], du[LANES], dv[LANES]; /* the plane at the pixel, and its gradient per pixel */
+    int good[LANES];
+} block;
+
+/* Sums of weights times 1, x, y, xx, xy, yy and of weights times the value times 1, x, y. */
+typedef struct {
+    float n[6][LANES], b[3][LANES];
+} normal_equations;
+
+/* NaN becomes `least`. */
+static inline float clamp(float v, float least, float most) { return v > least ? v < most ? v : most : least; }
+
+/* One round: neighbours weigh by distance from the centre and from the plane so far (Geman-McClure). */
+static inline void accumulate(const float *window, ptrdiff_t stride, int radius, const float *falloff,
+                              float widening, const block *k, normal_equations *sums) {
+    float inverse_scale[LANES];
+    for (int l = 0; l < LANES; l++) {
+        inverse_scale[l] = 1 / (k->noise[l] * k->noise[l] * widening * widening);
+    }
+    memset(sums, 0, sizeof *sums);
+    for (int x = -radius; x <= radius; x++) {
+        float a0[LANES] = {0}, a1[LANES] = {0}, a2[LANES] = {0}, b0[LANES] = {0}, b1[LANES] = {0};
+        const float fx = (float)x;
+        for (int y = -radius; y <= radius; y++) {
+            const float *tap = window + y * stride + x;
+            const float fy = (float)y, near = falloff[abs(x)] * falloff[abs(y)];
+            for (int l = 0; l < LANES; l++) {
+                const float w = clamp((tap[l] - k->centre[l]) * k->scale[l], -1, FARTHEST);
+                const float residual = w - (k->value[l] + k->du[l] * fx + k->dv[l] * fy);
+                const float robust = 1 / (1 + residual * residual * inverse_scale[l]);
+                const float weight = tap[l] > 0 ? near * robust * robust : 0;
+                a0[l] += weight;
+                a1[l] += weight * fy;
+                a2[l] += weight * fy * fy;
+                b0[l] += weight * w;
+                b1[l] += weight * w * fy;
+            }
+        }
+        for (int l = 0; l < LANES; l++) {
+            sums->n[0][l] += a0[l];
+            sums->n[1][l] += a0[l] * fx;
+            sums->n[2][l] += a1[l];
+            sums->n[3][l] += a0[l] * fx * fx;
+            sums->n[4][l] += a1[l] * fx;
+            sums->n[5][l] += a2[l];
+            sums->b[0][l] += b0[l];
+            sums->b[1][l] += b0[l] * fx;
+            sums->b[2][l] += b1[l];
+        }
+    }
+}
+
+static inline void solve(const normal_equations *sums, block *k) {
+    for (int l = 0; l < LANES; l++) {
+        const double sw = sums->n[0][l], sx = sums->n[1][l], sy = sums->n[2][l];
+        const double sxx = sums->n[3][l], sxy = sums->n[4][l], syy = sums->n[5][l];
+        const double b0 = sums->b[0][l], b1 = sums->b[1][l], b2 = sums->b[2][l];
+        const double c00 = sxx * syy - sxy * sxy, c01 = sy * sxy - sx * syy, c02 = sx * sxy - sy * sxx;
+        const double c11 = sw * syy - sy * sy, c12 = sx * sy - sw * sxy, c22 = sw * sxx - sx * sx;
+        const double determinant = sw * c00 + sx * c01 + sy * c02;
+        /* Else fewer than three neighbours, or all on a line. */
+        const int solved = determinant > 1e-6 * sw * sw * sw;
+        const double inverse = 1 / (solved ? determinant : 1);
+        k->good[l] &= solved;
+        k->value[l] = (float)((c00 * b0 + c01 * b1 + c02 * b2) * inverse);
+        k->du[l] = (float)((c01 * b0 + c11 * b1 + c12 * b2) * inverse);
+        k->dv[l] = (float)((c02 * b0 + c12 * b1 + c22 * b2) * inverse);
+    }
+}
+
+static inline void begin(const float *centre, const float *sigma, ptrdiff_t count, float tolerance, block *k) {
+    for (int l = 0; l < LANES; l++) {
+        const float w = l < count ? centre[l] : 0;
+        k->good[l] = w >= SMALLEST;
+        k->centre[l] = k->good[l] ? w : 1;
+        k->scale[l] = 1 / k->centre[l];
+        k->noise[l] = clamp(k->good[l] ? tolerance * sigma[l] * k->scale[l] : 1, LEAST_NOISE, 1);
+        k->value[l] = k->du[l] = k->dv[l] = 0;
+    }
+}
+
+/* Whether the pixel is off its plane, or glances at it with little support. `value` is the plane's inverse depth
+ * over the pixel's, `facing` the cosine at which its ray meets the plane. */
+static inline int is_doubtful(const plane_fit *fit, const block *k, int l, double value, double relative_sigma,
+                              double focal_length, double facing, int support) {
+    const double shift = fabs(k->value[l]);
+    const double slope = sqrt((double)(k->du[l] * k->du[l] + k->dv[l] * k->dv[l]));
+    const double size = slope * focal_length > 1 ? slope : 1 / focal_length;
+    const int is_off = shift > fit->max_shift * size && shift > fit->shift_sigma * relative_sigma * value;
+    return is_off || (support < fit->supported && facing < fit->min_cosine);
+}
+
+static inline void store_plane(const plane_fit *fit, const block *k, int l, double column, double row,
+                               const double *K, float sigma, int support, float *normal, float *depth) {
+    /* m . (col, row, 1) is the plane in image coordinates; n ~ K^T m, towards the camera. */
+    const double value = 1.0 + k->value[l];
+    const double m0 = k->du[l], m1 = k->dv[l], m2 = value - m0 * column - m1 * row;
+    const double x = K[0] * m0, y = K[1] * m0 + K[4] * m1, z = K[2] * m0 + K[5] * m1 + m2;
+    const double norm = sqrt(x * x + y * y + z * z);
+    const double ray_y = (row - K[5]) / K[4], ray_x = (column - K[2] - K[1] * ray_y) / K[0];
+    const double facing = value / (norm * sqrt(ray_x * ray_x + ray_y * ray_y + 1));
+    if (!(k->good[l] && value > 0 && norm > 0) ||
+        is_doubtful(fit, k, l, value, sigma * k->scale[l], K[0], facing, support)) {
+        normal[0] = normal[1] = normal[2] = *depth = 0;
+        return;
+    }
+    normal[0] = (float)(-x / norm);
+    normal[1] = (float)(-y / norm);
+    normal[2] = (float)(-z / norm);
+    *depth = (float)(1 / (value * k->centre[l]));
+}
+
+int VERSION_OF(fit_planes)(const float *inverse_depth, const float *inverse_sigma, const uint8_t *support,
+                           ptrdiff_t height, ptrdiff_t width, const double *K, const plane_fit *fit,
+                           float *normals, float *fitted_depth) {
+    const int radius = fit->radius;
+    float falloff[MAX_FIT_RADIUS + 1];
+    for (int i = 0; i <= radius; i++) {
+        const float t = (float)i / (float)(radius + 1);
+        falloff[i] = (1 - t * t) * (1 - t * t);
+    }
+    /* A border of zeros, which stand for "none", also to the right of the last block. */
+    const ptrdiff_t stride = width + 2 * radius + LANES;
+    float *padded = calloc((size_t)((height + 2 * radius) * stride), sizeof *padded);
+    if (!padded) {
+        return -1;
+    }
+    for (ptrdiff_t row = 0; row < height; row++) {
+        memcpy(padded + (row + radius) * stride + radius, inverse_depth + row * width,
+               (size_t)width * sizeof *padded);
+    }
+    for (ptrdiff_t row = 0; row < height; row++) {
+        for (ptrdiff_t column = 0; column < width; column += LANES) {
+            const ptrdiff_t p = row * width + column, count = width - column < LANES ? width - column : LANES;
+            const float *window = padded + (row + radius) * stride + column + radius;
+            block k;
+            begin(window, inverse_sigma + p, count, fit->tolerance, &k);
+            for (int round = 0; round < ROUNDS; round++) {
+                /* The first round allows for a slope of the surface, the later ones for noise only. */
+                const float widening = round == 0 ? (float)(1 + radius) : round == 1 ? 2 : 1;
+                normal_equations sums;
+                accumulate(window, stride, radius, falloff, widening, &k, &sums);
+                solve(&sums, &k);
+            }
+            for (int l = 0; l < count; l++) {
+                store_plane(fit, &k, l, (double)(column + l), (double)row, K, inverse_sigma[p + l], support[p + l],
+                            normals + 3 * (p + l), fitted_depth + p + l);
+            }
+        }
+    }
+    free(padded);
+    return 0;
+}

@@ -1,0 +1,254 @@
+/* The kernels of depth as Python's functions. */
+#include "boundary.h"
+
+#include <string.h>
+
+#include "geometry.h"
+
+_Static_assert(PATCH_EQUATIONS == 12 && (int)MAX_PATCH_SOURCES == (int)MAX_IMAGES, "tables below");
+
+#define TRANSFER_DISPARITY(X) \
+    X(IN, float32, left, H, W) \
+    X(VALUE, float, max_step) \
+    X(OUT, float32, right, H, TARGET_W)
+ARGUMENTS(transfer_disparity, TRANSFER_DISPARITY);
+
+static int run_transfer_disparity(void *arguments) {
+    const transfer_disparity_arguments *a = arguments;
+    transfer_disparity(a->left, a->size.H, a->size.W, a->size.TARGET_W, a->max_step, a->right);
+    return 0;
+}
+
+FUNCTION(transfer_disparity, TRANSFER_DISPARITY, any,
+         "Carry a disparity map from the left image's columns to the right image's (NaN = none).");
+
+#define DEPTH_CANDIDATES(X) \
+    X(VALUE, backend, backend) \
+    X(IN, float32, disparity, MAP_H, MAP_W) \
+    X(IN, float64, rectified_from_pixel, 3, 3) \
+    X(VALUE, pair, scales) \
+    X(VALUE, pair, origins) \
+    X(VALUE, double, disparity_origin) \
+    X(VALUE, double, baseline) \
+    X(VALUE, double, disparity_sigma) \
+    X(VALUE, double, max_disparity_step) \
+    X(VALUE, flag, spherical) \
+    X(VALUE, flag, is_left) \
+    X(VALUE, ptrdiff, first_row) \
+    X(OUT, float32, depth, H, W) \
+    X(OUT, float32, sigma, H, W)
+ARGUMENTS(depth_candidates, DEPTH_CANDIDATES);
+
+static int run_depth_candidates(void *arguments) {
+    const depth_candidates_arguments *a = arguments;
+    pair_geometry geometry = {.columns_per_radian = a->scales.first,
+                              .rows_per_radian = a->scales.second,
+                              .column_origin = a->origins.first,
+                              .row_origin = a->origins.second,
+                              .disparity_origin = a->disparity_origin,
+                              .baseline = a->baseline,
+                              .disparity_sigma = a->disparity_sigma,
+                              .max_disparity_step = a->max_disparity_step,
+                              .spherical = a->spherical,
+                              .is_left = a->is_left};
+    memcpy(geometry.rectified_from_pixel, a->rectified_from_pixel, sizeof geometry.rectified_from_pixel);
+    a->backend->depth_candidates(a->disparity, a->size.MAP_H, a->size.MAP_W, &geometry, a->first_row, a->size.H,
+                                 a->size.W, a->depth, a->sigma);
+    return 0;
+}
+
+FUNCTION(depth_candidates, DEPTH_CANDIDATES, any,
+         "z-depth and its standard deviation (0 = none) from a pair's disparities, for rows of a view from\n"
+         "`first_row` on; `scales` and `origins` are of columns and rows of the disparity map.");
+
+#define VOTE_DEPTH(X) \
+    X(IN, float32, depths, PAIRS, H, W) \
+    X(IN, float32, sigmas, PAIRS, H, W) \
+    X(VALUE, float, tolerance) \
+    X(OUT, float32, depth, H, W) \
+    X(OUT, float32, sigma, H, W) \
+    X(OUT, uint8, support, H, W)
+ARGUMENTS(vote_depth, VOTE_DEPTH);
+
+static int run_vote_depth(void *arguments) {
+    const vote_depth_arguments *a = arguments;
+    vote_depth(a->depths, a->sigmas, a->size.PAIRS, a->size.H * a->size.W, a->tolerance, a->depth, a->sigma,
+               a->support);
+    return 0;
+}
+
+FUNCTION(vote_depth, VOTE_DEPTH, any,
+         "The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size.");
+
+#define CHECK_CONSISTENCY(X) \
+    X(VALUE, backend, backend) \
+    X(IN, float32, depth, H, W) \
+    X(IN, float32, sigma, H, W) \
+    X(IN, float32, partner_depth, PARTNER_H, PARTNER_W) \
+    X(IN, float32, partner_sigma, PARTNER_H, PARTNER_W) \
+    X(IN, uint8, partner_support, PARTNER_H, PARTNER_W) \
+    X(IN, float64, partner_from_reference, 3, 4) \
+    X(IN, float64, reference_from_partner, 3, 4) \
+    X(VALUE, float, max_reprojection_error) \
+    X(VALUE, float, tolerance) \
+    X(VALUE, int, min_support) \
+    X(OUT, uint8, observing, H, W) \
+    X(OUT, uint8, agreeing, H, W) \
+    X(OUT, uint8, contradicting, H, W) \
+    X(OUT, float32, weighted_depth, H, W) \
+    X(OUT, float32, weight, H, W)
+ARGUMENTS(check_consistency, CHECK_CONSISTENCY);
+
+static int check_maps(ptrdiff_t height, ptrdiff_t width) {
+    return check(height <= INT32_MAX && width <= INT32_MAX, "maps are limited to 2^31 - 1 rows and columns");
+}
+
+static int check_check_consistency(const void *arguments) {
+    const check_consistency_arguments *a = arguments;
+    return check_maps(a->size.H, a->size.W) && check_maps(a->size.PARTNER_H, a->size.PARTNER_W);
+}
+
+static int run_check_consistency(void *arguments) {
+    const check_consistency_arguments *a = arguments;
+    const depth_map reference = {a->depth, a->sigma, NULL, a->size.H, a->size.W};
+    const depth_map partner = {a->partner_depth, a->partner_sigma, a->partner_support, a->size.PARTNER_H,
+                               a->size.PARTNER_W};
+    const consistency_gates gates = {a->max_reprojection_error, a->tolerance, a->min_support};
+    const consistency_sums sums = {a->observing, a->agreeing, a->contradicting, a->weighted_depth, a->weight};
+    view_transfer transfer;
+    split_transfer(a->partner_from_reference, transfer.pixel_from_reference, transfer.translation);
+    split_transfer(a->reference_from_partner, transfer.reference_from_pixel, transfer.back_translation);
+    a->backend->check_consistency(&reference, &partner, &transfer, gates, &sums);
+    return 0;
+}
+
+FUNCTION(check_consistency, CHECK_CONSISTENCY, check_check_consistency,
+         "Add what a partner's depth map says of a view's to the sums over all partners.");
+
+#define CONFIRM_DEPTH(X) \
+    X(IN, float32, depth, H, W) \
+    X(IN, float32, sigma, H, W) \
+    X(VALUE, int, min_consistent) \
+    X(VALUE, float, max_contradiction) \
+    X(VALUE, float, min_surface) \
+    X(VALUE, float, steepest) \
+    X(IN, uint8, observing, H, W) \
+    X(OUT, uint8, agreeing, H, W) \
+    X(OUT, uint8, contradicting, H, W) \
+    X(OUT, float32, weighted_depth, H, W) \
+    X(OUT, float32, weight, H, W)
+ARGUMENTS(confirm_depth, CONFIRM_DEPTH);
+
+static int run_confirm_depth(void *arguments) {
+    const confirm_depth_arguments *a = arguments;
+    const confirmation options = {a->min_consistent, a->max_contradiction, a->min_surface, a->steepest};
+    confirm_depth(a->depth, a->sigma, a->size.H, a->size.W, &options, a->observing, a->agreeing, a->contradicting,
+                  a->weighted_depth, a->weight);
+    return 0;
+}
+
+FUNCTION(
+    confirm_depth, CONFIRM_DEPTH, any,
+    "Turn the sums of check_consistency into the geometric map: `weighted_depth` becomes depth, `weight` its\n"
+    "deviation, `agreeing` its support; `contradicting` is spoilt.");
+
+#define FIT_PLANES(X) \
+    X(VALUE, backend, backend) \
+    X(IN, float32, inverse_depth, H, W) \
+    X(IN, float32, inverse_sigma, H, W) \
+    X(IN, uint8, support, H, W) \
+    X(IN, float64, K, 3, 3) \
+    X(VALUE, int, radius) \
+    X(VALUE, float, tolerance) \
+    X(VALUE, float, max_shift) \
+    X(VALUE, float, shift_sigma) \
+    X(VALUE, float, min_cosine) \
+    X(VALUE, int, supported) \
+    X(OUT, float32, normals, H, W, 3) \
+    X(OUT, float32, fitted_depth, H, W)
+ARGUMENTS(fit_planes, FIT_PLANES);
+
+static int check_fit_planes(const void *arguments) {
+    const fit_planes_arguments *a = arguments;
+    return check(a->radius >= 1 && a->radius <= MAX_FIT_RADIUS, "the window radius must lie in 1..16");
+}
+
+static int run_fit_planes(void *arguments) {
+    const fit_planes_arguments *a = arguments;
+    const plane_fit fit = {a->radius, a->tolerance, a->max_shift, a->shift_sigma, a->min_cosine, a->supported};
+    return a->backend->fit_planes(a->inverse_depth, a->inverse_sigma, a->support, a->size.H, a->size.W, a->K, &fit,
+                                  a->normals, a->fitted_depth);
+}
+
+FUNCTION(fit_planes, FIT_PLANES, check_fit_planes,
+         "Normals and depths of planes fitted to each pixel's neighbours; zeros where none fits.");
+
+#define ADD_PATCH_EQUATIONS(X) \
+    X(VALUE, backend, backend) \
+    X(IN, uint8, image, H, W) \
+    X(IMAGES, uint8, sources, SOURCES) \
+    X(IN, float64, sources_from_reference, SOURCES, 3, 4) \
+    X(IN, float32, planes, 3, ROWS, W) \
+    X(VALUE, ptrdiff, first_row) \
+    X(VALUE, ptrdiff, row_step) \
+    X(VALUE, float, contrast) \
+    X(VALUE, float, min_score) \
+    X(OUT, float32, equations, 12, ROWS, W)
+ARGUMENTS(add_patch_equations, ADD_PATCH_EQUATIONS);
+
+/* Whether every `step`-th of so many rows are at least `count`. */
+static int rows_fit(ptrdiff_t rows, ptrdiff_t step, ptrdiff_t count) {
+    return count == 0 || (rows > 0 && count - 1 <= (rows - 1) / step);
+}
+
+static int check_add_patch_equations(const void *arguments) {
+    const add_patch_equations_arguments *a = arguments;
+    for (ptrdiff_t k = 0; k < a->size.SOURCES; k++) {
+        const ptrdiff_t height = a->sources->image[k].height, width = a->sources->image[k].width;
+        if (!check(width <= 65535, "rows are limited to 65535 columns") ||
+            !check(height < 16384 || height * width < 1 << 30, "a source is limited to 2^30 pixels")) {
+            return 0;
+        }
+    }
+    return check(a->first_row >= 0 && a->row_step >= 1 &&
+                     rows_fit(a->size.H - a->first_row, a->row_step, a->size.ROWS),
+                 "the rows must lie in the image");
+}
+
+static int run_add_patch_equations(void *arguments) {
+    const add_patch_equations_arguments *a = arguments;
+    const grey_image reference = {a->image, a->size.H, a->size.W};
+    const patch_rows rows = {a->first_row, a->row_step, a->size.ROWS};
+    const patch_options options = {a->contrast, a->min_score};
+    patch_source sources[MAX_PATCH_SOURCES];
+    for (ptrdiff_t k = 0; k < a->size.SOURCES; k++) {
+        sources[k].image =
+            (grey_image){a->sources->image[k].values, a->sources->image[k].height, a->sources->image[k].width};
+        split_transfer(a->sources_from_reference + 12 * k, sources[k].matrix, sources[k].translation);
+    }
+    a->backend->add_patch_equations(&reference, sources, a->size.SOURCES, a->planes, rows, options, a->equations);
+    return 0;
+}
+
+FUNCTION(add_patch_equations, ADD_PATCH_EQUATIONS, check_add_patch_equations,
+         "Add the normal equations of matching planes of every `row_step`-th row in each of the sources.");
+
+#define REFINE_PLANES(X) \
+    X(IN, float32, equations, 12, H, W) \
+    X(IN, float32, sigma, H, W) \
+    X(VALUE, float, slope_sigma) \
+    X(OUT, float32, planes, 3, H, W)
+ARGUMENTS(refine_planes, REFINE_PLANES);
+
+static int run_refine_planes(void *arguments) {
+    const refine_planes_arguments *a = arguments;
+    refine_planes(a->equations, a->sigma, a->size.H * a->size.W, a->slope_sigma, a->planes);
+    return 0;
+}
+
+FUNCTION(refine_planes, REFINE_PLANES, any, "Move planes by the solution of their equations.");
+
+native_function *const depth_functions[] = {
+    &transfer_disparity_function,  &depth_candidates_function, &vote_depth_function,
+    &check_consistency_function,   &confirm_depth_function,    &fit_planes_function,
+    &add_patch_equations_function, &refine_planes_function,    NULL};

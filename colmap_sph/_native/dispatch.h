@@ -1,0 +1,28 @@
+/* The versions of kernels, one table per instruction set. */
+#ifndef COLMAP_SPH_DISPATCH_H
+#define COLMAP_SPH_DISPATCH_H
+
+#include "depth/depth.h"
+#include "matching/matching.h"
+
+typedef struct {
+    const char *name;
+    census_fn *census;
+    cost_fn *cost;
+    aggregation_fn *aggregation;
+    selection_fn *selection;
+    match_fn *match;
+    refine_offsets_fn *refine_offsets;
+    depth_candidates_fn *depth_candidates;
+    check_consistency_fn *check_consistency;
+    fit_planes_fn *fit_planes;
+    add_patch_equations_fn *add_patch_equations;
+} kernel_table;
+
+/* The names of all tables, fastest first; NULL ends them. */
+extern const char *const kernel_names[];
+
+/* The table of this name, NULL when the processor or the build has no such version. */
+const kernel_table *kernels_by_name(const char *name);
+
+#endif

@@ -1,0 +1,66 @@
+/* Kernels of fusion: from depth maps to points. One version each, so that the result never depends on the
+ * processor. */
+#ifndef COLMAP_SPH_FUSION_H
+#define COLMAP_SPH_FUSION_H
+
+#include "common.h"
+
+enum { MAX_FUSION_PARTNERS = 64 }; /* a bit for each of them */
+
+/* A view's depth map, its normals (three planes) and K^-1. */
+typedef struct {
+    const float *depth, *normals;
+    ptrdiff_t height, width;
+    double ray_from_pixel[9];
+} view_maps;
+
+/* From one view to another: its pixel ~ A (column, row, 1) depth + a; and how to turn its normals back. */
+typedef struct {
+    double pixel_from_reference[9];
+    double translation[3];
+    double reference_from_partner[9];
+    int partner_wins; /* where both see a point equally well */
+} fusion_transfer;
+
+typedef struct {
+    float max_reprojection_error, max_depth_error, min_normal_cosine;
+} fusion_gates;
+
+/* What the partners say of each pixel of the reference. */
+typedef struct {
+    uint8_t *covered;   /* 1: a partner sees the same piece of surface with a finer pixel */
+    uint64_t *agreeing; /* a bit for each partner that sees the same surface */
+    uint16_t *colour;   /* (..., 3) sums over these */
+} fusion_verdict;
+
+/* Adds the verdict of the partner with this bit, whose `image` has three channels. Pixels that are covered already
+ * are passed over. */
+void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
+                  const fusion_transfer *transfer, fusion_gates gates, int bit, const fusion_verdict *verdict);
+
+/* Rows of a view's pixels that are to become points: not covered, and seen by this many views, itself among them.
+ */
+typedef struct {
+    const view_maps *maps;
+    const fusion_verdict *verdict; /* which is only read */
+    ptrdiff_t first_row, end_row;
+    int min_views;
+} fused_rows;
+
+enum { POINT_BYTES = 6 * 4 + 3 };
+
+typedef struct {
+    double world_from_pixel[9];  /* R^T K^-1 */
+    double world_from_camera[9]; /* R^T */
+    double centre[3];
+    const uint32_t *indices; /* 1 + number of partners: of the view, and of the partner with each bit */
+} point_frame;
+
+/* The number of points, and of words that name the views which see them. */
+void count_points(const fused_rows *rows, ptrdiff_t *points, ptrdiff_t *words);
+
+/* Points as in a PLY file (position and normal as float32, red, green, blue); for each its number of views and
+ * their indices. */
+void write_points(const fused_rows *rows, const point_frame *frame, uint8_t *points, uint32_t *visibility);
+
+#endif

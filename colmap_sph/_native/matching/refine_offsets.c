@@ -1,0 +1,210 @@
+/* Sub-pixel refinement.
+ *
+ * Around each pixel a plane is fitted to the offsets of its own surface. Raw matching costs, summed over the
+ * window along that plane and one pixel to either side of it, make a V whose tip is where the window really
+ * matches. Aggregated costs cannot tell: P1 holds neighbours on the same whole pixel. Neighbouring pixels are
+ * refined side by side, each in a lane of its own. */
+#include <stdlib.h>
+#include <string.h>
+
+#include "matching/matching.h"
+#include "version.h"
+
+enum {
+    RADIUS = 2,
+    SIDE = 2 * RADIUS + 1,
+    MIN_COUNT = 6,
+    LARGEST = 1 << 24, /* offset of 65536 pixels */
+    NONE = 1 << 28,    /* stands for what is no offset: beyond any reach */
+    REACH = 2,         /* costs are kept for this many target pixels to either side of a pixel's offset */
+    COST_BITS = 6
+};
+
+/* Offsets of a row, RADIUS before the first and beyond the last block, NONE where a pixel cannot be used;
+ * and for each the costs of 2 REACH + 1 target pixels around it, COST_BITS each, the leftmost lowest. */
+typedef struct {
+    int32_t *offset;
+    uint32_t *costs;
+} window_row;
+
+/* GCC's and Clang's vectors, whose comparisons give 0 or -1. */
+typedef int32_t lanes __attribute__((vector_size(4 * LANES)));
+typedef uint32_t unsigned_lanes __attribute__((vector_size(4 * LANES)));
+typedef float float_lanes __attribute__((vector_size(4 * LANES)));
+typedef double double_lanes __attribute__((vector_size(8 * LANES)));
+
+/* Gradient and value at the centre, in 1/256 of the unit of offsets, relative to the centre's offset. */
+typedef struct {
+    lanes value, dx, dy;
+    lanes found;
+} offset_planes;
+
+static inline lanes load_lanes(const void *p) {
+    lanes v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+
+static inline lanes absolute(lanes v) { return (v ^ (v >> 31)) - (v >> 31); }
+
+static inline lanes choose(lanes condition, lanes yes, lanes no) { return (condition & yes) | (~condition & no); }
+
+/* Whole quotients of numbers below 2^24 with few digits before the point: rounding lifts none to the next. */
+static inline lanes quotient(lanes a, lanes b) {
+    return __builtin_convertvector(
+        __builtin_convertvector(a, float_lanes) / __builtin_convertvector(b, float_lanes), lanes);
+}
+
+/* Nearest multiple of 256, divided by it; compilers shift negative numbers so that they round down. */
+static inline int32_t nearest_256(int32_t value) { return (value + 128) >> 8; }
+
+static inline lanes nearest_256_lanes(lanes value) { return (value + 128) >> 8; }
+
+/* Within the widest row; OFFSET_INVALID is not. */
+static inline int is_offset(int32_t offset) { return offset >= -LARGEST && offset <= LARGEST; }
+
+static inline void read_row(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                            match_size size, ptrdiff_t y, window_row row) {
+    for (ptrdiff_t x = -RADIUS; x < size.width + RADIUS + LANES; x++) {
+        row.offset[x] = NONE;
+        row.costs[x] = 0;
+    }
+    if (y < 0 || y >= size.height) {
+        return;
+    }
+    for (ptrdiff_t x = 0; x < size.width; x++) {
+        const int32_t o = offset[y * size.width + x];
+        const ptrdiff_t column = x + nearest_256(is_offset(o) ? o : 0);
+        if (!is_offset(o) || column < REACH || column + REACH >= size.target_width) {
+            continue;
+        }
+        const uint64_t word = reference[y * size.width + x], *t = target + y * size.target_width + column - REACH;
+        uint64_t invalid = 0;
+        uint32_t costs = 0;
+        for (int k = 0; k <= 2 * REACH; k++) {
+            invalid |= t[k] & CENSUS_INVALID;
+            costs |= (uint32_t)__builtin_popcountll(word ^ t[k]) << COST_BITS * k;
+        }
+        if (!invalid) {
+            row.offset[x] = o;
+            row.costs[x] = costs;
+        }
+    }
+}
+
+/* Least-squares planes through the offsets within reach of the centre's; `difference` are offsets minus that. */
+static inline offset_planes fit_offsets(lanes difference[SIDE][SIDE]) {
+    lanes n = {0}, sx = {0}, sy = {0}, sxx = {0}, sxy = {0}, syy = {0}, so = {0}, sxo = {0}, syo = {0};
+    for (int j = 0; j < SIDE; j++) {
+        const int dy = j - RADIUS;
+        lanes count = {0}, count_x = {0}, sum = {0};
+        for (int i = 0; i < SIDE; i++) {
+            const int dx = i - RADIUS, ring = abs(dx) > abs(dy) ? abs(dx) : abs(dy);
+            const lanes kept = absolute(difference[j][i]) <= MAX_OFFSET_STEP * ring;
+            const lanes o = difference[j][i] & kept;
+            count -= kept;
+            count_x -= kept * dx;
+            sxx -= kept * (dx * dx);
+            sum += o;
+            sxo += o * dx;
+        }
+        n += count;
+        sx += count_x;
+        sy += count * dy;
+        sxy += count_x * dy;
+        syy += count * (dy * dy);
+        so += sum;
+        syo += sum * dy;
+    }
+    const lanes c00 = sxx * syy - sxy * sxy, c01 = sy * sxy - sx * syy, c02 = sx * sxy - sy * sxx;
+    const lanes c11 = n * syy - sy * sy, c12 = sx * sy - n * sxy, c22 = n * sxx - sx * sx;
+    const lanes determinant = n * c00 + sx * c01 + sy * c02;
+    const lanes solved = (n >= MIN_COUNT) & (determinant > 0);
+#define DOUBLES(v) __builtin_convertvector(v, double_lanes)
+    const double_lanes scale = 256.0 / DOUBLES(choose(solved, determinant, (lanes){0} + 1));
+    const double_lanes o = DOUBLES(so), xo = DOUBLES(sxo), yo = DOUBLES(syo);
+    const double_lanes value = (DOUBLES(c00) * o + DOUBLES(c01) * xo + DOUBLES(c02) * yo) * scale;
+    const double_lanes dx = (DOUBLES(c01) * o + DOUBLES(c11) * xo + DOUBLES(c12) * yo) * scale;
+    const double_lanes dy = (DOUBLES(c02) * o + DOUBLES(c12) * xo + DOUBLES(c22) * yo) * scale;
+#undef DOUBLES
+    const lanes v = __builtin_convertvector(value, lanes), vx = __builtin_convertvector(dx, lanes);
+    const lanes vy = __builtin_convertvector(dy, lanes);
+    /* Neighbours nearly on a line say nothing about the centre. What is beyond 32 bits becomes an extreme number.
+     */
+    const int most = 256 * MAX_OFFSET_STEP * SIDE;
+    const lanes found =
+        solved & (v < most) & (v > -most) & (vx < most) & (vx > -most) & (vy < most) & (vy > -most);
+    return (offset_planes){v & found, vx & found, vy & found, found};
+}
+
+/* Refined offsets of pixels of the middle row, the first at x. */
+static inline lanes refine_pixels(const window_row rows[SIDE], ptrdiff_t x, lanes centre) {
+    lanes difference[SIDE][SIDE];
+    for (int j = 0; j < SIDE; j++) {
+        for (int i = 0; i < SIDE; i++) {
+            difference[j][i] = load_lanes(rows[j].offset + x + i - RADIUS) - centre;
+        }
+    }
+    const offset_planes plane = fit_offsets(difference);
+    lanes count = {0}, rounded = {0};
+    unsigned_lanes beside = {0},
+                   on = {0}; /* costs before (from bit 0) and behind (from bit 12) the plane, on it */
+    lanes row_value = plane.value - RADIUS * plane.dy;
+    for (int j = 0; j < SIDE; j++, row_value += plane.dy) {
+        lanes value = row_value - RADIUS * plane.dx;
+        for (int i = 0; i < SIDE; i++, value += plane.dx) {
+            const lanes predicted = nearest_256_lanes(value);
+            const lanes whole = nearest_256_lanes(predicted + centre);
+            /* Whole pixels from the neighbour's own offset to what the plane says. */
+            const lanes step = whole - nearest_256_lanes(difference[j][i] + centre);
+            const lanes kept =
+                (absolute(difference[j][i] - predicted) <= MAX_OFFSET_STEP) & (absolute(step) < REACH);
+            const unsigned_lanes costs = (unsigned_lanes)(load_lanes(rows[j].costs + x + i - RADIUS) & kept) >>
+                                         (unsigned_lanes)(COST_BITS * (step + REACH - 1) & kept);
+            beside += costs & (63 | 63 << 2 * COST_BITS);
+            on += costs >> COST_BITS & 63;
+            count -= kept;
+            rounded += (predicted + centre - whole * 256) & kept;
+        }
+    }
+    const lanes before = (lanes)(beside & 4095), after = (lanes)(beside >> 2 * COST_BITS), at = (lanes)on;
+    const lanes rise = choose(before > after, before, after) - at;
+    const lanes good = plane.found & (count >= MIN_COUNT) & (rise > 0) & (at <= before) & (at <= after);
+    /* Whole pixels lie beside the plane by `rounded / count` on average. A perfect match is at whole pixels. */
+    const lanes one = (lanes){0} + 1;
+    const lanes tip = quotient((before - after) * 128, choose(good, rise, one)) & (at != 0);
+    const lanes change = nearest_256_lanes(plane.value) + tip - quotient(rounded, choose(good, count, one));
+    return centre + (change & good & (absolute(change) <= MAX_REFINEMENT));
+}
+
+int VERSION_OF(refine_offsets)(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                               match_size size, int32_t *refined) {
+    const ptrdiff_t stride = size.width + 2 * RADIUS + LANES;
+    int32_t *offsets = malloc((size_t)(SIDE * stride) * sizeof *offsets);
+    uint32_t *costs = malloc((size_t)(SIDE * stride) * sizeof *costs);
+    const int failed = !offsets || !costs;
+    window_row rows[SIDE];
+    for (int j = 0; j < SIDE && !failed; j++) {
+        rows[j] = (window_row){offsets + j * stride + RADIUS, costs + j * stride + RADIUS};
+        read_row(offset, reference, target, size, j - RADIUS, rows[j]);
+    }
+    for (ptrdiff_t y = 0; y < size.height && !failed; y++) {
+        for (ptrdiff_t x = 0; x < size.width; x += LANES) {
+            const lanes centre = load_lanes(rows[RADIUS].offset + x), none = centre == NONE;
+            const lanes result = refine_pixels(rows, x, centre & ~none);
+            const ptrdiff_t p = y * size.width + x, left = size.width - x;
+            for (ptrdiff_t l = 0; l < (left < LANES ? left : LANES); l++) {
+                refined[p + l] = none[l] ? offset[p + l] : result[l];
+            }
+        }
+        const window_row oldest = rows[0];
+        for (int j = 0; j + 1 < SIDE; j++) {
+            rows[j] = rows[j + 1];
+        }
+        rows[SIDE - 1] = oldest;
+        read_row(offset, reference, target, size, y + RADIUS + 1, oldest);
+    }
+    free(offsets);
+    free(costs);
+    return failed ? -1 : 0;
+}

@@ -1,0 +1,160 @@
+#include "matching/rows.h"
+
+#include <stdlib.h>
+#include <string.h>
+
+uint64_t *cost_row_buffer(match_size size) {
+    /* Three words per pixel: room for 17 planes of bytes, whose lines are filled up. */
+    const size_t padded_width = (size_t)(size.target_width + 2 * size.depth) + 128;
+    return malloc(3 * padded_width * sizeof(uint64_t));
+}
+
+int selection_begin(selection_buffers *buffers, match_size size) {
+    /* Three more, as vectorised versions read four at once. */
+    const ptrdiff_t best_sums = size.target_width + 2 * size.depth + 3;
+    buffers->winner = malloc((size_t)size.width * sizeof(int32_t) + (size_t)best_sums);
+    buffers->best_sum = buffers->winner ? (uint8_t *)(buffers->winner + size.width) : NULL;
+    return buffers->winner ? 0 : -1;
+}
+
+int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
+                 const int32_t *base, match_size size, uint8_t *cost) {
+    uint64_t *buffer = cost_row_buffer(size);
+    const int status = buffer ? 0 : -1;
+    for (ptrdiff_t y = 0; !status && y < size.height; y++) {
+        kernels->cost_row(reference + y * size.width, target + y * size.target_width, base + y * size.width, size,
+                          buffer, cost + y * size.width * size.depth);
+    }
+    free(buffer);
+    return status;
+}
+
+int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_t *base, const uint8_t *image,
+                   match_size size, path_penalties penalties, uint8_t *detours, uint8_t *aggregated) {
+    for (int backward = 0; backward < 2; backward++) {
+        sweep_state state;
+        if (kernels->sweep_begin(&state, base, image, size, penalties, backward)) {
+            return -1;
+        }
+        const ptrdiff_t y = backward ? size.height - 1 : 0, row = y * size.width * size.depth;
+        if (size.height > 0) {
+            kernels->sweep_rows(&state, y, size.height, cost + row, detours + row,
+                                backward ? aggregated + row : NULL);
+        }
+        free(state.memory);
+    }
+    return 0;
+}
+
+int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
+                const uint64_t *reference, const uint64_t *target, match_size size, left_right_check check,
+                int32_t *offset) {
+    selection_buffers buffers;
+    if (selection_begin(&buffers, size)) {
+        return -1;
+    }
+    for (ptrdiff_t y = 0; y < size.height; y++) {
+        const ptrdiff_t row = y * size.width;
+        kernels->selection_row(aggregated + row * size.depth, base + row, reference + row,
+                               target + y * size.target_width, size, check, &buffers, offset + row);
+    }
+    free(buffers.winner);
+    return 0;
+}
+
+/* ---- the matcher ------------------------------------------------------------------------------------------- */
+
+typedef struct {
+    const row_kernels *kernels;
+    const match_input *input;
+    ptrdiff_t row_size, band_rows;
+    uint64_t *cost_buffer;
+    uint8_t *row_sums;
+    selection_buffers selection;
+    sweep_state forward, backward;
+    uint8_t *checkpoints; /* what the forward sweep brings to each band but the first */
+} matcher;
+
+/* A group is as many rows as are swept at once and still are in the cache for the next step. */
+enum { GROUP = 2 };
+
+static void forward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost, uint8_t *detours) {
+    const match_input *in = m->input;
+    for (ptrdiff_t r = y; r < y + rows; r++) {
+        m->kernels->cost_row(in->reference + r * in->size.width, in->target + r * in->size.target_width,
+                             in->base + r * in->size.width, in->size, m->cost_buffer,
+                             cost + (r - y) * m->row_size);
+    }
+    m->kernels->sweep_rows(&m->forward, y, rows, cost, detours, NULL);
+}
+
+/* Rows up to y, whose costs and forward detours are given. */
+static void backward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, const uint8_t *cost, uint8_t *detours,
+                          int32_t *offset) {
+    const match_input *in = m->input;
+    uint8_t *row_sums = m->row_sums + (rows - 1) * m->row_size;
+    m->kernels->sweep_rows(&m->backward, y, rows, cost, detours, row_sums);
+    for (ptrdiff_t r = 0; r < rows; r++) {
+        const ptrdiff_t row = (y - r) * in->size.width;
+        m->kernels->selection_row(row_sums - r * m->row_size, in->base + row, in->reference + row,
+                                  in->target + (y - r) * in->size.target_width, in->size, in->check, &m->selection,
+                                  offset + row);
+    }
+}
+
+static ptrdiff_t lesser(ptrdiff_t a, ptrdiff_t b) { return a < b ? a : b; }
+
+/* The last band first. Its forward sweep starts from what was noted when the rows above it were swept for that
+ * alone: the result is that of one piece, to the bit. */
+static void match_bands(matcher *m, ptrdiff_t bands, uint8_t *cost, int32_t *offset) {
+    const ptrdiff_t height = m->input->size.height, row_size = m->row_size;
+    uint8_t *detours = cost + m->band_rows * row_size;
+    for (ptrdiff_t band = 0; band < bands - 1; band++) {
+        const ptrdiff_t first = band * m->band_rows;
+        for (ptrdiff_t n = 0; n < m->band_rows; n += GROUP) {
+            forward_rows(m, first + n, lesser(GROUP, m->band_rows - n), cost, detours);
+        }
+        memcpy(m->checkpoints + (size_t)band * m->forward.memory_size, m->forward.memory, m->forward.memory_size);
+    }
+    for (ptrdiff_t band = bands - 1; band >= 0; band--) {
+        const ptrdiff_t first = band * m->band_rows, count = lesser(m->band_rows, height - first);
+        m->forward.done = first;
+        if (band > 0) {
+            memcpy(m->forward.memory, m->checkpoints + (size_t)(band - 1) * m->forward.memory_size,
+                   m->forward.memory_size);
+        }
+        for (ptrdiff_t n = 0; n < count; n += GROUP) {
+            forward_rows(m, first + n, lesser(GROUP, count - n), cost + n * row_size, detours + n * row_size);
+        }
+        for (ptrdiff_t n = count; n > 0; n -= lesser(GROUP, n)) {
+            backward_rows(m, first + n - 1, lesser(GROUP, n), cost + (n - 1) * row_size,
+                          detours + (n - 1) * row_size, offset);
+        }
+    }
+}
+
+int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band_rows, uint8_t *scratch,
+               int32_t *offset) {
+    const ptrdiff_t bands = in->size.height > 0 ? (in->size.height + band_rows - 1) / band_rows : 0;
+    matcher m = {.kernels = kernels, .input = in, .band_rows = band_rows};
+    m.row_size = in->size.width * in->size.depth;
+    int status = -1;
+    if (!kernels->sweep_begin(&m.forward, in->base, in->image, in->size, in->penalties, 0) &&
+        !kernels->sweep_begin(&m.backward, in->base, in->image, in->size, in->penalties, 1) &&
+        !selection_begin(&m.selection, in->size)) {
+        m.cost_buffer = cost_row_buffer(in->size);
+        m.row_sums = malloc(((size_t)(m.row_size * GROUP) + 1) * sizeof *m.row_sums);
+        m.checkpoints = malloc((size_t)(bands > 1 ? bands - 1 : 1) * m.forward.memory_size);
+        if (m.cost_buffer && m.row_sums && m.checkpoints) {
+            match_bands(&m, bands, scratch, offset);
+            status = 0;
+        }
+    }
+    free(m.checkpoints);
+    free(m.row_sums);
+    free(m.cost_buffer);
+    free(m.selection.winner);
+    free(m.backward.memory);
+    free(m.forward.memory);
+    return status;
+}

@@ -1,0 +1,76 @@
+#include <stdlib.h>
+
+#include "matching/rows.h"
+
+/* Equiangular ("V") fit through three costs, 1/256 pixel, within [-128, 128]. Where every path matches to the bit
+ * the images differ by whole pixels: without motion the offset is exactly zero. */
+static int32_t subpixel_offset(uint8_t before, uint8_t best, uint8_t after) {
+    const int32_t rise = (before > after ? before : after) - best;
+    if (rise <= 0 || best == 0) {
+        return 0;
+    }
+    return ((int32_t)before - after) * 128 / rise;
+}
+
+/* Least sum of every target pixel of the row: the other direction of the left-right check, read off the same
+ * volume along x + base + i = constant. */
+static void match_target_row(const uint8_t *sums, const int32_t *base, const uint64_t *reference, match_size size,
+                             uint8_t *best_sum) {
+    for (ptrdiff_t r = 0; r < size.target_width; r++) {
+        best_sum[r] = UINT8_MAX;
+    }
+    for (ptrdiff_t x = 0; x < size.width; x++) {
+        if (reference[x] & CENSUS_INVALID) {
+            continue;
+        }
+        for (ptrdiff_t i = 0; i < size.depth; i++) {
+            const ptrdiff_t r = x + base[x] + i;
+            if (r >= 0 && r < size.target_width && sums[x * size.depth + i] < best_sum[r]) {
+                best_sum[r] = sums[x * size.depth + i];
+            }
+        }
+    }
+}
+
+/* Whether one of the best matches of target pixel r lies within `max_difference` columns of x. */
+static int is_mutual(const uint8_t *sums, const int32_t *base, const uint64_t *reference, match_size size,
+                     uint8_t best_sum, ptrdiff_t x, ptrdiff_t r, int32_t max_difference) {
+    const ptrdiff_t first = x < max_difference ? 0 : x - max_difference;
+    for (ptrdiff_t near = first; near < size.width && near - x <= max_difference; near++) {
+        const ptrdiff_t i = r - near - base[near];
+        if (!(reference[near] & CENSUS_INVALID) && i >= 0 && i < size.depth &&
+            sums[near * size.depth + i] == best_sum) {
+            return 1;
+        }
+    }
+    return 0;
+}
+
+static ptrdiff_t first_minimum(const uint8_t *sums, ptrdiff_t depth) {
+    ptrdiff_t best = 0;
+    for (ptrdiff_t i = 1; i < depth; i++) {
+        if (sums[i] < sums[best]) {
+            best = i;
+        }
+    }
+    return best;
+}
+
+void selection_row_scalar(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
+                          const uint64_t *target, match_size size, left_right_check check,
+                          selection_buffers *buffers, int32_t *offset) {
+    match_target_row(sums, base, reference, size, buffers->best_sum);
+    for (ptrdiff_t x = 0; x < size.width; x++) {
+        const uint8_t *own = sums + x * size.depth;
+        const ptrdiff_t best = first_minimum(own, size.depth), r = x + base[x] + best;
+        /* At the end of the range the true minimum may lie beyond it. */
+        const int found =
+            !(reference[x] & CENSUS_INVALID) && best > 0 && best < size.depth - 1 && r >= 0 &&
+            r < size.target_width && !(target[r] & CENSUS_INVALID) &&
+            (own[best] - buffers->best_sum[r] <= check.max_excess ||
+             is_mutual(sums, base, reference, size, buffers->best_sum[r], x, r, check.max_difference));
+        offset[x] =
+            found ? (int32_t)(base[x] + best) * 256 + subpixel_offset(own[best - 1], own[best], own[best + 1])
+                  : OFFSET_INVALID;
+    }
+}

@@ -1,3 +1,0 @@
-/* The scalar code, with more lanes per instruction. */
-#define FIT_PLANES fit_planes_avx2
-#include "normals.inc"

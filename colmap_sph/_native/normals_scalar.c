@@ -1,2 +1,0 @@
-#define FIT_PLANES fit_planes_scalar
-#include "normals.inc"

@@ -1,3 +1,0 @@
-/* The scalar code, with more lanes per instruction. */
-#define ADD_PATCH_EQUATIONS add_patch_equations_avx2
-#include "refinement.inc"

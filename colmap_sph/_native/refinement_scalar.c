@@ -1,2 +1,0 @@
-#define ADD_PATCH_EQUATIONS add_patch_equations_scalar
-#include "refinement.inc"

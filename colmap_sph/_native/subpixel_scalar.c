@@ -1,2 +1,0 @@
-#define REFINE_OFFSETS refine_offsets_scalar
-#include "subpixel.inc"
