@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from compare_workspaces import result_files
 
 from colmap_sph.app.cli import PARTIAL_EXIT_CODE
 from colmap_sph.project.cloud_files import CLOUD_FILES
@@ -165,14 +166,7 @@ def kind_of(path: Path, workspace: Path) -> str:
 
 def num_different(workspace: Path, whole: Path) -> int:
     """Maps and clouds that differ, or that only one of two workspaces has; and leftovers of killed runs."""
-    files = [
-        {
-            path.relative_to(root)
-            for pattern in ("stereo/*_maps/**/*.bin", "fused.ply*", "colmap_sph/local/fused.ply")
-            for path in root.glob(pattern)
-        }
-        for root in (workspace, whole)
-    ]
+    files = [result_files(root) for root in (workspace, whole)]
     missing = {Path(name) for name in CLOUD_FILES} - files[1]
     assert not missing, f"{whole} has no {missing}"
     same = [filecmp.cmp(workspace / name, whole / name, shallow=False) for name in files[0] & files[1]]
