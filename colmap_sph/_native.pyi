@@ -17,6 +17,7 @@ def aggregation(
     p1: int,
     p2: Array,
     max_slant: int,
+    detours: Array,
     aggregated: Array,
     /,
 ) -> None: ...

@@ -436,7 +436,7 @@ def test_what_cannot_be_fused_is_named(what, kind, tmp_path):
 
 def test_unknown_method():
     with pytest.raises(OptionError, match="'best-pixel' or 'colmap', not 'pmvs'"):
-        FusionOptions(method="pmvs").check()
+        FusionOptions(method="pmvs").check()  # type: ignore[arg-type]  # as untyped code may
 
 
 def test_reprojection_takes_no_points_from_us(workspace):

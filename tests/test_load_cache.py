@@ -1,6 +1,7 @@
 """The cache that workers share: each value loaded once, no more kept than allowed."""
 
 import threading
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -12,7 +13,8 @@ class Loader:
     """Values of a given size, and a record of the keys asked for."""
 
     def __init__(self, size: int = 10) -> None:
-        self.size, self.loaded = size, []
+        self.size = size
+        self.loaded: list[str] = []
 
     def __call__(self, key: str) -> bytes:
         self.loaded.append(key)
@@ -60,7 +62,7 @@ def test_a_value_larger_than_the_capacity() -> None:
 
 
 def test_a_failure_is_not_kept() -> None:
-    answers = iter([OSError("disk"), b"value"])
+    answers: Iterator[OSError | bytes] = iter([OSError("disk"), b"value"])
 
     def load(key: str) -> bytes:
         answer = next(answers)

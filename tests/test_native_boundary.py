@@ -620,7 +620,7 @@ def fuse_empty(reference, other, matrix):
     """Fuse a map with another, one of which has no pixels, and write its points."""
     maps = [(depth, np.ones((3, *depth.shape), np.float32), np.eye(3)) for depth in (reference, other)]
     shape = reference.shape
-    verdict = [np.zeros(shape, np.uint8), np.zeros(shape, np.uint64), np.zeros((*shape, 3), np.uint16)]
+    verdict = (np.zeros(shape, np.uint8), np.zeros(shape, np.uint64), np.zeros((*shape, 3), np.uint16))
     image = np.ones((*other.shape, 3), np.uint8)
     _native.fuse_partner(*maps[0], *maps[1], image, matrix, np.eye(3), 0.5, 0.01, 0.9, True, 63, *verdict)
     assert not any(array.any() for array in verdict)

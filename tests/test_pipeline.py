@@ -24,7 +24,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import find_database, workspace_root
 from colmap_sph.pipeline.stages import _MATCH_BYTES, check_views, estimate_views, match_pairs
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
-from colmap_sph.project.pair_lists import read_patch_match_cfg, write_patch_match_cfg
+from colmap_sph.project.pair_lists import SourceImages, read_patch_match_cfg, write_patch_match_cfg
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
@@ -81,7 +81,7 @@ def test_every_image_has_maps_close_to_the_truth(block: DemoBlock, finished: Fin
         assert scores.within[0] > 0.8, name
         assert scores.within[1] > 0.88, name
         assert scores.median_error < 0.25, name
-        assert scores.median_normal_angle < 8, name
+        assert scores.median_normal_angle is not None and scores.median_normal_angle < 8, name
         assert finished.report.coverage[name] == np.mean(depth > 0)
     coverage, within = median_scores(block, finished.dense)
     assert coverage > 0.72
@@ -204,7 +204,11 @@ def test_workspace_of_colmap(project: Path) -> None:
 def test_explicit_patch_match_cfg_is_obeyed(project: Path) -> None:
     dense = project / "dense"
     workspace = prepare_workspace(project / "sparse/0", None, dense, UndistortionOptions())
-    sources = {"N_0_1.jpg": ["N_0_0.jpg", "N_0_2.jpg"], "N_1_1.jpg": ["N_0_1.jpg"], "R_0.jpg": 1}
+    sources: dict[str, SourceImages] = {
+        "N_0_1.jpg": ["N_0_0.jpg", "N_0_2.jpg"],
+        "N_1_1.jpg": ["N_0_1.jpg"],
+        "R_0.jpg": 1,
+    }
     write_patch_match_cfg(workspace.patch_match_cfg_path, sources)
     report = colmap_sph.run(workspace=dense, options=FEW_PAIRS)
     assert report.pair_source == "patch-match.cfg"
@@ -427,7 +431,7 @@ def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:
         {"workspace": Path("dense"), "options": RunOptions(undistortion=UndistortionOptions(1000))},
         {"model": Path("sparse/0"), "options": RunOptions(threads=-1)},
         {"model": Path("sparse/0"), "options": RunOptions(threads=2000)},
-        {"model": Path("sparse/0"), "options": RunOptions(fusion_input="depth")},  # type: ignore[arg-type]
+        {"model": Path("sparse/0"), "options": RunOptions(fusion_input="depth")},  # type: ignore[arg-type]  # as untyped code may
         {"model": Path("sparse/0"), "options": RunOptions(pairs=PairOptions(num_pairs=0))},
         {"model": Path("sparse/0"), "options": RunOptions(fusion=FusionOptions(min_num_pixels=0))},
         {"model": Path("sparse/0"), "options": RunOptions(vote=VoteOptions(min_support=0))},

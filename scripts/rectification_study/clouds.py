@@ -35,6 +35,7 @@ def against_lidar(
     result: dict[str, Any] = {}
     for model, run in runs.items():
         cloud = read_geometry(run.workspace.fused_path)
+        assert isinstance(cloud, PointCloud)
         result[model] = {"cloud": evaluate_cloud(cloud, reference, options).as_dict()}
         if surface is None or surface_index is None:
             continue
