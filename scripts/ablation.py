@@ -102,6 +102,7 @@ def sparse_scores(arguments: argparse.Namespace, folder: Path, report: dict[str,
 
 
 def main() -> None:
+    """Run the variants, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, required=True, help="COLMAP sparse model, images beside or above it")
     parser.add_argument("--output", type=Path, required=True, help="folder for the workspaces; grows large")

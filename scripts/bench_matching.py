@@ -134,6 +134,7 @@ def measure(folder: Path) -> dict[str, Score]:
 
 
 def main() -> None:
+    """Match every pair, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = Path(os.environ.get("COLMAP_SPH_DATA", Path(__file__).parents[2] / "shared" / "data"))
     parser.add_argument("--pairs", type=Path, default=default / "stereo_pairs")

@@ -301,7 +301,7 @@ DAMAGED = {
 def test_what_is_damaged_is_made_again(what: str, damage: Callable[[Path], None], finished: Finished) -> None:
     pattern, made = DAMAGED[what]
     before = results(finished.dense)
-    damage(sorted(finished.dense.glob(pattern))[0])
+    damage(min(finished.dense.glob(pattern)))
     report = finished.rerun()
     assert report.made == NOTHING | made
     assert report.skipped_images == {}
