@@ -93,7 +93,7 @@ _MODULE_OF = {
     "write_depth_map": "project.map_files",
     "write_normal_map": "project.map_files",
 }
-__all__ = sorted(_MODULE_OF)
+__all__ = list(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
-from benchmarking import machine, table
+from benchmarking import PARTIAL_EXIT_CODE, machine, table
 from scipy.spatial import cKDTree
 
 from colmap_sph.scene import POINT
@@ -54,7 +54,7 @@ _MIN_TRACK, _MAX_ERROR = 5, 0.7
 def run(command: list[str]) -> None:
     """Run the program; end with its message where it fails."""
     done = subprocess.run([sys.executable, "-m", "colmap_sph", *command], capture_output=True, text=True)
-    if done.returncode not in (0, 5):  # 5: some images have no depth map
+    if done.returncode not in (0, PARTIAL_EXIT_CODE):
         sys.exit(f"colmap_sph {' '.join(command)} failed:\n{done.stdout}{done.stderr}")
 
 
@@ -102,6 +102,7 @@ def sparse_scores(arguments: argparse.Namespace, folder: Path, report: dict[str,
 
 
 def main() -> None:
+    """Run the variants, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", type=Path, required=True, help="COLMAP sparse model, images beside or above it")
     parser.add_argument("--output", type=Path, required=True, help="folder for the workspaces; grows large")

@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import cv2
@@ -148,7 +149,7 @@ def make_scene(width: int, height: int, depth: int, *, same_range: bool, seed: i
         plane = rng.uniform(0.5, 0.75) + slope_x * (x - left) + slope_y * (y - top)
         share = np.where(inside, plane, share)
     disparity = (depth * np.clip(share, 0.1, 0.9)).astype(np.float32)
-    right = cv2.GaussianBlur(rng.normal(0, 1, (height, width)).astype(np.float32), None, 1.2)
+    right = cv2.GaussianBlur(rng.normal(0, 1, (height, width)).astype(np.float32), (0, 0), 1.2)
     columns, rows = np.meshgrid(np.arange(width, dtype=np.float32), np.arange(height, dtype=np.float32))
     left = cv2.remap(right, columns - disparity, rows, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     images = [np.clip(128 + 180 * image + rng.normal(0, 2, image.shape), 0, 255) for image in (left, right)]
@@ -207,7 +208,12 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
     def match(backend: str) -> None:
         _native.match(backend, left, right, base, image, p1, P2, slant, *limits, scratch, matched)
 
-    steps = [(matching_cost, cost), (aggregation, sums), (selection, selected), (match, matched)]
+    steps: list[tuple[Callable[[str], None], NDArray[Any]]] = [
+        (matching_cost, cost),
+        (aggregation, sums),
+        (selection, selected),
+        (match, matched),
+    ]
     return [Kernel(call.__name__, call, [output], cost.size, scene.depth) for call, output in steps]
 
 
@@ -256,20 +262,18 @@ def image_kernels(scene: Scene) -> list[Kernel]:
 def partner_kernels(scene: Scene) -> list[Kernel]:
     """The kernels that compare a view with its partners: the right camera stands one unit beside the left one."""
     focal, shape, pixels = float(scene.shape[1]), scene.shape, scene.base.size
-    beside = np.hstack([np.eye(3), [[-focal], [0], [0]]])
+    beside = np.column_stack([np.eye(3), [-focal, 0, 0]])
     from_right, back = np.empty(shape, np.float32), beside * np.where(np.arange(4) == 3, -1, 1)
     _native.transfer_disparity(scene.disparity, 2.0, from_right)
-    maps = []
-    for disparity in (scene.disparity, from_right):
-        known = np.where(disparity > 0, disparity, np.inf)  # no depth: 0
-        maps += [(focal / known).astype(np.float32), (0.3 * focal / known**2).astype(np.float32)]
+    known = [np.where(map_ > 0, map_, np.inf) for map_ in (scene.disparity, from_right)]  # no depth: 0
+    maps = [((focal / one).astype(np.float32), (0.3 * focal / one**2).astype(np.float32)) for one in known]
     support = np.full(shape, 2, np.uint8)
     counts, sums = np.empty((3, *shape), np.uint8), np.empty((2, *shape), np.float32)
 
     def check_consistency(backend: str) -> None:
         counts.fill(0)
         sums.fill(0)
-        _native.check_consistency(backend, *maps, support, beside, back, 2.0, 4.5, 2, *counts, *sums)
+        _native.check_consistency(backend, *maps[0], *maps[1], support, beside, back, 2.0, 4.5, 2, *counts, *sums)
 
     inverse = scene.disparity / focal
     planes = np.stack([inverse, *np.gradient(inverse)[::-1]]).astype(np.float32)
@@ -280,8 +284,10 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
         equations.fill(0)
         _native.add_patch_equations(backend, scene.left, sources, transfers, planes, 0, 1, 20.0, 0.5, equations)
 
-    steps = [(check_consistency, [counts, sums], pixels), (add_patch_equations, [equations], SOURCES * pixels)]
-    return [Kernel(call.__name__, call, outputs, work) for call, outputs, work in steps]
+    return [
+        Kernel("check_consistency", check_consistency, [counts, sums], pixels),
+        Kernel("add_patch_equations", add_patch_equations, [equations], SOURCES * pixels),
+    ]
 
 
 def check_equality(kernel: Kernel, backends: Sequence[str]) -> None:
@@ -291,7 +297,7 @@ def check_equality(kernel: Kernel, backends: Sequence[str]) -> None:
         for output in kernel.outputs:
             output.view(np.uint8).fill(0xA5)  # what one version leaves unwritten must not pass for its result
         kernel.call(backend)
-        digests[backend] = [hashlib.blake2b(output).digest() for output in kernel.outputs]
+        digests[backend] = [hashlib.blake2b(output.data).digest() for output in kernel.outputs]
     different = [backend for backend in backends if digests[backend] != digests[backends[-1]]]
     if different:
         at = f" with {kernel.depth} disparities" if kernel.depth else ""
@@ -337,7 +343,7 @@ def opencv_matcher(mode: str, depth: int) -> cv2.StereoSGBM:
 
 def time_kernel(kernel: Kernel, backends: Sequence[str], runs: int) -> Timing:
     """Time all versions of a kernel."""
-    seconds = [median_seconds(lambda b=backend: kernel.call(b), runs) for backend in backends]
+    seconds = [median_seconds(partial(kernel.call, backend), runs) for backend in backends]
     return Timing(kernel.name, kernel.depth, kernel.work, seconds)
 
 
@@ -355,7 +361,7 @@ def time_matchers(scene: Scene, ours: Kernel, ours_seconds: float, runs: int) ->
     for mode in OPENCV_MODES:
         matcher = opencv_matcher(mode, scene.depth)
         found = matcher.compute(scene.left, scene.right).astype(np.float32) / 16
-        seconds = median_seconds(lambda m=matcher: m.compute(scene.left, scene.right), runs)
+        seconds = median_seconds(partial(matcher.compute, scene.left, scene.right), runs)
         results[f"OpenCV MODE_{mode}"] = seconds, share_right(scene, np.where(found < 0, np.nan, found))
     hh_seconds = results["OpenCV MODE_HH"][0]
     return [

@@ -18,6 +18,7 @@ import argparse
 import os
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -29,6 +30,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
 
+Image = NDArray[np.uint8]
 _BLOCK = 3
 _BINS = 10
 
@@ -46,20 +48,18 @@ class Score:
     seconds: float
 
 
-def ours(
-    left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: int, options: MatchingOptions
-) -> NDArray[np.float32]:
+def ours(left: Image, right: Image, low: int, high: int, options: MatchingOptions) -> NDArray[np.float32]:
     """Disparities by `colmap_sph.matching`; NaN = none."""
-    images = [
-        RectifiedImage(
-            cv2.cvtColor(image.astype(np.float32), cv2.COLOR_BGR2GRAY), np.full(image.shape[:2], 255, np.uint8)
-        )
-        for image in (left, right)
-    ]
-    return match_pair(*images, low, high, options)
+    return match_pair(whole_image(left), whole_image(right), low, high, options)
 
 
-def opencv(left: NDArray[np.uint8], right: NDArray[np.uint8], low: int, high: int) -> NDArray[np.float32]:
+def whole_image(image: Image) -> RectifiedImage:
+    """A colour image in grey, content everywhere."""
+    grey = np.asarray(cv2.cvtColor(image.astype(np.float32), cv2.COLOR_BGR2GRAY), dtype=np.float32)
+    return RectifiedImage(grey, np.full(grey.shape, 255, np.uint8))
+
+
+def opencv(left: Image, right: Image, low: int, high: int) -> NDArray[np.float32]:
     """Disparities by OpenCV with the settings of its own sample, 8 paths and colour; NaN = none."""
     count = -(-(high - low + 1) // 16) * 16
     matcher = cv2.StereoSGBM.create(
@@ -104,36 +104,37 @@ def score(found: NDArray[np.float32], truth: NDArray[np.float32], seconds: float
         for values in (found, truth)
     ]
     locked = float(np.max(np.abs(shares[0] - shares[1]) * _BINS))
-    counts = [
-        count
+    parts = [
+        (float((matched & chosen).sum() / chosen.sum()), float((error[matched & chosen] > 1).mean()))
         for chosen in (known, seen)
-        for count in ((matched & chosen).sum() / chosen.sum(), float((error[matched & chosen] > 1).mean()))
     ]
-    return Score(*counts, float(np.median(error[matched])), locked, seconds)
+    return Score(*parts[0], *parts[1], float(np.median(error[matched])), locked, seconds)
 
 
 def measure(folder: Path) -> dict[str, Score]:
     """Scores of the matchers on the pair in `folder`."""
-    left, right = (cv2.imread(str(folder / f"{side}.png")) for side in ("left", "right"))
+    left = cv2.imread(str(folder / "left.png"))
+    right = cv2.imread(str(folder / "right.png"))
     with np.load(folder / "disparity.npz") as data:
         truth = data["disparity"]
     if left is None or right is None or left.shape[:2] != truth.shape:
         sys.exit(f"{folder}: left.png, right.png and the array in disparity.npz must be there and of one size.")
     low, high = int(np.floor(np.nanmin(truth))), int(np.ceil(np.nanmax(truth)))
     scores = {}
-    matchers = {
+    matchers: dict[str, Callable[[Image, Image, int, int], NDArray[np.float32]]] = {
         "ours": partial(ours, options=SINGLE_PAIR),
         "OpenCV HH": opencv,
         "ours, to vote": partial(ours, options=MatchingOptions()),
     }
     for name, matcher in matchers.items():
         start = time.perf_counter()
-        found = matcher(left, right, low, high)
+        found = matcher(np.asarray(left, np.uint8), np.asarray(right, np.uint8), low, high)
         scores[name] = score(found, truth, time.perf_counter() - start)
     return scores
 
 
 def main() -> None:
+    """Match every pair, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     default = Path(os.environ.get("COLMAP_SPH_DATA", Path(__file__).parents[2] / "shared" / "data"))
     parser.add_argument("--pairs", type=Path, default=default / "stereo_pairs")

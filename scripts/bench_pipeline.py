@@ -10,21 +10,16 @@ import argparse
 import itertools
 import json
 import math
-import os
 import statistics
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from benchmarking import machine, table
+from benchmarking import PARTIAL_EXIT_CODE, machine, run_process, table
 
 # A process's peak memory begins, for the system, with that of the process that started it: import nothing large.
-
-PARTIAL_EXIT_CODE = 5  # of `colmap_sph run`: finished, but some images have no depth map
 
 
 @dataclass(frozen=True)
@@ -65,19 +60,6 @@ def command() -> list[str]:
     """The installed command beside this Python, else the package's module."""
     script = Path(sys.executable).parent / "colmap_sph"
     return [str(script)] if script.is_file() else [sys.executable, "-P", "-m", "colmap_sph"]
-
-
-def run_process(arguments: Sequence[str], log: Path) -> tuple[int, float, float, int]:
-    """Exit code, seconds, processor seconds and peak memory (bytes) of a process that writes into `log`."""
-    with log.open("wb") as file:
-        start = time.perf_counter()
-        process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT)
-        # Of this child alone: RUSAGE_CHILDREN has the maximum over all children so far.
-        _, status, usage = os.wait4(process.pid, 0)
-        wall = time.perf_counter() - start
-    process.returncode = os.waitstatus_to_exitcode(status)  # Popen must not wait for it again
-    peak = usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024)
-    return process.returncode, wall, usage.ru_utime + usage.ru_stime, peak
 
 
 def depth_map_pixels(workspace: Path) -> int:

@@ -20,8 +20,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from compare_workspaces import result_files
 
-from colmap_sph.app.cli import PARTIAL_EXIT_CODE
+from colmap_sph.app.run_command import PARTIAL_EXIT_CODE
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.synthetic import make_demo_block
 
@@ -165,14 +166,7 @@ def kind_of(path: Path, workspace: Path) -> str:
 
 def num_different(workspace: Path, whole: Path) -> int:
     """Maps and clouds that differ, or that only one of two workspaces has; and leftovers of killed runs."""
-    files = [
-        {
-            path.relative_to(root)
-            for pattern in ("stereo/*_maps/**/*.bin", "fused.ply*", "colmap_sph/local/fused.ply")
-            for path in root.glob(pattern)
-        }
-        for root in (workspace, whole)
-    ]
+    files = [result_files(root) for root in (workspace, whole)]
     missing = {path.relative_to(whole) for path in Workspace(whole).cloud_paths} - files[1]
     assert not missing, f"{whole} has no {missing}"
     same = [filecmp.cmp(workspace / name, whole / name, shallow=False) for name in files[0] & files[1]]

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import InputError
@@ -29,7 +30,7 @@ ALLOWED = (TypeError, ValueError, OverflowError, MemoryError)
 DTYPES = (np.uint8, np.int8, np.uint16, np.int32, np.uint64, np.float32, np.float64, np.complex64, np.bool_)
 FLOATS = (np.nan, np.inf, -np.inf, 0.0, -0.0, -1.0, 0.5, 1e-300, 5e-324, 1e30, -1e300)
 INTEGERS = (-(2**63), -(2**31), -1, 0, 1, 17, 255, 256, 2**31 - 1, 2**31, 2**63, 2**70)
-ODD_OBJECTS = (None, "text", b"bytes", [1, 2], (), {}, 1.5, 3, True)
+ODD_OBJECTS: tuple[object, ...] = (None, "text", b"bytes", [1, 2], (), {}, 1.5, 3, True)
 
 
 # ---- valid arguments ---------------------------------------------------------------------------------------
@@ -42,7 +43,7 @@ def filled(rng: Random, shape: tuple[int, ...], dtype: type) -> np.ndarray:
         return (
             np.frombuffer(rng.bytes(int(np.prod(shape)) * np.dtype(dtype).itemsize), dtype).reshape(shape).copy()
         )
-    array = rng.integers(0, 60, shape).astype(dtype)
+    array: NDArray[Any] = rng.integers(0, 60, shape).astype(dtype)
     if kind == 1 and array.size and array.dtype.kind == "f":
         with np.errstate(over="ignore"):
             array.flat[int(rng.integers(array.size))] = FLOATS[int(rng.integers(len(FLOATS)))]

@@ -89,8 +89,10 @@ def main(study: Study) -> None:
         }
 
     figures = [plots.points_per_image(content, study.output), plots.pairs_by_angle(content, study.output)]
-    for pair in pairs.telling_pairs(scored_pairs, study.shown_pairs):
-        figures.append(plots.depth_side_by_side(scene, results, pair, exact, study.run, study.output))
+    figures += [
+        plots.depth_side_by_side(scene, results, pair, exact, study.run, study.output)
+        for pair in pairs.telling_pairs(scored_pairs, study.shown_pairs)
+    ]
     write_json(study.output / "study.json", {**content, "options": runs.plain(study.run)})
     (study.output / "study.md").write_text(tables.markdown(content, figures), encoding="utf-8")
     print(f"{study.output / 'study.md'}\n")

@@ -5,6 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_sph.evaluation import PointCloud, read_geometry
+
 FUSED = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
 
 
@@ -18,6 +20,13 @@ def read_fused(path: Path) -> np.ndarray:
     (count,) = (int(line.split()[2]) for line in lines if line.startswith("element vertex"))
     assert len(body) == count * FUSED.itemsize
     return np.frombuffer(body, FUSED)
+
+
+def read_points(path: Path) -> np.ndarray:
+    """(N, 3) points of a cloud in any format."""
+    cloud = read_geometry(path)
+    assert isinstance(cloud, PointCloud)
+    return cloud.points
 
 
 def read_visibility(path: Path) -> list[tuple[int, ...]]:

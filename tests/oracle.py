@@ -82,7 +82,7 @@ def selection(aggregated, base, reference, target, max_difference, max_excess):
     offsets = np.full((height, width), OFFSET_INVALID, dtype=np.int32)
     for y in range(height):
         content = [x for x in range(width) if int(reference[y, x]) < CENSUS_INVALID]
-        best_of_target = {}  # column in the target: (sum, columns in the reference)
+        best_of_target: dict = {}  # column in the target: (sum, columns in the reference)
         for x in content:
             for i in range(depth):
                 r, vote = x + int(base[y, x]) + i, int(aggregated[y, x, i])
@@ -181,7 +181,7 @@ def transfer_disparity(left, max_step, right_width):
     """Disparity map of the right image's columns: the nearest of the surfaces that meet a column."""
     right = np.full((left.shape[0], right_width), np.nan)
     for y, row in enumerate(left.astype(float)):
-        claims = {}  # right column: disparities
+        claims: dict = {}  # right column: disparities
         for x, d in enumerate(row):
             if np.isnan(d):
                 continue

@@ -28,9 +28,16 @@ def pinhole_pixels(block: DemoBlock, name: str, camera: pycolmap.Camera, origin:
     return pixels.reshape(camera.height, camera.width, 2)
 
 
+def read_picture(path: Path, flags: int = cv2.IMREAD_COLOR) -> np.ndarray:
+    """A picture that must be there, as OpenCV reads it."""
+    picture = cv2.imread(str(path), flags)
+    assert picture is not None, path
+    return picture
+
+
 def picture_of(block: DemoBlock, name: str, camera: pycolmap.Camera) -> np.ndarray:
     """The block's picture as another camera in the same place and pose takes it."""
-    picture = cv2.imread(str(block.images_dir / name))
+    picture = read_picture(block.images_dir / name)
     pixels = (pinhole_pixels(block, name, camera, 0.5) - 0.5).astype(np.float32)
     return cv2.remap(picture, pixels[..., 0], pixels[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
@@ -65,7 +72,8 @@ def make_block_project(
     """
     source = pycolmap.Reconstruction(block.sparse_dir)
     by_name = {image.name: image for image in source.images.values()}
-    model, rows = pycolmap.Reconstruction(), {}
+    model = pycolmap.Reconstruction()
+    rows: dict[tuple[int, int], int] = {}
     for number, (name, camera) in enumerate(cameras.items(), start=1):
         image, called = by_name[name], (names or {}).get(name, name)
         camera = pycolmap.Camera(

@@ -5,6 +5,9 @@ import numpy as np
 
 from colmap_sph import synthetic as syn
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.rectified_pair import Side
+
+SIDES: tuple[Side, Side] = ("left", "right")
 
 
 def scene_of(surfaces, cameras, count=600, seed=0, min_track_length=2):

@@ -155,7 +155,7 @@ def test_memory_and_processor_time_are_the_childs_own(tmp_path):
 import json, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[1])
-from bench_pipeline import run_process
+from benchmarking import run_process
 large = [sys.executable, "-c", "b'x' * (300 << 20); import time; time.sleep(1)"]
 small = [sys.executable, "-c", "import time\\nwhile time.process_time() < 0.6: pass"]
 failing = [sys.executable, "-c", "raise SystemExit(7)"]

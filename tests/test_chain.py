@@ -4,7 +4,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from rendered import grey, scene_of
+from rendered import SIDES, grey, scene_of
 
 from colmap_sph import synthetic as syn
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
@@ -30,9 +30,9 @@ def reconstruct(surfaces, light, cameras):
         pair = rectify_pair(scene, left, right, RectificationOptions())
         images = [
             RectifiedImage(*resample(pictures[view.name], view, pair, side))
-            for view, side in ((left, "left"), (right, "right"))
+            for view, side in zip((left, right), SIDES, strict=True)
         ]
-        disparity = match_pair(*images, pair.min_disparity, pair.max_disparity, MatchingOptions())
+        disparity = match_pair(images[0], images[1], pair.min_disparity, pair.max_disparity, MatchingOptions())
         pairs.append(PairDisparity(left.name, right.name, pair, disparity))
     own = {
         view.name: vote_depth(view, [p for p in pairs if view.name in (p.left, p.right)], VoteOptions())

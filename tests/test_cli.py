@@ -467,13 +467,13 @@ def test_dry_run_writes_nothing(small: Path, capsys: pytest.CaptureFixture[str])
     )
     assert "estimates" in words
     assert command(capsys, *RUN, *FAST)[0] == 0
-    before = {path: path.stat().st_mtime_ns for path in small.rglob("*")}
+    stamps = {path: path.stat().st_mtime_ns for path in small.rglob("*")}
     code, output = command(capsys, *RUN, *FAST, "--dry-run", "--fusion.min-num-pixels", "3")
     assert code == 0
     words = " ".join(output.split())
     for line in ("undistort done", "pairs 0 to do, 3 done", "images 0 to do, 3 done", "cloud 1 to do, 0 done"):
         assert line in words
-    assert {path: path.stat().st_mtime_ns for path in small.rglob("*")} == before
+    assert {path: path.stat().st_mtime_ns for path in small.rglob("*")} == stamps
 
 
 def test_an_image_that_cannot_be_fused_is_left_out(small: Path, capsys: pytest.CaptureFixture[str]) -> None:

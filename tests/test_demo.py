@@ -32,6 +32,7 @@ def test_depth_maps_against_exact_depth(result: DemoResult) -> None:
     assert mean.within[0] > 0.87
     assert mean.within[1] > 0.93
     assert mean.median_error < 0.2
+    assert mean.median_normal_angle is not None and mean.normal_coverage is not None
     assert mean.median_normal_angle < 5
     assert mean.normal_coverage > 0.99
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import assert_refused
 from rendered import (
+    SIDES,
     disparities,
     exact_disparity,
     pixel_rays,
@@ -155,7 +156,7 @@ def test_candidates_do_not_depend_on_the_backend(options, monkeypatch):
     scene, left, right = scene_of_pair(synthetic)
     pair = rectify_pair(scene, left, right, options)
     rng = np.random.default_rng(0)
-    for side, view in (("left", left), ("right", right)):
+    for side, view in zip(SIDES, (left, right), strict=True):
         disparity, _ = exact_disparity(synthetic.surfaces, left, right, pair, side)
         disparity += rng.normal(0, 1.5, disparity.shape)
         disparity[rng.random(disparity.shape) < 0.2] = np.nan
@@ -173,7 +174,7 @@ def test_disparities_without_a_point_in_front_give_none():
     scene, left, right = scene_of_pair(synthetic)
     for options in (SPHERE, FRAME):
         pair = rectify_pair(scene, left, right, options)
-        for side, view in (("left", left), ("right", right)):
+        for side, view in zip(SIDES, (left, right), strict=True):
             for value in (np.nan, -pair.disparity_origin, -pair.disparity_origin - 5):
                 flat = np.full((pair.height, pair.width(side)), value, dtype=np.float32)
                 depth, sigma = depth_candidates(view, np.nextafter(flat, np.float32(-1e9)), pair, side, VOTE)
@@ -182,7 +183,8 @@ def test_disparities_without_a_point_in_front_give_none():
 
 def test_surfaces_are_not_mixed_across_a_step():
     """Bilinear within a surface; at a step of more than the limit the nearest pixel's side alone counts."""
-    view = View(1, "a", 200, 8, np.array([[100, 0, 0.0], [0, 100, 0], [0, 0, 1]]), np.eye(3), np.zeros(3), None)
+    K = np.array([[100, 0, 0.0], [0, 100, 0], [0, 0, 1]])
+    view = View(1, "a", 200, 8, K, np.eye(3), np.zeros(3), np.zeros(0, np.int64))
     pair = RectifiedPair("frame", np.eye(3), 1.0, 100.0, 100.0, 0.25, 0.25, 0.25, 8, 200, 200, 0.0, 50.0)
     left, right = 10.0, 13.0
     disparity = np.full((8, 200), left, dtype=np.float32)
@@ -393,12 +395,14 @@ def test_consistency_does_not_depend_on_the_backend(size, shift, odd):
     for values in maps:
         values[rng.random(size) < 0.1] = odd
     support = rng.integers(0, 4, size).astype(np.uint8)
-    forward, back = (np.hstack([np.eye(3), [[sign * 10 * shift], [0], [0]]]) for sign in (1, -1))
+    forward, back = (np.column_stack([np.eye(3), [sign * 10 * shift, 0, 0]]) for sign in (1, -1))
     results = []
     for kernels in _native.backends():
         sums = [np.full(size, counted, np.uint8) for counted in (0, 254, 255)]
         sums += [np.full(size, -0.0, np.float32), np.full(size, 2, np.float32)]
-        _native.check_consistency(kernels, *maps, support, forward, back, 2.0, 4.0, 2, *sums)
+        _native.check_consistency(
+            kernels, maps[0], maps[1], maps[2], maps[3], support, forward, back, 2.0, 4.0, 2, *sums
+        )
         results.append(sums)
     assert results[0][0].any() or size[1] <= abs(shift) + 1
     for other in results[1:]:
@@ -408,17 +412,34 @@ def test_consistency_does_not_depend_on_the_backend(size, shift, odd):
 
 def test_at_the_rim_the_nearest_depth_is_taken():
     """The last column has no neighbours to interpolate with, though points half a pixel before it have."""
-    maps = [np.full((2, 3), 10, np.float32), np.full((2, 3), 0.05, np.float32)]
+    maps = (np.full((2, 3), 10, np.float32), np.full((2, 3), 0.05, np.float32))
     partner = np.array([[10, 10, 10.1], [10, 10, 10.1]], np.float32)
     for shift, carried in ((0.0, 10.1), (-0.5, 1 / (0.5 / 10 + 0.5 / 10.1))):
-        forward, back = (np.hstack([np.eye(3), [[sign * 10 * shift], [0], [0]]]) for sign in (1, -1))
+        forward, back = (np.column_stack([np.eye(3), [sign * 10 * shift, 0, 0]]) for sign in (1, -1))
         for kernels in _native.backends():
-            sums = [np.zeros((2, 3), np.uint8) for _ in range(3)] + [
-                np.zeros((2, 3), np.float32) for _ in range(2)
-            ]
+            counts = [np.zeros((2, 3), np.uint8) for _ in range(3)]
+            sums = [np.zeros((2, 3), np.float32) for _ in range(2)]
             support = np.ones((2, 3), np.uint8)
-            _native.check_consistency(kernels, *maps, partner, maps[1], support, forward, back, 2.0, 4.0, 2, *sums)
-            assert sums[3][0, 2] / sums[4][0, 2] == pytest.approx(carried - 10, rel=1e-4)
+            matrices = (forward, back)
+            sigmas = maps[1]
+            _native.check_consistency(
+                kernels,
+                maps[0],
+                sigmas,
+                partner,
+                sigmas,
+                support,
+                *matrices,
+                2.0,
+                4.0,
+                2,
+                counts[0],
+                counts[1],
+                counts[2],
+                sums[0],
+                sums[1],
+            )
+            assert sums[0][0, 2] / sums[1][0, 2] == pytest.approx(carried - 10, rel=1e-4)
 
 
 def test_exact_maps_confirm_each_other_and_stay_as_they_are():

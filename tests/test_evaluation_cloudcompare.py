@@ -11,8 +11,8 @@ import pytest
 
 from colmap_sph.evaluation import EvaluationOptions, PointCloud, evaluate_cloud, make_reference, read_geometry
 
-CLOUDCOMPARE = shutil.which("CloudCompare") or shutil.which("cloudcompare.CloudCompare")
-pytestmark = pytest.mark.skipif(CLOUDCOMPARE is None, reason="CloudCompare is not installed")
+CLOUDCOMPARE = shutil.which("CloudCompare") or shutil.which("cloudcompare.CloudCompare") or ""
+pytestmark = pytest.mark.skipif(not CLOUDCOMPARE, reason="CloudCompare is not installed")
 
 
 def write_ply(path: Path, points: np.ndarray) -> Path:

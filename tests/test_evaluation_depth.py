@@ -126,12 +126,12 @@ def test_visible_surface_counts_views_and_knows_what_is_hidden():
     # A wall at 10 m, and in front of its middle a screen at 5 m; the second camera stands 1 m to the right.
     wall = np.full((HEIGHT, WIDTH), 10.0)
     depths = []
-    for x in (0.0, 1.0):
+    for eye in (0.0, 1.0):
         depth = wall.copy()
-        # The screen reaches from -1 to 1 m: columns f (X - x) / 5 + 60.
-        left, right = (round(FOCAL * (edge - x) / 5 + 60) for edge in (-1.0, 1.0))
+        # The screen reaches from -1 to 1 m: columns f (X - eye) / 5 + 60.
+        left, right = (round(FOCAL * (edge - eye) / 5 + 60) for edge in (-1.0, 1.0))
         depth[:, left:right] = 5.0
-        depths.append(view(f"camera {x}", x, depth))
+        depths.append(view(f"camera {eye}", eye, depth))
     surface = visible_surface(depths, 0.05)
     counts = count_views(surface, depths)
     on_wall, x = surface[:, 2] > 9, surface[:, 0]

@@ -10,11 +10,11 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from clouds import read_fused, read_visibility
+from clouds import read_fused, read_points, read_visibility
 from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_maps
 
 from colmap_sph.errors import NoResultError, OptionError, OutputError
-from colmap_sph.evaluation import read_geometry
+from colmap_sph.evaluation import Mesh, read_geometry
 from colmap_sph.pipeline import fuse as fuse_module
 from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.context import Context
@@ -30,6 +30,7 @@ from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.pair_lists import write_fusion_cfg
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import POINT
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
 
@@ -43,9 +44,9 @@ def workspace(tmp_path):
 
 def context_of(workspace, scene=None, **options):
     """A run that has come to its last stage."""
-    options = RunOptions(**{"threads": 1, **options})
+    run_options = RunOptions(**{"threads": 1, **options})
     scene = scene or read_scene(workspace.sparse_dir)
-    context = Context(workspace, scene, options, Keys(workspace, options))
+    context = Context(workspace, scene, run_options, Keys(workspace, run_options))
     context.report.coverage = {view.name: 1.0 for view in context.scene.views}
     return context
 
@@ -77,7 +78,8 @@ def seen_as_listed(workspace, image_ids, cloud, visible):
         seen = cloud["xyz"][[number in listed for listed in visible]].astype(float)
         pixel = (seen @ view.R.T + view.t) @ view.K.T
         pixel = pixel[:, :2] / pixel[:, 2:]
-        right += np.count_nonzero(((pixel > -2.6) & (pixel < [view.width + 1.6, view.height + 1.6])).all(axis=1))
+        inside = (pixel > -2.6) & (pixel < [view.width + 1.6, view.height + 1.6])
+        right += int(inside.all(axis=1).sum())
         total += len(seen)
     return right / total
 
@@ -149,13 +151,19 @@ def test_files_are_colmaps_to_the_byte_but_for_their_points(workspace):
     assert len(ours[2]) == 27 * len(read_visibility(workspace.root / "fused.ply.vis"))
 
 
+def read_vertices(path):
+    mesh = read_geometry(path)
+    assert isinstance(mesh, Mesh)
+    return mesh.vertices
+
+
 def test_colmap_meshes_the_cloud(workspace, tmp_path):
     """Its own reader takes points and normals; the mesh lies on the plane."""
     fuse(workspace)
     options = pycolmap.PoissonMeshingOptions()
     options.depth, options.trim, options.num_threads = 6, 0, 1
     pycolmap.poisson_meshing(workspace.fused_path, tmp_path / "mesh.ply", options)
-    vertices = read_geometry(tmp_path / "mesh.ply").vertices
+    vertices = read_vertices(tmp_path / "mesh.ply")
     middle = np.linalg.norm(vertices, axis=1) < 2
     assert middle.sum() > 100
     assert np.abs(vertices[middle] @ NORMAL).max() < GSD
@@ -172,7 +180,7 @@ def test_colmap_program_reads_points_and_visibility(workspace, tmp_path):
     if "CGAL" in done.stderr + done.stdout:
         pytest.skip("this colmap was built without CGAL, which its Delaunay mesher needs")
     assert done.returncode == 0, done.stderr
-    assert np.abs(read_geometry(tmp_path / "mesh.ply").vertices @ NORMAL).max() < 5 * GSD
+    assert np.abs(read_vertices(tmp_path / "mesh.ply") @ NORMAL).max() < 5 * GSD
 
 
 def test_parts_are_joined_in_the_order_given(tmp_path):
@@ -181,7 +189,8 @@ def test_parts_are_joined_in_the_order_given(tmp_path):
     for number, stem in enumerate(stems):
         body = rng.integers(0, 256, (number, 27), dtype=np.uint8)
         listed = np.arange(3 * number, dtype=np.uint32)
-        bands = [(body[:1], listed[:3]), (body[1:], listed[3:])]
+        points = body.view(POINT)[:, 0]
+        bands = [(points[:1], listed[:3]), (points[1:], listed[3:])]
         assert write_part(stem, bands) == number
         bodies.append(body.tobytes())
         words.append(listed.tobytes())
@@ -328,13 +337,13 @@ def test_map_coordinates(workspace, tmp_path):
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))
     model.write_binary(far.sparse_dir)
     fuse(far)
-    near_cloud, far_cloud = (read_geometry(one.fused_path) for one in (workspace, far))
-    np.testing.assert_allclose(far_cloud.points - UTM, near_cloud.points, rtol=0, atol=3e-6)
+    near_points, far_points = (read_points(one.fused_path) for one in (workspace, far))
+    np.testing.assert_allclose(far_points - UTM, near_points, rtol=0, atol=3e-6)
     assert cloud_bytes(far)[1] == cloud_bytes(workspace)[1]
     local = Workspace(far.local_dir)
     origin = np.array([float(word) for word in (local.root / "origin.txt").read_text().split()])
     near = read_fused(local.fused_path)
-    np.testing.assert_allclose(near["xyz"] + origin, far_cloud.points, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(near["xyz"] + origin, far_points, rtol=0, atol=1e-9)
     assert near["rgb"].tobytes() == read_fused(workspace.fused_path)["rgb"].tobytes()
     assert (local.root / "fused.ply.vis").read_bytes() == cloud_bytes(far)[1]
     assert (

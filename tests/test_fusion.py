@@ -442,7 +442,7 @@ def test_what_cannot_be_fused_is_named(what, kind, tmp_path):
 
 
 def test_unknown_method():
-    error = assert_refused(FusionOptions(method="pmvs"), "method")
+    error = assert_refused(FusionOptions(method="pmvs"), "method")  # type: ignore[arg-type]  # as untyped code may
     assert "'best-pixel' or 'colmap', not 'pmvs'" in str(error)
 
 

@@ -354,7 +354,7 @@ def test_refinement_finds_the_tip_between_whole_pixels(backend, position):
 # ---- the whole chain ---------------------------------------------------------------------------------------
 
 
-def run_match(backend, reference, target, base, image, p1, p2, max_slant, check, depth, rows):
+def run_match(backend, reference, target, base, image, p1, p2, max_slant, check: tuple[int, int], depth, rows):
     scratch = np.full((2, rows * base.shape[1], depth), 77, dtype=np.uint8)
     offset = np.full(base.shape, 5, dtype=np.int32)
     _native.match(backend, reference, target, base, image, p1, p2, max_slant, *check, scratch, offset)

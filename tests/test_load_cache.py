@@ -1,8 +1,9 @@
 """The cache that workers share: each value loaded once, no more kept than allowed."""
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,8 @@ class Loader:
     """Values of a given size, and a record of the keys asked for."""
 
     def __init__(self, size: int = 10) -> None:
-        self.size, self.loaded = size, []
+        self.size = size
+        self.loaded: list[str] = []
 
     def __call__(self, key: str) -> bytes:
         self.loaded.append(key)
@@ -68,7 +70,7 @@ def test_a_value_larger_than_the_capacity() -> None:
 
 
 def test_a_failure_is_not_kept() -> None:
-    answers = iter([OSError("disk"), b"value"])
+    answers: Iterator[OSError | bytes] = iter([OSError("disk"), b"value"])
 
     def load(key: str) -> bytes:
         answer = next(answers)
@@ -130,7 +132,7 @@ def test_nothing_is_kept_from_one_stage_to_the_next() -> None:
     for _ in range(2):
         with cache.holding(30):
             for key in "abcabc":
-                cache.get(key, lambda key=key: load(key))
+                cache.get(key, partial(load, key))
     assert load.loaded == [*"abc", *"abc"]
 
 

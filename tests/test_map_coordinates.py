@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from clouds import read_fused, read_visibility
+from clouds import read_fused, read_points, read_visibility
 from conftest import keep_images
 from test_undistortion import make_project, prepare
 
 import colmap_sph
-from colmap_sph.evaluation import read_geometry
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project import map_coordinates
 from colmap_sph.project.map_coordinates import local_origin, move_cloud
@@ -59,19 +58,19 @@ def near(block, tmp_path_factory: pytest.TempPathFactory) -> Near:
 
 def assert_same_maps(near: Path, far: Path, names: list[str]) -> None:
     """Every map is the same to the bit, and there is something in it."""
+    workspaces = [Workspace(dense) for dense in (near, far)]
     for name in names:
         for kind in ("photometric", "geometric"):
-            paths = [Workspace(dense).depth_map_path(name, kind) for dense in (near, far)]
-            expected, found = map(read_depth_map, paths)
+            expected, found = (read_depth_map(w.depth_map_path(name, kind)) for w in workspaces)
             np.testing.assert_array_equal(found, expected, err_msg=f"{name} {kind}")
             assert (expected > 0).mean() > 0.3
-            paths = [Workspace(dense).normal_map_path(name, kind) for dense in (near, far)]
-            np.testing.assert_array_equal(*map(read_normal_map, paths), err_msg=f"{name} {kind}")
+            expected, found = (read_normal_map(w.normal_map_path(name, kind)) for w in workspaces)
+            np.testing.assert_array_equal(found, expected, err_msg=f"{name} {kind}")
 
 
 def assert_same_cloud(near: Path, far: Path, offset: tuple[float, ...]) -> None:
     """Every point lies where it lies in the other cloud, once `offset` is taken away, but for 32-bit rounding."""
-    expected, found = (read_geometry(dense / "fused.ply").points for dense in (near, far))
+    expected, found = (read_points(dense / "fused.ply") for dense in (near, far))
     assert len(found) == len(expected) > 1000
     assert np.abs(found - offset - expected).max() < 1e-3
     visible = [(dense / "fused.ply.vis").read_bytes() for dense in (near, far)]
@@ -113,7 +112,7 @@ def test_local_workspace_serves_colmap(near: Near, tmp_path: Path) -> None:
     assert counts[1] == pytest.approx(counts[2], rel=0.01)
     assert counts[0] < 0.5 * counts[1]
     origin = np.array([float(word) for word in (local / "origin.txt").read_text().split()])
-    cloud, whole = read_fused(local / "fused.ply"), read_geometry(dense / "fused.ply").points
+    cloud, whole = read_fused(local / "fused.ply"), read_points(dense / "fused.ply")
     np.testing.assert_allclose(cloud["xyz"] + origin, whole, rtol=0, atol=1e-9)
     assert (local / "fused.ply.vis").read_bytes() == (dense / "fused.ply.vis").read_bytes()
 

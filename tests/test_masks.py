@@ -7,14 +7,17 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from clouds import read_points
 from conftest import keep_images
 from PIL import Image
+from projects import read_picture
 from test_undistortion import HEIGHT, NAMES, WIDTH, make_project, prepare
 
 import colmap_sph
 from colmap_sph.app import cli
+from colmap_sph.app.run_command import PARTIAL_EXIT_CODE
 from colmap_sph.errors import InputError
-from colmap_sph.evaluation import compare_depth_map, read_geometry
+from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.masks import read_mask, undistort_mask
@@ -51,7 +54,7 @@ def test_undistorted_mask_is_exact(tmp_path: Path) -> None:
     mask, options = blobs(5), pycolmap.UndistortCameraOptions()
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     undistort_mask(tmp_path / "mask.png", camera, options, tmp_path / "sub" / "out.png")
-    found = cv2.imread(str(tmp_path / "sub" / "out.png"), cv2.IMREAD_UNCHANGED)
+    found = read_picture(tmp_path / "sub" / "out.png", cv2.IMREAD_UNCHANGED)
     pinhole = pycolmap.undistort_camera(options, camera)
     assert found.shape == (pinhole.height, pinhole.width)
     x, y = np.meshgrid(np.arange(pinhole.width) + 0.5, np.arange(pinhole.height) + 0.5)
@@ -89,11 +92,11 @@ def test_masks_of_a_workspace(tmp_path: Path) -> None:
         found = sorted(str(path.relative_to(output / "masks")) for path in (output / "masks").rglob("*.png"))
         assert found == [f"{name}.png" for name in masked]
         for name in masked:
-            image = cv2.imread(str(workspace.image_path(name)), cv2.IMREAD_GRAYSCALE)
-            mask = cv2.imread(str(workspace.mask_path(name)), cv2.IMREAD_GRAYSCALE)
+            seen = read_picture(workspace.image_path(name), cv2.IMREAD_GRAYSCALE)
+            kept = read_picture(workspace.mask_path(name), cv2.IMREAD_GRAYSCALE)
             # The image is white where its mask is: the undistorted mask keeps what is purely white.
-            np.testing.assert_array_equal(mask == 255, image == 255)
-            assert 0.3 < np.mean(mask == 255) < 0.55
+            np.testing.assert_array_equal(kept == 255, seen == 255)
+            assert 0.3 < np.mean(kept == 255) < 0.55
 
 
 def test_a_mask_undistorts_with_ideal_fisheyes(tmp_path: Path) -> None:
@@ -102,8 +105,8 @@ def test_a_mask_undistorts_with_ideal_fisheyes(tmp_path: Path) -> None:
     write_masks(tmp_path / "masks", NAMES)
     workspace = prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
     for seed, name in enumerate(NAMES):
-        image = cv2.imread(str(workspace.image_path(name)), cv2.IMREAD_GRAYSCALE)
-        mask = cv2.imread(str(workspace.mask_path(name)), cv2.IMREAD_GRAYSCALE)
+        image = read_picture(workspace.image_path(name), cv2.IMREAD_GRAYSCALE)
+        mask = read_picture(workspace.mask_path(name), cv2.IMREAD_GRAYSCALE)
         assert mask.shape == image.shape
         assert not np.array_equal(mask, blobs(seed))
 
@@ -156,8 +159,8 @@ def mask_the_east(block: DemoBlock, folder: Path, border: float) -> None:
         camera = block.cameras[block.names.index(name)]
         west = world_x(camera, block.truth(name)[0], 0.0) < border
         # The truth is that of the pixels' corners: a pixel is ignored with any of its four.
-        west = cv2.erode(np.where(west, 255, 0).astype(np.uint8), np.ones((3, 3), np.uint8))
-        assert cv2.imwrite(str(folder / f"{name}.png"), west)
+        mask = cv2.erode(np.where(west, 255, 0).astype(np.uint8), np.ones((3, 3), np.uint8))
+        assert cv2.imwrite(str(folder / f"{name}.png"), mask)
 
 
 @pytest.mark.parametrize("from_workspace", [False, True], ids=["model", "workspace"])
@@ -179,7 +182,7 @@ def test_what_is_masked_is_not_reconstructed(block: DemoBlock, project: Path, fr
         for kind in ("photometric", "geometric"):
             depth = read_depth_map(workspace.depth_map_path(name, kind))
             if name in NADIR[:-1]:
-                mask = cv2.imread(str(project / "masks" / f"{name}.png"), cv2.IMREAD_GRAYSCALE)
+                mask = read_picture(project / "masks" / f"{name}.png", cv2.IMREAD_GRAYSCALE)
                 assert (mask == 0).mean() > 0.1
                 assert not depth[mask == 0].any()
                 assert not read_normal_map(workspace.normal_map_path(name, kind))[mask == 0].any()
@@ -187,7 +190,7 @@ def test_what_is_masked_is_not_reconstructed(block: DemoBlock, project: Path, fr
             scores = compare_depth_map(depth, truth, gsd=truth / camera.K[0, 0])
             assert scores.within[0] > 0.85, (name, kind)
     # Its partners ignore the east: the image without a mask has nothing to compare its own with.
-    x = read_geometry(dense / "fused.ply").points[:, 0]
+    x = read_points(dense / "fused.ply")[:, 0]
     assert len(x) == report.points > 5000
     assert np.mean(x > middle + 2 * gsd) < 1e-3
     assert np.percentile(x, 99.5) > middle - 20 * gsd
@@ -198,7 +201,7 @@ def test_a_black_mask_leaves_its_image_out(project: Path, capsys: pytest.Capture
     (project / "masks").mkdir()
     cv2.imwrite(str(project / "masks" / f"{NADIR[0]}.png"), np.zeros((240, 320), np.uint8))
     arguments = ["run", "--model", str(project / "sparse/0"), "--masks", str(project / "masks")]
-    assert cli.main([*arguments, "--threads", "1"]) == cli.PARTIAL_EXIT_CODE
+    assert cli.main([*arguments, "--threads", "1"]) == PARTIAL_EXIT_CODE
     assert f"image skipped: {NADIR[0]}: " in capsys.readouterr().err
     depth = read_depth_map(Workspace(project / "dense").depth_map_path(NADIR[0], "photometric"))
     assert not depth.any()

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from refusals import assert_refused
-from rendered import exact_disparity, grey, scene_of_pair
+from rendered import SIDES, exact_disparity, grey, scene_of_pair
 from scipy import ndimage
 
 from colmap_sph import _native
@@ -25,7 +25,7 @@ OPTIONS = MatchingOptions()
 def rectified_images(synthetic, pair, left, right):
     return [
         RectifiedImage(*resample(grey(synthetic.render(side)), view, pair, side))
-        for side, view in (("left", left), ("right", right))
+        for side, view in zip(SIDES, (left, right), strict=True)
     ]
 
 
@@ -43,7 +43,10 @@ class Matched:
         self.occluded = ~self.seen & ~np.isnan(self.truth)
 
     def match(self, options):
-        return match_pair(*self.images, self.pair.min_disparity, self.pair.max_disparity, options)
+        return self.match_range(self.pair.min_disparity, self.pair.max_disparity, options)
+
+    def match_range(self, low, high, options):
+        return match_pair(self.images[0], self.images[1], low, high, options)
 
     @property
     def completeness(self):
@@ -147,7 +150,7 @@ def test_fractions_of_a_grey_value_are_matched():
     pictures = [128 + texture[:, shift : shift + 300] + 0.1 * rng.standard_normal((120, 300)) for shift in (0, 20)]
     inner = np.s_[10:-10, 40:-10]
     right = [
-        np.abs(match_pair(*map(whole, images), 0, 60, OPTIONS) - 20)[inner] < 1
+        np.abs(match_pair(whole(images[0]), whole(images[1]), 0, 60, OPTIONS) - 20)[inner] < 1
         for images in (pictures, np.round(pictures))
     ]
     assert right[0].mean() > 0.998
@@ -170,7 +173,7 @@ def test_what_a_step_hides_is_left_out():
 def test_wide_ranges_are_searched_through_the_pyramid():
     """Nearly three times the range, as where sparse points say little: hardly anything changes."""
     matched = matched_scene("convergent")
-    wide = match_pair(*matched.images, matched.pair.min_disparity - 90, matched.pair.max_disparity + 90, OPTIONS)
+    wide = matched.match_range(matched.pair.min_disparity - 90, matched.pair.max_disparity + 90, OPTIONS)
     both = matched.found & ~np.isnan(wide)
     assert both.sum() > 0.95 * matched.found.sum()
     assert (np.abs(wide - matched.disparity)[both] < 0.5).mean() > 0.95
@@ -180,7 +183,7 @@ def test_wide_ranges_are_searched_through_the_pyramid():
 
 
 @pytest.mark.parametrize("search", [(-20, 20), (0, 31), (-200, 10), (-0.5, 0.5)])
-def test_no_motion_is_exactly_zero(search):
+def test_no_motion_is_exactly_zero(search: tuple[float, float]):
     image = random_image((90, 130))
     disparity = match_pair(image, image, *search, OPTIONS)
     found = ~np.isnan(disparity)
@@ -277,12 +280,12 @@ def test_pixels_without_content_are_neither_matched_nor_matched_to():
 def test_nothing_valid_gives_nothing():
     image = random_image((64, 64))
     empty = RectifiedImage(image.image, np.zeros_like(image.valid))
-    for images in ((image, empty), (empty, image), (empty, empty)):
-        assert np.isnan(match_pair(*images, -10, 10, OPTIONS)).all()
+    for left, right in ((image, empty), (empty, image), (empty, empty)):
+        assert np.isnan(match_pair(left, right, -10, 10, OPTIONS)).all()
 
 
 @pytest.mark.parametrize("search", [(500, 600), (-600, -500), (2000, 5000)])
-def test_a_range_beside_the_images_gives_nothing(search):
+def test_a_range_beside_the_images_gives_nothing(search: tuple[float, float]):
     image = random_image((70, 90))
     assert np.isnan(match_pair(image, image, *search, OPTIONS)).all()
 
@@ -295,7 +298,7 @@ def test_disparities_stay_within_the_range_and_the_images(seed):
     low = rng.uniform(-100, 50)
     high = low + rng.uniform(1, 300)
     images = [random_image((height, width), seed + k) for k, width in enumerate(widths)]
-    disparity = match_pair(*images, low, high, replace(OPTIONS, min_segment=0))
+    disparity = match_pair(images[0], images[1], low, high, replace(OPTIONS, min_segment=0))
     assert disparity.shape == (height, widths[0]) and disparity.dtype == np.float32
     found = ~np.isnan(disparity)
     # Ranges are rounded up to a multiple of 32 disparities.
@@ -331,8 +334,14 @@ def test_offsets_are_drawn_away_from_whole_pixels_that_they_are_locked_to():
 
 
 def test_the_excess_is_that_of_the_level(monkeypatch):
-    limits, match = [], _native.match
-    monkeypatch.setattr(_native, "match", lambda *a: (limits.append((a[4].shape, a[8], a[9])), match(*a)))
+    limits = []
+    match = _native.match
+
+    def recorded(*arguments):
+        limits.append((arguments[4].shape, arguments[8], arguments[9]))
+        match(*arguments)
+
+    monkeypatch.setattr(_native, "match", recorded)
     options = replace(
         OPTIONS, max_left_right_difference=3, max_left_right_excess=7, max_coarse_left_right_excess=91
     )
@@ -354,7 +363,7 @@ def test_planes_of_few_disparities_are_not_made_worse(angle, monkeypatch):
 def test_small_segments_are_removed():
     images = [random_image((120, 160), seed) for seed in (1, 2)]
     for least in (0, 30):
-        disparity = match_pair(*images, -15, 15, replace(OPTIONS, min_segment=least))
+        disparity = match_pair(images[0], images[1], -15, 15, replace(OPTIONS, min_segment=least))
         labels, count = ndimage.label(~np.isnan(disparity))
         sizes = np.bincount(labels.ravel())[1:]
         assert count > 0 or least > 0

@@ -13,12 +13,13 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from projects import read_picture
 from refusals import assert_refused
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Scene, SourceImages, View
 from colmap_sph.stereo.pairing import partners_of
 from colmap_sph.stereo.pairs import PairOptions, PairSelection, overlapping_views, select_pairs
 from colmap_sph.stereo.partner_choice import choose, triangulation_angles, worth_of
@@ -128,7 +129,7 @@ def test_partners_see_what_others_see(data_dir: Path) -> None:
     scene = read_scene(data_dir / "penta" / "sparse" / "0")
     partners_by_name = partners_of(select_pairs(scene, PairOptions()).unique_pairs())
     read = {view.name: data_dir / "penta" / "depth" / f"{Path(view.name).stem}.png" for view in scene.views}
-    depths = {name: 0.005 * cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for name, path in read.items()}
+    depths = {name: 0.005 * read_picture(path, cv2.IMREAD_UNCHANGED) for name, path in read.items()}
     missed = []
     for view in scene.views:
         rows, columns = (axis.ravel() for axis in np.mgrid[8 : view.height : 16, 8 : view.width : 16])
@@ -235,8 +236,13 @@ def test_options_out_of_bounds(line: Scene, options: PairOptions, names: tuple[s
 
 
 def test_patch_match_cfg_is_obeyed(line: Scene, caplog: pytest.LogCaptureFixture) -> None:
-    explicit = {"4.jpg": ["0.jpg", "gone.jpg"], "2.jpg": 20, "1.jpg": "__all__", "lost.jpg": 20}
-    selection = select_pairs(line, PairOptions(num_pairs=2), explicit=explicit)  # type: ignore[arg-type]
+    explicit: dict[str, SourceImages] = {
+        "4.jpg": ["0.jpg", "gone.jpg"],
+        "2.jpg": 20,
+        "1.jpg": "__all__",
+        "lost.jpg": 20,
+    }
+    selection = select_pairs(line, PairOptions(num_pairs=2), explicit=explicit)
     assert selection.source == "patch-match.cfg"
     assert list(selection.partners) == ["1.jpg", "2.jpg", "4.jpg"]
     # No gate for what the user wrote; "__auto__" means our choice of our number.

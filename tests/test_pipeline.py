@@ -31,6 +31,7 @@ from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import SourceImages
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.pairs import PairOptions, select_pairs
@@ -84,7 +85,7 @@ def test_every_image_has_maps_close_to_the_truth(block: DemoBlock, finished: Fin
         assert scores.within[0] > 0.8, name
         assert scores.within[1] > 0.88, name
         assert scores.median_error < 0.25, name
-        assert scores.median_normal_angle < 8, name
+        assert scores.median_normal_angle is not None and scores.median_normal_angle < 8, name
         assert finished.report.coverage[name] == np.mean(depth > 0)
     coverage, within = median_scores(block, finished.dense)
     assert coverage > 0.72
@@ -212,7 +213,11 @@ def test_workspace_of_colmap(project: Path) -> None:
 def test_explicit_patch_match_cfg_is_obeyed(project: Path) -> None:
     dense = project / "dense"
     workspace = prepared(project, dense)
-    sources = {"N_0_1.jpg": ["N_0_0.jpg", "N_0_2.jpg"], "N_1_1.jpg": ["N_0_1.jpg"], "R_0.jpg": 1}
+    sources: dict[str, SourceImages] = {
+        "N_0_1.jpg": ["N_0_0.jpg", "N_0_2.jpg"],
+        "N_1_1.jpg": ["N_0_1.jpg"],
+        "R_0.jpg": 1,
+    }
     write_patch_match_cfg(workspace.patch_match_cfg_path, sources)
     report = colmap_sph.run(workspace=dense, options=FEW_PAIRS)
     assert report.pair_source == "patch-match.cfg"
@@ -415,7 +420,7 @@ def test_the_number_of_opencv_threads_is_restored(project: Path) -> None:
         {"workspace": Path("dense"), "options": RunOptions(undistortion=UndistortionOptions(1000))},
         {"model": Path("sparse/0"), "options": RunOptions(threads=-1)},
         {"model": Path("sparse/0"), "options": RunOptions(threads=2000)},
-        {"model": Path("sparse/0"), "options": RunOptions(fusion=FusionOptions(input="depth"))},  # type: ignore[arg-type]
+        {"model": Path("sparse/0"), "options": RunOptions(fusion=FusionOptions(input="depth"))},  # type: ignore[arg-type]  # as untyped code may
         {"model": Path("sparse/0"), "options": RunOptions(pairs=PairOptions(num_pairs=0))},
         {"model": Path("sparse/0"), "options": RunOptions(fusion=FusionOptions(min_num_pixels=0))},
         {"model": Path("sparse/0"), "options": RunOptions(vote=VoteOptions(min_support=0))},

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from clouds import read_fused
 from conftest import keep_images
+from projects import read_picture
 
 import colmap_sph
 from colmap_sph.evaluation import compare_depth_map, mean_of_depth_maps, truth_at_pixel_origin
@@ -91,7 +92,7 @@ def test_penta_depth_maps(penta: Result) -> None:
     scores = {}
     for name in PENTA:
         path = penta.source / "depth" / name.replace(".jpg", ".png")
-        centres = cv2.imread(str(path), cv2.IMREAD_UNCHANGED).astype(np.float32) * PENTA_DEPTH_UNIT
+        centres = read_picture(path, cv2.IMREAD_UNCHANGED).astype(np.float32) * PENTA_DEPTH_UNIT
         depth = read_depth_map(penta.workspace.depth_map_path(name, "geometric"))
         scores[name] = compare_depth_map(depth, truth_at_pixel_origin(centres), gsd=PENTA_GSD)
     mean = mean_of_depth_maps(scores)
@@ -136,5 +137,5 @@ def test_brighton(data_dir: Path, tmp_path: Path) -> None:
     assert np.mean(list(result.report.coverage.values())) > 0.3
     assert result.report.coverage["DJI_0026.jpg"] > 0.4
     assert result.report.points > 200_000
-    image = cv2.imread(str(result.workspace.image_path(BRIGHTON[0])))
+    image = read_picture(result.workspace.image_path(BRIGHTON[0]))
     assert max(image.shape) <= 1000

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from refusals import assert_refused
 from rendered import (
+    SIDES,
     array_coordinates,
     disparities,
     grey,
@@ -63,16 +64,22 @@ PAIRS = {
 POINTS = np.random.default_rng(5).uniform([-4, -3, 7], [4, 3, 13], (500, 3))
 
 
-def view_of(k, R, t, K, size, points):
-    view = View(k, f"{k}", *size, K, R, t, np.zeros(0, dtype=np.int64))
+def view_of(k, pose, points):
+    R, t, K, size = pose
+    view = View(k, f"{k}", size[0], size[1], K, R, t, np.zeros(0, dtype=np.int64))
     pixel, depth = project(view, points)
     seen = (depth > 0) & (pixel > 0).all(axis=1) & (pixel < size).all(axis=1)
     return replace(view, point_indices=np.flatnonzero(seen))
 
 
 def scene_of(cameras, points=POINTS):
-    views = tuple(view_of(k + 1, *parameters, points) for k, parameters in enumerate(cameras))
+    views = tuple(view_of(k + 1, pose, points) for k, pose in enumerate(cameras))
     return Scene(views, points)
+
+
+def rectify_views(scene, options):
+    left, right = scene.views
+    return rectify_pair(scene, left, right, options)
 
 
 # One viewing ray at least runs along the baseline: no plane parallel to it holds these.
@@ -110,7 +117,7 @@ def test_a_point_has_the_same_row_in_both_images(name, surface, swapped):
     left, right, pair, points = rectified(name, surface, swapped)
     assert len(points) > 50
     positions = []
-    for view, side in ((left, "left"), (right, "right")):
+    for view, side in zip((left, right), SIDES, strict=True):
         pixel, depth = project(view, points)
         rays = np.column_stack([pixel, np.ones(len(pixel))]) @ rectified_ray_from_pixel(view, pair).T
         # The ray has depth 1 in its camera: times the depth it ends at the point.
@@ -173,7 +180,7 @@ def test_sampling_follows_the_finer_image(name, options):
     scene = scene_of(PAIRS[name])
     middle = POINTS.mean(axis=0)
     for sampling in (0.5, 1.0):
-        pair = rectify_pair(scene, *scene.views, replace(options, sampling=sampling))
+        pair = rectify_views(scene, replace(options, sampling=sampling))
         areas = []
         for view, side in zip(scene.views, ("left", "right"), strict=True):
             x, y = project(view, middle[None])[0][0]
@@ -205,7 +212,7 @@ def test_resampling_reads_the_right_place(name, surface):
     The first pixel's centre is (0.5, 0.5): the grey value at x is x − 0.5. Half a pixel off would be seen.
     """
     left, right, pair, _ = rectified(name, surface)
-    for view, side in ((left, "left"), (right, "right")):
+    for view, side in zip((left, right), SIDES, strict=True):
         x, y, _ = source_pixels(view, pair, side)
         row_grid, column_grid = np.indices((view.height, view.width))
         for grid, place in ((column_grid, x), (row_grid, y)):
@@ -222,7 +229,7 @@ def test_resampling_reads_the_right_place(name, surface):
 @every_case
 def test_valid_pixels_are_those_inside_the_image(name, surface):
     left, right, pair, _ = rectified(name, surface)
-    for view, side in ((left, "left"), (right, "right")):
+    for view, side in zip((left, right), SIDES, strict=True):
         _, valid = resample(np.zeros((view.height, view.width), np.uint8), view, pair, side)
         assert valid.shape == (pair.height, pair.width(side))
         assert set(np.unique(valid)) <= {0, 255} and valid.any()
@@ -235,7 +242,7 @@ def test_valid_pixels_are_those_inside_the_image(name, surface):
 
 def test_the_back_of_the_sphere_shows_nothing():
     """Rays behind the camera project into the image too, but are not seen."""
-    view = view_of(1, *camera((0, 0, 0)), POINTS)
+    view = view_of(1, camera((0, 0, 0)), POINTS)
     scale = 40.0
     pair = RectifiedPair(
         "spherical", np.eye(3), 1.0, scale, scale, -np.pi * scale, -1.5 * scale, 0.0, 252, 121, 121, 0.0, 1.0
@@ -272,17 +279,17 @@ def test_rows_go_on_past_the_seam():
 def test_the_plane_refuses_motion_along_the_view(name):
     scene = scene_of(PAIRS[name])
     with pytest.raises(RectificationError):
-        rectify_pair(scene, *scene.views, FRAME)
+        rectify_views(scene, FRAME)
 
 
 @every_surface
 def test_identical_centres_are_refused(options):
     pair = (camera((0, 0, 0)), camera((0, 0, 0), (1, 0, 10)))
     with pytest.raises(RectificationError, match="same projection centre"):
-        rectify_pair(scene_of(pair), *scene_of(pair).views, options)
+        rectify_views(scene_of(pair), options)
     without_points = scene_of(pair, np.zeros((0, 3)))
     with pytest.raises(RectificationError, match="same projection centre"):
-        rectify_pair(without_points, *without_points.views, options)
+        rectify_views(without_points, options)
 
 
 @every_surface
@@ -299,14 +306,14 @@ def test_identical_centres_are_refused(options):
 def test_images_without_overlap_are_refused(pair, options, points):
     scene = scene_of(pair, points)
     with pytest.raises(RectificationError):
-        rectify_pair(scene, *scene.views, options)
+        rectify_views(scene, options)
 
 
 @every_surface
 def test_a_pair_without_sparse_points_searches_a_wide_range(options):
     scene = scene_of(PAIRS["convergent"], np.zeros((0, 3)))
-    pair = rectify_pair(scene, *scene.views, options)
-    disparity, _, _ = disparities(pair, *scene.views, POINTS)
+    pair = rectify_views(scene, options)
+    disparity, _, _ = disparities(pair, scene.views[0], scene.views[1], POINTS)
     assert ((disparity > pair.min_disparity) & (disparity < pair.max_disparity)).all()
 
 
@@ -322,14 +329,14 @@ def test_sizes_are_bounded(name, surface):
 def test_images_beyond_the_bound_are_refused():
     scene = scene_of(PAIRS["convergent"])
     with pytest.raises(RectificationError, match="times the pixels"):
-        rectify_pair(scene, *scene.views, RectificationOptions(max_pixels_ratio=0.5))
+        rectify_views(scene, RectificationOptions(max_pixels_ratio=0.5))
 
 
 def test_sides_beyond_what_can_be_resampled_are_refused():
     large = [camera(eye, size=(16000, 12000), focal=(8000, 8000)) for eye in ((0, 0, -2), (0.3, -0.2, 0))]
     scene = scene_of(large)
     with pytest.raises(RectificationError, match="rows or columns"):
-        rectify_pair(scene, *scene.views, SPHERE)
+        rectify_views(scene, SPHERE)
 
 
 @pytest.mark.parametrize(
@@ -391,7 +398,7 @@ def test_the_two_rectified_images_show_the_same(name):
     disparity, columns, rows = disparities(pair, left, right, points)
     images = [
         resample(grey(RENDERED[name].render(side)), view, pair, side)[0]
-        for view, side in ((left, "left"), (right, "right"))
+        for view, side in zip((left, right), SIDES, strict=True)
     ]
 
     def difference(shift):

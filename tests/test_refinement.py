@@ -8,6 +8,7 @@ import numpy as np
 import oracle
 import pytest
 from refusals import assert_refused
+from rendered import SIDES, grey
 
 import colmap_sph
 from colmap_sph import _native
@@ -147,7 +148,7 @@ def test_there_may_be_more_partners_than_one_call_takes(monkeypatch):
 def test_an_image_matches_itself(backend):
     """At infinite depth the image lies on itself, half a pixel of COLMAP's origin included: nothing is to do."""
     image = texture((20, 30), 6)
-    identity = np.hstack([np.eye(3), [[1.0], [0], [0]]])
+    identity = np.column_stack([np.eye(3), [1.0, 0, 0]])
     planes = np.zeros((3, 20, 30), np.float32)
     planes[0] = 1e-7
     equations = equations_of(backend, image, image, identity, planes)
@@ -171,7 +172,7 @@ def test_a_shifted_image_gives_its_shift(shift):
 
     image = np.rint(picture(x, y)).astype(np.uint8)
     source = np.rint(picture(x - 4 - shift, y)).astype(np.uint8)
-    matrix = np.hstack([np.eye(3), [[4.0], [0], [0]]])
+    matrix = np.column_stack([np.eye(3), [4.0, 0, 0]])
     planes = np.zeros((3, 24, 48), np.float32)
     planes[0] = 1
     equations = equations_of(_native.backends()[0], image, source, matrix, planes)
@@ -335,7 +336,7 @@ def test_a_slanted_plane_is_found_from_a_frontal_one():
         View(k, name, c.width, c.height, c.K, c.R, c.t, np.zeros(0, np.int64))
         for k, (name, c) in enumerate((("a", pair.left), ("b", pair.right)))
     )
-    image, source = (cv2.cvtColor(pair.render(side).image, cv2.COLOR_RGB2GRAY) for side in ("left", "right"))
+    image, source = (grey(pair.render(side)) for side in SIDES)
     truth, true_normals, _ = syn.exact_geometry(pair.surfaces, pair.left, origin=0.0)
     normals = np.zeros((*truth.shape, 3), np.float32)
     normals[..., 2] = -1

@@ -7,11 +7,13 @@ import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 from conftest import SMALL_BLOCK, keep_images
+from projects import read_picture
 
 import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
@@ -56,7 +58,7 @@ class Finished:
     def ids(self) -> dict[str, int]:
         return {view.name: view.image_id for view in read_scene(self.dense / "sparse").views}
 
-    def rerun(self, **changes: object) -> RunReport:
+    def rerun(self, **changes: Any) -> RunReport:
         return colmap_sph.run(self.project / "sparse/0", options=replace(OPTIONS, **changes))
 
 
@@ -137,7 +139,7 @@ def test_time_stamps_threads_and_place_do_not_matter(finished: Finished) -> None
 # ---- options and inputs that changed -----------------------------------------------------------------------
 
 EVERYTHING = expected_files(pairs=6, votes=4, photometric=4, geometric=4, cloud=True)
-CHANGES = {
+CHANGES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "matching": ({"matching": MatchingOptions(p1=12)}, EVERYTHING),
     "rectification": ({"rectification": RectificationOptions(near_margin=2.2)}, EVERYTHING),
     "depth": (
@@ -197,8 +199,7 @@ def test_fewer_pairs_keep_their_disparity_maps(finished: Finished) -> None:
 def test_a_changed_image_redoes_its_pairs(finished: Finished) -> None:
     before = results(finished.dense)
     path = finished.dense / "images" / NAMES[0]
-    image = cv2.imread(str(path))
-    assert cv2.imwrite(str(path), cv2.add(image, 3))
+    assert cv2.imwrite(str(path), cv2.convertScaleAbs(read_picture(path), beta=3))
     finished.rerun()
     files = rewritten(before, finished.dense)
     number = f"{finished.ids[NAMES[0]]:06d}"
@@ -301,7 +302,7 @@ DAMAGED = {
 def test_what_is_damaged_is_made_again(what: str, damage: Callable[[Path], None], finished: Finished) -> None:
     pattern, made = DAMAGED[what]
     before = results(finished.dense)
-    damage(sorted(finished.dense.glob(pattern))[0])
+    damage(min(finished.dense.glob(pattern)))
     report = finished.rerun()
     assert report.made == NOTHING | made
     assert report.skipped_images == {}
@@ -370,14 +371,14 @@ def test_memory_refused_once(what: str, finished: Finished, monkeypatch: pytest.
         return original(*arguments)
 
     monkeypatch.setattr(place, refused_first)
-    changes = {"matching": MatchingOptions(p1=12)}
-    report = colmap_sph.run(finished.project / "sparse/0", options=replace(OPTIONS, threads=1, **changes))
+    options = replace(OPTIONS, threads=1, matching=MatchingOptions(p1=12))
+    report = colmap_sph.run(finished.project / "sparse/0", options=options)
     failed = report.skipped_pairs if what == "match.match_pair" else report.skipped_images
     assert len(failed) == 1
     assert "not enough memory" in next(iter(failed.values()))
     assert len(report.skipped_pairs) + len(report.skipped_images) == 1
     monkeypatch.undo()
-    again = finished.rerun(**changes)
+    again = finished.rerun(matching=options.matching)
     assert again.images == 4
     assert again.skipped_pairs == again.skipped_images == {}
     assert again.made["match pairs"] == (1 if what == "match.match_pair" else 0)
@@ -544,9 +545,8 @@ def test_plan_of_reduced_images(project: Path) -> None:
 def test_plan_of_the_fusion(finished: Finished) -> None:
     """The budget bounds ours, not COLMAP's, and more partners take more time."""
 
-    def plan(**changes: object) -> Plan:
-        options = {"min_num_pixels": 3, **changes}
-        tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(**options))
+    def plan(**changes: Any) -> Plan:
+        tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(min_num_pixels=3, **changes))
         return make_plan(Project(workspace=finished.dense), tight)
 
     ours, theirs = plan(), plan(method="colmap")
@@ -557,14 +557,14 @@ def test_plan_of_the_fusion(finished: Finished) -> None:
 
 def test_plan_of_a_finished_workspace(finished: Finished) -> None:
     before, state = results(finished.dense), sorted(finished.dense.rglob("*"))
-    for arguments in ({"model": finished.project / "sparse/0"}, {"workspace": finished.dense}):
-        plan = make_plan(Project(**arguments), OPTIONS)
+    for project in (Project(finished.project / "sparse/0"), Project(workspace=finished.dense)):
+        plan = make_plan(project, OPTIONS)
         assert not plan.undistort and not plan.fuse
         assert plan.pairs == plan.pairs_done == 6
         assert plan.images == plan.images_done == 4
         assert plan.seconds == plan.disk == 0
-        fresh = make_plan(Project(**arguments), OPTIONS, overwrite=True)
-        assert fresh.undistort == ("model" in arguments)
+        fresh = make_plan(project, OPTIONS, overwrite=True)
+        assert fresh.undistort == (project.model is not None)
         assert fresh.fuse and fresh.pairs_done == fresh.images_done == 0
         assert fresh.disk > 2e6
     assert rewritten(before, finished.dense) == set()

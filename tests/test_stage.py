@@ -1,10 +1,12 @@
 """The contract of the stages: a task can be pickled, and what it makes does not depend on where it is made."""
 
 import pickle
+from collections.abc import Hashable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any, TypeVar
 
 import pytest
 from conftest import SMALL_BLOCK, keep_images
@@ -31,6 +33,8 @@ from colmap_sph.synthetic import make_demo_block
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 OPTIONS = RunOptions(threads=2)
+Item = TypeVar("Item", bound=Hashable)
+Task = TypeVar("Task")
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +61,7 @@ def made(dense: Path) -> dict[str, bytes]:
     return {str(path.relative_to(dense)): path.read_bytes() for path in files}
 
 
-def make_elsewhere(stage: Stage, pool: ProcessPoolExecutor) -> dict[object, Result]:
+def make_elsewhere(stage: Stage[Item, Task], pool: ProcessPoolExecutor) -> dict[Item, Result]:
     """All jobs of a stage, made by another process from their pickled tasks."""
     kept = stage.kept_memory(MemoryGate(OPTIONS.memory_budget))
     with stage.opened(kept):
@@ -90,10 +94,10 @@ def test_another_process_makes_the_same(project: Path, tmp_path: Path) -> None:
     assert not any(report.made.values())
 
 
-def finished_stages(project: Path) -> list[Stage]:
+def finished_stages(project: Path) -> list[Stage[Any, Any]]:
     context = context_of(project, project / "dense")
     pairs = select_pairs(context.scene, OPTIONS.pairs).unique_pairs()
-    stages: list[Stage] = [MatchStage(context, pairs)]
+    stages: list[Stage[Any, Any]] = [MatchStage(context, pairs)]
     pair_keys = keys_of(execute(stages[-1]))
     stages.append(VoteStage(context, pair_keys))
     stages.append(ConfirmStage(context, pair_keys, keys_of(execute(stages[-1]))))

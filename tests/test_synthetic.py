@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from projects import read_picture
 
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError, OutputError
@@ -335,7 +336,7 @@ def test_block_is_a_colmap_model_that_reprojects(block):
         np.testing.assert_allclose(image.cam_from_world().matrix()[:, :3], camera.R, atol=1e-12)
         np.testing.assert_allclose(image.projection_center(), camera.centre, atol=1e-9)
         np.testing.assert_allclose(image.camera.calibration_matrix(), camera.K)
-        picture = cv2.imread(str(block.images_dir / name))
+        picture = read_picture(block.images_dir / name)
         assert picture.shape == (120, 160, 3)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,12 +107,25 @@ def make_cloud_by_colmap(task: ColmapFuseTask) -> Facts:
     return Facts(points=points)
 
 
-def fuse_stage(
-    context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]
-) -> "FuseStage | ColmapFuseStage":
-    """The last stage, by the method that the options name; `maps` are the results of the stage before."""
+def fuse_stage(context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> "Stage[str, Any]":
+    """Choose the last stage by the method that the options name.
+
+    Parameters
+    ----------
+    context : Context
+    pair_keys : mapping
+        Key of each pair that was matched.
+    maps : mapping of str to Result
+        Results of the stage before.
+
+    Returns
+    -------
+    FuseStage or ColmapFuseStage
+        On the images with any depth.
+    """
+    filled = {name: result for name, result in maps.items() if result.facts.coverage > 0}
     stage = ColmapFuseStage if context.options.fusion.method == "colmap" else FuseStage
-    return stage(context, pair_keys, {name: result for name, result in maps.items() if result.facts.coverage > 0})
+    return stage(context, pair_keys, filled)
 
 
 class FuseStage(Stage[str, FuseTask]):

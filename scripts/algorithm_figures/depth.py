@@ -39,7 +39,7 @@ def _candidates(demo: Demo, name: str, options: VoteOptions) -> tuple[list[str],
 
 def _agree(depth: Float, sigma: Float, tolerance: float) -> NDArray[np.bool_]:
     """(n, n): which candidates of a pixel agree."""
-    return np.abs(depth[:, None] - depth) <= tolerance * np.hypot(sigma[:, None], sigma)
+    return np.asarray(np.abs(depth[:, None] - depth) <= tolerance * np.hypot(sigma[:, None], sigma))
 
 
 def _draw_ray(axes: Any, names: list[str], depth: Float, sigma: Float, voted: float, exact: float) -> None:
@@ -73,7 +73,8 @@ def _telling_pixels(
     calm = inner & (support == inliers) & (outliers == 0)
     torn = inner & (support == inliers) & (inliers >= 3) & (spread < 0.25)
     scores = np.where(calm, inliers, 0), np.where(torn, 100 * outliers + inliers, 0)
-    return [tuple(map(int, np.unravel_index(int(np.argmax(score)), score.shape))) for score in scores]
+    places = (np.unravel_index(int(np.argmax(score)), score.shape) for score in scores)
+    return [(int(row), int(column)) for row, column in places]
 
 
 def vote(demo: Demo, path: Path) -> None:
@@ -82,7 +83,7 @@ def vote(demo: Demo, path: Path) -> None:
     voted, (exact, _) = demo.voted(NAME), demo.truth(NAME)
     pixels = _telling_pixels(depths, sigmas, exact, voted.support)
     figure = plt.figure(figsize=(9.6, 6.6), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1, 1.05))
+    above, below = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.05))))
     panels = above.subplots(1, 2)
     support = masked(voted.support, voted.depth > 0)
     bounds = np.arange(1, voted.support.max() + 2)

@@ -94,7 +94,7 @@ def matching(demo: Demo, path: Path) -> None:
     finest, disparity, exact = levels[-1], pair.disparity, demo.exact_disparity(pair)
     error = np.abs(disparity - exact)
     figure = plt.figure(figsize=(9.6, 5.4), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.1, 1))
+    above, below = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1))))
     panels = above.subplots(1, 3)
     grey = np.where(pair.left_image.valid > 0, pair.left_image.image, 255)
     show(panels[0], grey, "left, rectified", cmap="gray", vmin=0, vmax=255)

@@ -46,7 +46,7 @@ def _refined(demo: Demo, name: str, estimate: DepthEstimate, planes: Maps) -> Ma
 
 def _normal_picture(normals: NDArray[np.float32]) -> NDArray[np.uint8]:
     """Red right, green up, blue towards the camera; white where there is none."""
-    picture = np.clip(127.5 + 127.5 * normals * (1, -1, -1), 0, 255).astype(np.uint8)
+    picture: NDArray[np.uint8] = np.clip(127.5 + 127.5 * normals * (1, -1, -1), 0, 255).astype(np.uint8)
     picture[~normals.any(axis=-1)] = 255
     return picture
 
@@ -54,7 +54,7 @@ def _normal_picture(normals: NDArray[np.float32]) -> NDArray[np.uint8]:
 def _angular_error(normals: NDArray[np.float32], exact: NDArray[np.float32]) -> NDArray[np.float64]:
     own, other = normals.astype(float), exact.astype(float)
     sine = np.linalg.norm(np.cross(own, other), axis=-1)
-    return np.degrees(np.arctan2(sine, (own * other).sum(axis=-1)))
+    return np.asarray(np.degrees(np.arctan2(sine, (own * other).sum(axis=-1))))
 
 
 def _weights(estimate: DepthEstimate, row: int, column: int, options: NormalOptions) -> NDArray[np.float64]:
@@ -136,7 +136,7 @@ def refinement(demo: Demo, path: Path) -> None:
     there = (before[1] > 0) & (after[1] > 0) & (exact > 0)
     gsd = exact / view.K[0, 0]
     figure = plt.figure(figsize=(9.6, 6.2), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.15, 1))
+    above, below = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.15, 1))))
     top = above.subplots(1, 2)
     angles, shifts = [], []
     part = np.s_[150:390, 130:450]

@@ -81,7 +81,7 @@ def partners(demo: Demo, path: Path) -> None:
     }
     most_shared = sorted(shared, key=lambda other: -shared[other])
     figure = plt.figure(figsize=(9.6, 6.0), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(1.15, 1))
+    above, below = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.15, 1))))
     plan, worth = above.subplots(1, 2)
     panels = below.subplots(1, 3)
     _draw_cameras(plan, demo, {name: "tab:red"} | {partner.name: "tab:blue" for partner in chosen})

@@ -33,21 +33,22 @@ def against_lidar(
     surface = None if exact is None else visible_surface(exact, gsd / 2)
     surface_index = None if surface is None else PointIndex(surface)
     result: dict[str, Any] = {}
-    for surface, run in runs.items():
+    for which, run in runs.items():
         cloud = read_geometry(run.workspace.fused_path)
-        result[surface] = {"cloud": evaluate_cloud(cloud, reference, options).as_dict()}
+        assert isinstance(cloud, PointCloud)
+        result[which] = {"cloud": evaluate_cloud(cloud, reference, options).as_dict()}
         if surface is None or surface_index is None:
             continue
         rows = surface_index.nearest(cloud.points, 1, threads=options.worker_count)[:, 0]
         fixed = EvaluationOptions(gsd=gsd, register=False)
         floor = PointCloud("exact surface", surface[rows])
-        result[surface]["floor"] = evaluate_cloud(floor, reference, fixed).as_dict()
+        result[which]["floor"] = evaluate_cloud(floor, reference, fixed).as_dict()
         seen = np.asarray(reference.distances(floor.points, threads=options.worker_count, bound=np.inf))
         kept = seen <= SEEN_BY_LIDAR * gsd
-        result[surface]["share_seen_by_lidar"] = float(kept.mean())
+        result[which]["share_seen_by_lidar"] = float(kept.mean())
         for name, points in (("cloud", cloud.points), ("floor", floor.points)):
             part = PointCloud(name, points[kept])
-            result[surface][f"{name}_seen_by_lidar"] = evaluate_cloud(part, reference, fixed).as_dict()
+            result[which][f"{name}_seen_by_lidar"] = evaluate_cloud(part, reference, fixed).as_dict()
     return result
 
 

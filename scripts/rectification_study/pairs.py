@@ -121,10 +121,10 @@ def score_pairs(
 
 def _exact_scores(
     views: tuple[View, View],
-    depths: Mapping[str, tuple[Map, Map]],
+    depths: Mapping[Surface, tuple[Map, Map]],
     maps: ExactMaps,
     plane: NDArray[np.float64] | None,
-) -> dict[str, dict[str, Any]]:
+) -> dict[Surface, dict[str, Any]]:
     """Per surface what exact depth says about a pair's depths; by slope against a plane where one is given."""
 
     def flat(parts: Sequence[Map]) -> Map:
@@ -136,7 +136,7 @@ def _exact_scores(
     }
     common = np.logical_and.reduce([np.isfinite(error) for error in errors.values()])
     slopes = None if plane is None else flat([maps.slopes(view, plane) for view in views])
-    scores: dict[str, dict[str, Any]] = {}
+    scores: dict[Surface, dict[str, Any]] = {}
     for surface, error in errors.items():
         scores[surface] = {
             "correct": int((error <= CORRECT).sum()),

@@ -31,7 +31,7 @@ def points_per_image(content: Mapping[str, Any], folder: Path) -> Path:
     names = sorted(points["spherical"])
     figure, axes = plt.subplots(figsize=(max(8.0, 0.3 * len(names)), 4), layout="constrained")
     places = np.arange(len(names))
-    for shift, surface in ((-0.2, "frame"), (0.2, "spherical")):
+    for shift, surface in zip((-0.2, 0.2), SURFACES, strict=True):
         heights = [points[surface].get(name, 0) / 1e6 for name in names]
         axes.bar(places + shift, heights, 0.4, color=COLOURS[surface], label=surface)
     axes.set_xticks(places, [Path(name).stem for name in names], rotation=90, fontsize=8)

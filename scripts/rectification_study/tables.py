@@ -104,8 +104,10 @@ def _exact(clouds: Mapping[str, Any], depth_maps: Mapping[str, Any]) -> str:
     rows = []
     for one, other in zip(frame["thresholds"], spherical["thresholds"], strict=True):
         tau = f"{one['tau_m'] / frame['gsd_m']:g} GSD"
-        for key in ("accuracy", "completeness", "f_score"):
-            rows.append([f"cloud: {key.replace('_', '-')}, {tau}", *_shares(one[key], other[key])])
+        rows += [
+            [f"cloud: {key.replace('_', '-')}, {tau}", *_shares(one[key], other[key])]
+            for key in ("accuracy", "completeness", "f_score")
+        ]
     frame, spherical = depth_maps["frame"], depth_maps["spherical"]
     rows.append(["geometric depth maps: coverage", *_shares(frame["coverage"], spherical["coverage"])])
     for place, bound in enumerate(frame["thresholds_gsd"]):
