@@ -129,12 +129,12 @@ def match(
     offset : (H, W) int32, written
     """
 
-def refine_offsets(
+def fit_offsets(
     backend: str,
     offset: NDArray[np.int32],
     reference: NDArray[np.uint64],
     target: NDArray[np.uint64],
-    refined: NDArray[np.int32],
+    fitted: NDArray[np.int32],
     /,
 ) -> None:
     """Offsets fitted to the raw costs of a window around each pixel, in 1/256 pixel.
@@ -143,7 +143,7 @@ def refine_offsets(
     offset : (H, W) int32
     reference : (H, W) uint64
     target : (H, TARGET_W) uint64
-    refined : (H, W) int32, written
+    fitted : (H, W) int32, written
     """
 
 def transfer_disparity(
@@ -214,7 +214,7 @@ def vote_depth(
     support : (H, W) uint8, written
     """
 
-def check_consistency(
+def compare_depths(
     backend: str,
     depth: NDArray[np.float32],
     sigma: NDArray[np.float32],
@@ -267,7 +267,7 @@ def confirm_depth(
     weight: NDArray[np.float32],
     /,
 ) -> None:
-    """Turn the sums of check_consistency into the geometric map: `weighted_depth` becomes depth, `weight` its
+    """Turn the sums of compare_depths into the geometric map: `weighted_depth` becomes depth, `weight` its
     deviation, `agreeing` its support; `contradicting` is spoilt.
 
     depth : (H, W) float32

@@ -220,7 +220,8 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
 def image_kernels(scene: Scene) -> list[Kernel]:
     """The kernels that work on images, on the results of those before them."""
     left, right = census_pair(scene)
-    census, refined = np.empty_like(left), np.empty(scene.shape, np.int32)
+    census = np.empty_like(left)
+    fitted = np.empty(scene.shape, np.int32)
     offset = np.round(-256 * scene.disparity).astype(np.int32)
     # A camera whose focal length is its width: the sphere's columns and rows are about its own.
     height, width = scene.shape
@@ -249,9 +250,9 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     return [
         Kernel("census", lambda backend: _native.census(backend, padded, valid, census), [census], pixels),
         Kernel(
-            "refine_offsets",
-            lambda backend: _native.refine_offsets(backend, offset, left, right, refined),
-            [refined],
+            "fit_offsets",
+            lambda backend: _native.fit_offsets(backend, offset, left, right, fitted),
+            [fitted],
             pixels,
         ),
         Kernel("depth_candidates", candidates, [depth, sigma], pixels),
@@ -270,10 +271,10 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
     support = np.full(shape, 2, np.uint8)
     counts, sums = np.empty((3, *shape), np.uint8), np.empty((2, *shape), np.float32)
 
-    def check_consistency(backend: str) -> None:
+    def compare_depths(backend: str) -> None:
         counts.fill(0)
         sums.fill(0)
-        _native.check_consistency(backend, *maps[0], *maps[1], support, beside, back, 2.0, 4.5, 2, *counts, *sums)
+        _native.compare_depths(backend, *maps[0], *maps[1], support, beside, back, 2.0, 4.5, 2, *counts, *sums)
 
     inverse = scene.disparity / focal
     planes = np.stack([inverse, *np.gradient(inverse)[::-1]]).astype(np.float32)
@@ -285,7 +286,7 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
         _native.add_patch_equations(backend, scene.left, sources, transfers, planes, 0, 1, 20.0, 0.5, equations)
 
     return [
-        Kernel("check_consistency", check_consistency, [counts, sums], pixels),
+        Kernel("compare_depths", compare_depths, [counts, sums], pixels),
         Kernel("add_patch_equations", add_patch_equations, [equations], SOURCES * pixels),
     ]
 

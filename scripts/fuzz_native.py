@@ -91,7 +91,7 @@ def match(rng: Random) -> Arguments:
     return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
 
 
-def refine_offsets(rng: Random) -> Arguments:
+def fit_offsets(rng: Random) -> Arguments:
     (h, w), target = size(rng), int(rng.integers(0, 70))
     offset = filled(rng, (h, w), np.int32)
     if rng.random() < 0.7:  # one surface within the target, in 1/256 pixel
@@ -120,7 +120,7 @@ def vote_depth(rng: Random) -> Arguments:
     return [*inputs, number(rng), *(np.zeros((h, w), kind) for kind in (np.float32, np.float32, np.uint8))]
 
 
-def check_consistency(rng: Random) -> Arguments:
+def compare_depths(rng: Random) -> Arguments:
     sizes = [size(rng)] * 2 + [size(rng)] * 2
     inputs = [filled(rng, shape, np.float32) for shape in sizes]
     support, least = filled(rng, sizes[2], np.uint8), int(rng.integers(-1, 4))
@@ -224,11 +224,11 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         aggregation,
         selection,
         match,
-        refine_offsets,
+        fit_offsets,
         transfer_disparity,
         depth_candidates,
         vote_depth,
-        check_consistency,
+        compare_depths,
         fuse_partner,
         count_points,
         write_points,

@@ -140,7 +140,7 @@ def _costs_around(offset, reference, target, y, x):
     return None if max(words) >= CENSUS_INVALID else [(w ^ int(reference[y, x])).bit_count() for w in words]
 
 
-def refine_offsets(offset, reference, target):
+def fit_offsets(offset, reference, target):
     """Offsets (H, W) int32 in 1/256 pixel, refined by the V of the raw costs in a 5 x 5 window along its plane."""
     height, width = offset.shape
     ring = np.maximum(*np.abs(np.mgrid[-2:3, -2:3]))
@@ -239,7 +239,7 @@ def _read_depth(depth, u, v):
     return 1 / (weights / corners).sum()
 
 
-def check_consistency(view, depth, sigma, partner, maps, max_error, tolerance, min_support):
+def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_support):
     """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner sees the point or would if it had a depth
     there, the partner's depth and sigma, clearance.
 

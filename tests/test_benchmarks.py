@@ -63,8 +63,8 @@ def test_the_whole_benchmark_of_kernels(kernels, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", arguments)
     kernels.main()
     printed = capsys.readouterr().out
-    of_images = ("census", "refine_offsets", "depth_candidates", "fit_planes")
-    for name in (*of_images, "check_consistency", "add_patch_equations"):
+    of_images = ("census", "fit_offsets", "depth_candidates", "fit_planes")
+    for name in (*of_images, "compare_depths", "add_patch_equations"):
         assert re.search(rf"^\| {name} \| - \| Mpixel/s \|", printed, re.MULTILINE)
     for depth in (96, 32, 64):
         for name in ("matching_cost", "aggregation", "selection", "match"):

@@ -350,7 +350,7 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
     forward[:, 3] = partner.t - partner.R @ reference.R.T @ reference.t
     back = np.hstack([reference.R @ partner.R.T @ np.linalg.inv(partner.K), np.zeros((3, 1))])
     back[:, 3] = reference.t - reference.R @ partner.R.T @ partner.t
-    _native.check_consistency(
+    _native.compare_depths(
         kernels,
         maps[0],
         sigmas[0],
@@ -368,7 +368,7 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
         weighted,
         weight,
     )
-    verdict, seen, carried, spread, clearance = oracle.check_consistency(
+    verdict, seen, carried, spread, clearance = oracle.compare_depths(
         reference, maps[0], sigmas[0], partner, (maps[1], sigmas[1], support), max_error, 4.0, 2
     )
     clear = clearance > 1e-4
@@ -400,7 +400,7 @@ def test_consistency_does_not_depend_on_the_backend(size, shift, odd):
     for kernels in _native.backends():
         sums = [np.full(size, counted, np.uint8) for counted in (0, 254, 255)]
         sums += [np.full(size, -0.0, np.float32), np.full(size, 2, np.float32)]
-        _native.check_consistency(
+        _native.compare_depths(
             kernels, maps[0], maps[1], maps[2], maps[3], support, forward, back, 2.0, 4.0, 2, *sums
         )
         results.append(sums)
@@ -422,7 +422,7 @@ def test_at_the_rim_the_nearest_depth_is_taken():
             support = np.ones((2, 3), np.uint8)
             matrices = (forward, back)
             sigmas = maps[1]
-            _native.check_consistency(
+            _native.compare_depths(
                 kernels,
                 maps[0],
                 sigmas,

@@ -294,13 +294,13 @@ def test_selection_reaches_the_widest_row(backend, width):
     np.testing.assert_array_equal(offset, 0)
 
 
-# ---- sub-pixel refinement ----------------------------------------------------------------------------------
+# ---- sub-pixel fit ----------------------------------------------------------------------------------
 
 
-def run_refinement(backend, offset, reference, target):
-    refined = np.full(offset.shape, 5, dtype=np.int32)
-    _native.refine_offsets(backend, offset, reference, target, refined)
-    return refined
+def run_fit(backend, offset, reference, target):
+    fitted = np.full(offset.shape, 5, dtype=np.int32)
+    _native.fit_offsets(backend, offset, reference, target, fitted)
+    return fitted
 
 
 OFFSETS = {
@@ -323,7 +323,7 @@ OFFSETS = {
     likeness=st.sampled_from([0.0, 0.5, 0.9]),
     seed=seeds,
 )
-def test_refinement_is_the_oracles(backend, size, target_width, kind, missing, likeness, seed):
+def test_the_fit_is_the_oracles(backend, size, target_width, kind, missing, likeness, seed):
     rng = np.random.default_rng(seed)
     reference, target = words(rng, size, 0), words(rng, (size[0], target_width), 0.05)
     common = min(size[1], target_width)
@@ -332,13 +332,13 @@ def test_refinement_is_the_oracles(backend, size, target_width, kind, missing, l
     offset = OFFSETS[kind](rng, size).astype(np.int32)
     offset[rng.random(size) < missing] = oracle.OFFSET_INVALID
     np.testing.assert_array_equal(
-        run_refinement(backend, offset, reference, target), oracle.refine_offsets(offset, reference, target)
+        run_fit(backend, offset, reference, target), oracle.fit_offsets(offset, reference, target)
     )
 
 
 @every_backend
 @pytest.mark.parametrize("position", [-100, 0, 64, 120])
-def test_refinement_finds_the_tip_between_whole_pixels(backend, position):
+def test_the_fit_finds_the_tip_between_whole_pixels(backend, position):
     """Costs that grow by 20 bits per pixel from a tip at `position` / 256 pixel: the tip is found."""
     content = np.zeros((9, 30), dtype=np.uint64)
     columns = np.arange(30)
@@ -347,8 +347,8 @@ def test_refinement_finds_the_tip_between_whole_pixels(backend, position):
     target = np.broadcast_to(np.array([(1 << min(c, 62)) - 1 for c in costs], dtype=np.uint64), (9, 30)).copy()
     offset = np.full((9, 30), oracle.OFFSET_INVALID, dtype=np.int32)
     offset[:, 13:18] = 256 * (15 - columns[13:18])
-    refined = run_refinement(backend, offset, content, target)
-    assert np.abs(refined[2:-2, 15] - position).max() <= 8
+    fitted = run_fit(backend, offset, content, target)
+    assert np.abs(fitted[2:-2, 15] - position).max() <= 8
 
 
 # ---- the whole chain ---------------------------------------------------------------------------------------

@@ -67,11 +67,11 @@ def arguments(function):
             "out scratch": np.zeros((2, H * W, DEPTH), u8),
             "out offset": np.zeros((H, W), np.int32),
         },
-        "refine_offsets": {
+        "fit_offsets": {
             "backend": "scalar",
             "offset": np.zeros((H, W), np.int32),
             **census_pair,
-            "out refined": np.zeros((H, W), np.int32),
+            "out fitted": np.zeros((H, W), np.int32),
         },
         "transfer_disparity": {
             "left": np.zeros((H, W), f32),
@@ -102,7 +102,7 @@ def arguments(function):
             "out sigma": np.zeros((H, W), f32),
             "out support": np.zeros((H, W), u8),
         },
-        "check_consistency": {
+        "compare_depths": {
             "backend": "scalar",
             "depth": np.ones((H, W), f32),
             "sigma": np.ones((H, W), f32),
@@ -220,11 +220,11 @@ FUNCTIONS = [
     "aggregation",
     "selection",
     "match",
-    "refine_offsets",
+    "fit_offsets",
     "transfer_disparity",
     "depth_candidates",
     "vote_depth",
-    "check_consistency",
+    "compare_depths",
     "fuse_partner",
     "count_points",
     "write_points",
@@ -251,7 +251,7 @@ FREE = {
     ("matching_cost", "target"): {1},
     ("selection", "target"): {1},
     ("match", "target"): {1},
-    ("refine_offsets", "target"): {1},
+    ("fit_offsets", "target"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -699,7 +699,7 @@ def test_empty_maps_are_no_work(shape):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
         for backend in BACKENDS:
             maps = reference, reference, other, other, np.ones(other.shape, np.uint8)
-            _native.check_consistency(backend, *maps, matrix, matrix, 1.0, 4.0, 2, *counts)
+            _native.compare_depths(backend, *maps, matrix, matrix, 1.0, 4.0, 2, *counts)
             assert not any(count.any() for count in counts)
         fuse_empty(reference, other, matrix)
     _native.fit_planes(

@@ -34,9 +34,9 @@
      aggregation_##version, \
      selection_##version, \
      match_##version, \
-     refine_offsets_##version, \
+     fit_offsets_##version, \
      depth_candidates_##version, \
-     check_consistency_##version, \
+     compare_depths_##version, \
      fit_planes_##version, \
      add_patch_equations_##version}
 
@@ -56,7 +56,7 @@ static int has_avx2(void) {
 #ifdef COLMAP_SPH_HAVE_AVX512
 #define census_avx512 census_avx2
 #define depth_candidates_avx512 depth_candidates_avx2
-#define check_consistency_avx512 check_consistency_avx2
+#define compare_depths_avx512 compare_depths_avx2
 WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
 

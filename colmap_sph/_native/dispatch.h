@@ -12,9 +12,9 @@ typedef struct {
     aggregation_fn *aggregation;
     selection_fn *selection;
     match_fn *match;
-    refine_offsets_fn *refine_offsets;
+    fit_offsets_fn *fit_offsets;
     depth_candidates_fn *depth_candidates;
-    check_consistency_fn *check_consistency;
+    compare_depths_fn *compare_depths;
     fit_planes_fn *fit_planes;
     add_patch_equations_fn *add_patch_equations;
 } kernel_table;

@@ -70,7 +70,7 @@ class EvaluationOptions:
     @property
     def worker_count(self) -> int:
         """`threads` with its default filled in."""
-        return self.threads or os.cpu_count() or 1
+        return self.threads or len(os.sched_getaffinity(0))
 
     def check(self) -> None:
         """Raise `OptionError` for the first option out of its bounds."""

@@ -82,7 +82,7 @@ def confirm_depth(
     weighted = np.zeros(shape, np.float32)
     weight = np.zeros(shape, np.float32)
     for partner, partner_estimate in partners:
-        _native.check_consistency(
+        _native.compare_depths(
             backend(),
             estimate.depth,
             estimate.sigma,

@@ -22,7 +22,7 @@ from colmap_sph.stereo.offsets import remove_small_segments, smooth, to_disparit
 from colmap_sph.stereo.search_ranges import MAX_DEPTH, STEP, num_levels, propagate, range_depth, whole_range
 
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
-# Census compares 1/64 grey values, see CENSUS_MARGIN in `kernels.h`: on weak texture, whole ones are too coarse.
+# Census compares 1/64 grey values, see CENSUS_MARGIN in `matching.h`: on weak texture, whole ones are too coarse.
 _CENSUS_STEPS = 64
 # Unsharp masking, which gives back some of what lenses and resampling took away: so much of the difference from
 # the binomial mean of 3 x 3 pixels is added.
@@ -279,7 +279,7 @@ def _match_level(
     if not finest:
         return offset
     fitted = np.empty_like(offset)
-    _native.refine_offsets(kernels, offset, left_census, right_census, fitted)
+    _native.fit_offsets(kernels, offset, left_census, right_census, fitted)
     return fitted
 
 

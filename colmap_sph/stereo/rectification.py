@@ -47,7 +47,7 @@ class RectificationOptions:
     """Surfaces are looked for down to the distance of the nearest sparse points divided by this: treetops and
     roofs often carry no sparse point."""
     far_margin: float = 1.5
-    """… and up to the distance of the farthest sparse points times this."""
+    """Surfaces are looked for up to the distance of the farthest sparse points times this."""
     max_pixels_ratio: float = 8.0
     """A pair is given up when its rectified images have more pixels than this times the originals."""
 

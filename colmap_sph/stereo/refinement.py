@@ -25,7 +25,7 @@ _BAND_ROWS = 32
 _SURVEY_ROWS = 16
 # Partners that bring the planes near in the rounds before the last.
 _FIRST_PARTNERS = 3
-# Arrays of equations, and sources of one call; see `kernels.h`.
+# Arrays of equations, and sources of one call; see `depth.h`.
 _EQUATIONS = 12
 _SOURCES = 32
 

@@ -104,12 +104,11 @@ typedef struct {
 } consistency_sums;
 
 /* Adds the partner's verdict on every pixel of the reference. */
-typedef void check_consistency_fn(const depth_map *reference, const depth_map *partner,
-                                  const view_transfer *transfer, consistency_gates gates,
-                                  const consistency_sums *sums);
+typedef void compare_depths_fn(const depth_map *reference, const depth_map *partner, const view_transfer *transfer,
+                               consistency_gates gates, const consistency_sums *sums);
 
 depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
-check_consistency_fn check_consistency_scalar, check_consistency_avx2;
+compare_depths_fn compare_depths_scalar, compare_depths_avx2;
 fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512;
 add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512;
 

@@ -80,7 +80,7 @@ static int run_vote_depth(void *arguments) {
 FUNCTION(vote_depth, VOTE_DEPTH, any,
          "The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size.");
 
-#define CHECK_CONSISTENCY(X) \
+#define COMPARE_DEPTHS(X) \
     X(VALUE, backend, backend) \
     X(IN, float32, depth, H, W) \
     X(IN, float32, sigma, H, W) \
@@ -97,19 +97,19 @@ FUNCTION(vote_depth, VOTE_DEPTH, any,
     X(OUT, uint8, contradicting, H, W) \
     X(OUT, float32, weighted_depth, H, W) \
     X(OUT, float32, weight, H, W)
-ARGUMENTS(check_consistency, CHECK_CONSISTENCY);
+ARGUMENTS(compare_depths, COMPARE_DEPTHS);
 
 static int check_maps(ptrdiff_t height, ptrdiff_t width) {
     return check(height <= INT32_MAX && width <= INT32_MAX, "maps are limited to 2^31 - 1 rows and columns");
 }
 
-static int check_check_consistency(const void *arguments) {
-    const check_consistency_arguments *a = arguments;
+static int check_compare_depths(const void *arguments) {
+    const compare_depths_arguments *a = arguments;
     return check_maps(a->size.H, a->size.W) && check_maps(a->size.PARTNER_H, a->size.PARTNER_W);
 }
 
-static int run_check_consistency(void *arguments) {
-    const check_consistency_arguments *a = arguments;
+static int run_compare_depths(void *arguments) {
+    const compare_depths_arguments *a = arguments;
     const depth_map reference = {a->depth, a->sigma, NULL, a->size.H, a->size.W};
     const depth_map partner = {a->partner_depth, a->partner_sigma, a->partner_support, a->size.PARTNER_H,
                                a->size.PARTNER_W};
@@ -118,11 +118,11 @@ static int run_check_consistency(void *arguments) {
     view_transfer transfer;
     split_transfer(a->partner_from_reference, transfer.pixel_from_reference, transfer.translation);
     split_transfer(a->reference_from_partner, transfer.reference_from_pixel, transfer.back_translation);
-    a->backend->check_consistency(&reference, &partner, &transfer, gates, &sums);
+    a->backend->compare_depths(&reference, &partner, &transfer, gates, &sums);
     return 0;
 }
 
-FUNCTION(check_consistency, CHECK_CONSISTENCY, check_check_consistency,
+FUNCTION(compare_depths, COMPARE_DEPTHS, check_compare_depths,
          "Add what a partner's depth map says of a view's to the sums over all partners.");
 
 #define CONFIRM_DEPTH(X) \
@@ -147,10 +147,9 @@ static int run_confirm_depth(void *arguments) {
     return 0;
 }
 
-FUNCTION(
-    confirm_depth, CONFIRM_DEPTH, any,
-    "Turn the sums of check_consistency into the geometric map: `weighted_depth` becomes depth, `weight` its\n"
-    "deviation, `agreeing` its support; `contradicting` is spoilt.");
+FUNCTION(confirm_depth, CONFIRM_DEPTH, any,
+         "Turn the sums of compare_depths into the geometric map: `weighted_depth` becomes depth, `weight` its\n"
+         "deviation, `agreeing` its support; `contradicting` is spoilt.");
 
 #define FIT_PLANES(X) \
     X(VALUE, backend, backend) \
@@ -250,5 +249,5 @@ FUNCTION(refine_planes, REFINE_PLANES, any, "Move planes by the solution of thei
 
 native_function *const depth_functions[] = {
     &transfer_disparity_function,  &depth_candidates_function, &vote_depth_function,
-    &check_consistency_function,   &confirm_depth_function,    &fit_planes_function,
+    &compare_depths_function,      &confirm_depth_function,    &fit_planes_function,
     &add_patch_equations_function, &refine_planes_function,    NULL};

@@ -1,5 +1,5 @@
 /* The second pass of the vectorised selection over a row, see selection_vector.c: eight winners at once are
- * checked and refined. */
+ * checked and fitted. */
 #include <immintrin.h>
 
 #include "matching/rows.h"

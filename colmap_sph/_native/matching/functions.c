@@ -164,26 +164,26 @@ static int run_match(void *arguments) {
 FUNCTION(match, MATCH, check_match,
          "Matching cost, aggregation and selection in one, in bands of so many rows as BAND pixels are.");
 
-#define REFINE_OFFSETS(X) \
+#define FIT_OFFSETS(X) \
     X(VALUE, backend, backend) \
     X(IN, int32, offset, H, W) \
     X(IN, uint64, reference, H, W) \
     X(IN, uint64, target, H, TARGET_W) \
-    X(OUT, int32, refined, H, W)
-ARGUMENTS(refine_offsets, REFINE_OFFSETS);
+    X(OUT, int32, fitted, H, W)
+ARGUMENTS(fit_offsets, FIT_OFFSETS);
 
-static int check_refine_offsets(const void *arguments) {
-    const refine_offsets_arguments *a = arguments;
+static int check_fit_offsets(const void *arguments) {
+    const fit_offsets_arguments *a = arguments;
     return check_widths(&a->size);
 }
 
-static int run_refine_offsets(void *arguments) {
-    const refine_offsets_arguments *a = arguments;
+static int run_fit_offsets(void *arguments) {
+    const fit_offsets_arguments *a = arguments;
     const match_size size = {a->size.H, a->size.W, a->size.TARGET_W, 0};
-    return a->backend->refine_offsets(a->offset, a->reference, a->target, size, a->refined);
+    return a->backend->fit_offsets(a->offset, a->reference, a->target, size, a->fitted);
 }
 
-FUNCTION(refine_offsets, REFINE_OFFSETS, check_refine_offsets,
+FUNCTION(fit_offsets, FIT_OFFSETS, check_fit_offsets,
          "Offsets fitted to the raw costs of a window around each pixel, in 1/256 pixel.");
 
 native_function *const matching_functions[] = {&census_function,
@@ -191,5 +191,5 @@ native_function *const matching_functions[] = {&census_function,
                                                &aggregation_function,
                                                &selection_function,
                                                &match_function,
-                                               &refine_offsets_function,
+                                               &fit_offsets_function,
                                                NULL};

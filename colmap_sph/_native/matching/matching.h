@@ -17,8 +17,8 @@ enum {
     NO_SLOT = 192,
     DEPTH_STEP = 32,
     MAX_DEPTH = 1024,
-    MAX_OFFSET_STEP = 512, /* 1/256 pixel: neighbours whose offsets differ by more are not one surface */
-    MAX_REFINEMENT = 256   /* 1/256 pixel */
+    MAX_OFFSET_STEP = 512,  /* 1/256 pixel: neighbours whose offsets differ by more are not one surface */
+    MAX_OFFSET_CHANGE = 256 /* 1/256 pixel */
 };
 
 /* Census images come in 1/64 grey value (_CENSUS_STEPS in matching.py); a difference up to half a grey value,
@@ -78,10 +78,10 @@ typedef struct {
 typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint8_t *scratch, int32_t *offset);
 
 /* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
-typedef int refine_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
-                              match_size size, int32_t *refined);
+typedef int fit_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                           match_size size, int32_t *fitted);
 
 census_fn census_scalar, census_avx2;
-refine_offsets_fn refine_offsets_scalar, refine_offsets_avx2, refine_offsets_avx512;
+fit_offsets_fn fit_offsets_scalar, fit_offsets_avx2, fit_offsets_avx512;
 
 #endif

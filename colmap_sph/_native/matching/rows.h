@@ -54,7 +54,7 @@ typedef void selection_row_fn(const uint8_t *sums, const int32_t *base, const ui
                               const uint64_t *target, match_size size, left_right_check check,
                               selection_buffers *buffers, int32_t *offset);
 
-/* The second half of the vectorised selection: what is left of `buffers->winner`, refined. */
+/* The second half of the vectorised selection: what is left of `buffers->winner`, fitted. */
 void check_winners_avx2(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
                         left_right_check check, const selection_buffers *buffers, int32_t *offset);
 

@@ -1,5 +1,5 @@
 /* Selection of a row in two passes. The first one over the sums finds each pixel's winner and the target pixels'
- * least sums; the second one checks and refines the winners (check_winners_avx2.c, for AVX-512, too). */
+ * least sums; the second one checks and fits the winners (check_winners_avx2.c, for AVX-512, too). */
 #include <immintrin.h>
 
 #include <string.h>

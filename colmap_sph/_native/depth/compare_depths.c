@@ -137,9 +137,9 @@ static inline void add_depths(const float *values, const int32_t *agreed, ptrdif
     }
 }
 
-void VERSION_OF(check_consistency)(const depth_map *reference, const depth_map *partner,
-                                   const view_transfer *transfer, consistency_gates gates,
-                                   const consistency_sums *sums) {
+void VERSION_OF(compare_depths)(const depth_map *reference, const depth_map *partner,
+                                const view_transfer *transfer, consistency_gates gates,
+                                const consistency_sums *sums) {
     block k;
     memset(&k, 0, sizeof k);
     for (ptrdiff_t row = 0; row < reference->height; row++) {

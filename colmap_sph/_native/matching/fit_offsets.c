@@ -1,9 +1,9 @@
-/* Sub-pixel refinement.
+/* The sub-pixel fit of offsets.
  *
  * Around each pixel a plane is fitted to the offsets of its own surface. Raw matching costs, summed over the
  * window along that plane and one pixel to either side of it, make a V whose tip is where the window really
  * matches. Aggregated costs cannot tell: P1 holds neighbours on the same whole pixel. Neighbouring pixels are
- * refined side by side, each in a lane of its own. */
+ * fitted side by side, each in a lane of its own. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -137,8 +137,8 @@ static inline offset_planes fit_offsets(lanes difference[SIDE][SIDE]) {
     return (offset_planes){v & found, vx & found, vy & found, found};
 }
 
-/* Refined offsets of pixels of the middle row, the first at x. */
-static inline lanes refine_pixels(const window_row rows[SIDE], ptrdiff_t x, lanes centre) {
+/* Fitted offsets of pixels of the middle row, the first at x. */
+static inline lanes fit_pixels(const window_row rows[SIDE], ptrdiff_t x, lanes centre) {
     lanes difference[SIDE][SIDE];
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++) {
@@ -174,11 +174,11 @@ static inline lanes refine_pixels(const window_row rows[SIDE], ptrdiff_t x, lane
     const lanes one = (lanes){0} + 1;
     const lanes tip = quotient((before - after) * 128, choose(good, rise, one)) & (at != 0);
     const lanes change = nearest_256_lanes(plane.value) + tip - quotient(rounded, choose(good, count, one));
-    return centre + (change & good & (absolute(change) <= MAX_REFINEMENT));
+    return centre + (change & good & (absolute(change) <= MAX_OFFSET_CHANGE));
 }
 
-int VERSION_OF(refine_offsets)(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
-                               match_size size, int32_t *refined) {
+int VERSION_OF(fit_offsets)(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
+                            match_size size, int32_t *fitted) {
     const ptrdiff_t stride = size.width + 2 * RADIUS + LANES;
     int32_t *offsets = malloc((size_t)(SIDE * stride) * sizeof *offsets);
     uint32_t *costs = malloc((size_t)(SIDE * stride) * sizeof *costs);
@@ -191,10 +191,10 @@ int VERSION_OF(refine_offsets)(const int32_t *offset, const uint64_t *reference,
     for (ptrdiff_t y = 0; y < size.height && !failed; y++) {
         for (ptrdiff_t x = 0; x < size.width; x += LANES) {
             const lanes centre = load_lanes(rows[RADIUS].offset + x), none = centre == NONE;
-            const lanes result = refine_pixels(rows, x, centre & ~none);
+            const lanes result = fit_pixels(rows, x, centre & ~none);
             const ptrdiff_t p = y * size.width + x, left = size.width - x;
             for (ptrdiff_t l = 0; l < (left < LANES ? left : LANES); l++) {
-                refined[p + l] = none[l] ? offset[p + l] : result[l];
+                fitted[p + l] = none[l] ? offset[p + l] : result[l];
             }
         }
         const window_row oldest = rows[0];
