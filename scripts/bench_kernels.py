@@ -221,7 +221,7 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     """The kernels that work on images, on the results of those before them."""
     left, right = census_pair(scene)
     census = np.empty_like(left)
-    fitted = np.empty(scene.shape, np.int32)
+    fitted_offset = np.empty(scene.shape, np.int32)
     offset = np.round(-256 * scene.disparity).astype(np.int32)
     # A camera whose focal length is its width: the sphere's columns and rows are about its own.
     height, width = scene.shape
@@ -251,8 +251,8 @@ def image_kernels(scene: Scene) -> list[Kernel]:
         Kernel("census", lambda backend: _native.census(backend, padded, valid, census), [census], pixels),
         Kernel(
             "fit_offsets",
-            lambda backend: _native.fit_offsets(backend, offset, left, right, fitted),
-            [fitted],
+            lambda backend: _native.fit_offsets(backend, offset, left, right, fitted_offset),
+            [fitted_offset],
             pixels,
         ),
         Kernel("depth_candidates", candidates, [depth, sigma], pixels),

@@ -10,28 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_sph"
 # Made or written elsewhere, may be missing.
-OPTIONAL = {ROOT / "CHANGELOG.md", ROOT / "docs" / "options.md"}
-DOCUMENTS = [
-    path for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md") if path.exists()
-]
-DOCUMENTS += sorted((ROOT / "docs").glob("*.md"))
-# Modules that the documents name ahead of them; to be taken out as they come.
-ANNOUNCED = {
-    "app/spelling.py",
-    "pipeline/confirm.py",
-    "pipeline/execute.py",
-    "pipeline/fuse.py",
-    "pipeline/match.py",
-    "pipeline/stage.py",
-    "pipeline/vote.py",
-    "project/cameras.py",
-    "stereo/covisibility.py",
-    "stereo/disparity_range.py",
-    "stereo/extent.py",
-    "stereo/offsets.py",
-    "stereo/search_ranges.py",
-}
-
+DOCUMENTS = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").glob("*.md"))]
 _FENCE = re.compile(r"^(```|~~~).*?^\1", re.MULTILINE | re.DOTALL)
 _LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 _CODE = re.compile(r"`([^`\n]+)`")
@@ -68,8 +47,6 @@ def links_of_all() -> list[tuple[Path, str]]:
 def test_links_lead_somewhere(document: Path, target: str) -> None:
     path, _, anchor = target.partition("#")
     there = (document.parent / path).resolve() if path else document
-    if there in OPTIONAL and not there.exists():
-        pytest.skip(f"{there.name} is not there")
     assert there.is_relative_to(ROOT) and there.exists()
     if anchor:
         assert anchor in anchors(there)
@@ -80,8 +57,7 @@ def test_named_files_exist(document: Path) -> None:
     """A path in backticks is one of the repository, its scripts, the package, or one of its rooms."""
     rooms = [ROOT, ROOT / "scripts", PACKAGE, *(folder for folder in PACKAGE.iterdir() if folder.is_dir())]
     named = {name for code in _CODE.findall(prose(document)) for name in _PATH.findall(code)}
-    missing = {name for name in named if not any((room / name).exists() for room in rooms)}
-    assert missing <= ANNOUNCED
+    assert {name for name in named if not any((room / name).exists() for room in rooms)} == set()
 
 
 def test_every_figure_is_shown() -> None:
