@@ -48,7 +48,8 @@ _VARIANTS: dict[str, list[str]] = {
     "five pairs": ["--num-pairs", "5"],
     "planar rectification": ["--rectification", "frame"],
 }
-_MIN_TRACK, _MAX_ERROR = 5, 0.7
+_MIN_TRACK = 5
+_MAX_ERROR = 0.7
 
 
 def run(command: list[str]) -> None:
@@ -84,7 +85,8 @@ def exact_scores(arguments: argparse.Namespace, folder: Path, _report: dict[str,
     truth = ["--reference", str(arguments.reference), "--depth-scale", str(arguments.depth_scale)]
     run([*cloud, *truth, "--gsd", str(arguments.gsd)])
     scores = json.loads(file.read_text())
-    maps, cloud_scores = scores["depth_maps"]["mean"], scores["clouds"][0]["thresholds"]
+    maps = scores["depth_maps"]["mean"]
+    cloud_scores = scores["clouds"][0]["thresholds"]
     rows = [[f"{100 * one[k]:.1f}" for one in cloud_scores] for k in ("accuracy", "completeness", "f_score")]
     means = [maps["coverage"], *maps["within"][:2]]
     return [*(f"{100 * mean:.1f}" for mean in means), *(" / ".join(row) for row in rows)]

@@ -192,8 +192,10 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
     scratch = np.empty((2, scene.base.size, scene.depth), np.uint8)
     detours = scratch[0].reshape(volume)
     selected, matched = np.empty(scene.shape, np.int32), np.empty(scene.shape, np.int32)
-    base, image = scene.base, scene.left
-    p1, slant = OPTIONS.p1, OPTIONS.max_slant
+    base = scene.base
+    image = scene.left
+    p1 = OPTIONS.p1
+    slant = OPTIONS.max_slant
     limits = OPTIONS.max_left_right_difference, OPTIONS.max_left_right_excess
 
     def matching_cost(backend: str) -> None:
@@ -227,10 +229,12 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     height, width = scene.shape
     K = np.array([[width, 0, width / 2], [0, width, height / 2], [0, 0, 1]], dtype=np.float64)
     origins = (-width * np.arctan(0.5), -width * np.arctan(0.5 * height / width))
-    inverse_K, disparity = np.linalg.inv(K), scene.disparity
+    inverse_K = np.linalg.inv(K)
+    disparity = scene.disparity
     depth, sigma, fitted = (np.empty(scene.shape, np.float32) for _ in range(3))
     normals = np.empty((*scene.shape, 3), np.float32)
-    padded, valid = with_border(scene.left), np.full(scene.shape, 255, dtype=np.uint8)
+    padded = with_border(scene.left)
+    valid = np.full(scene.shape, 255, dtype=np.uint8)
 
     def candidates(backend: str) -> None:
         arguments = ((width, width), origins, 0.0, 1.0, 0.25, 1.0, True, True, 0, depth, sigma)
@@ -240,7 +244,8 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     with np.errstate(divide="ignore", invalid="ignore"):
         inverse = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
     inverse_sigma = (sigma * inverse * inverse).astype(np.float32)
-    window, support = NormalOptions(), np.ones(scene.shape, np.uint8)
+    window = NormalOptions()
+    support = np.ones(scene.shape, np.uint8)
 
     def fit(backend: str) -> None:
         gates = (window.radius, window.tolerance, window.max_shift, 2.0, 0.0, 0)
@@ -262,9 +267,12 @@ def image_kernels(scene: Scene) -> list[Kernel]:
 
 def partner_kernels(scene: Scene) -> list[Kernel]:
     """The kernels that compare a view with its partners: the right camera stands one unit beside the left one."""
-    focal, shape, pixels = float(scene.shape[1]), scene.shape, scene.base.size
+    focal = float(scene.shape[1])
+    shape = scene.shape
+    pixels = scene.base.size
     beside = np.column_stack([np.eye(3), [-focal, 0, 0]])
-    from_right, back = np.empty(shape, np.float32), beside * np.where(np.arange(4) == 3, -1, 1)
+    from_right = np.empty(shape, np.float32)
+    back = beside * np.where(np.arange(4) == 3, -1, 1)
     _native.transfer_disparity(scene.disparity, 2.0, from_right)
     known = [np.where(map_ > 0, map_, np.inf) for map_ in (scene.disparity, from_right)]  # no depth: 0
     maps = [((focal / one).astype(np.float32), (0.3 * focal / one**2).astype(np.float32)) for one in known]
@@ -278,7 +286,8 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
 
     inverse = scene.disparity / focal
     planes = np.stack([inverse, *np.gradient(inverse)[::-1]]).astype(np.float32)
-    sources, transfers = (scene.right,) * SOURCES, np.stack([beside] * SOURCES)
+    sources = (scene.right,) * SOURCES
+    transfers = np.stack([beside] * SOURCES)
     equations = np.empty((12, *shape), np.float32)
 
     def add_patch_equations(backend: str) -> None:
@@ -394,7 +403,8 @@ def limit_mde(work: dict[int, float], traffic: float, throughput: dict[int, floa
 
 def print_limits(version: str, timings: Sequence[Timing]) -> None:
     """The machine's limits, and how near to them this version's matching kernels come."""
-    bandwidth, traffic = copy_bandwidth(), TRAFFIC["match"]
+    bandwidth = copy_bandwidth()
+    traffic = TRAFFIC["match"]
     print(
         f"\nCopy bandwidth, read and written: {bandwidth / 1e9:.1f} GB/s; `match` moves {traffic} bytes per ",
         end="",

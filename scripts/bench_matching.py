@@ -97,7 +97,8 @@ def seen_by_both(truth: NDArray[np.float32]) -> NDArray[np.bool_]:
 def score(found: NDArray[np.float32], truth: NDArray[np.float32], seconds: float) -> Score:
     """Compare with the truth where that is known and inside the right image."""
     known = np.isfinite(truth) & (np.arange(truth.shape[1]) >= np.nan_to_num(truth))
-    matched, seen = known & np.isfinite(found), seen_by_both(truth)
+    matched = known & np.isfinite(found)
+    seen = seen_by_both(truth)
     error = np.abs(found - truth)
     shares = [
         np.histogram(values[matched] % 1, bins=_BINS, range=(0, 1))[0] / max(matched.sum(), 1)

@@ -75,7 +75,8 @@ def depth_map_pixels(workspace: Path) -> int:
 def measure(model: Path, images: Path | None, setting: Setting) -> Measured:
     """One run into a folder of its own; ends the program if it fails."""
     with tempfile.TemporaryDirectory(prefix="bench_pipeline_") as folder:
-        workspace, log = Path(folder) / "dense", Path(folder) / "output.txt"
+        workspace = Path(folder) / "dense"
+        log = Path(folder) / "output.txt"
         arguments = [*command(), "run", "--model", str(model), "--output", str(workspace)]
         arguments += ["--threads", str(setting.threads), "--num-pairs", str(setting.num_pairs)]
         arguments += ["--images", str(images)] if images else []

@@ -147,7 +147,8 @@ def judge(moment: float, finished: dict[Path, int], workspace: Path, whole: Path
 
 def finished_files(workspace: Path) -> dict[Path, int]:
     """Time stamps of the results that are complete: of maps and cloud those which a record vouches for."""
-    state, stereo = workspace / "colmap_sph", workspace / "stereo"
+    state = workspace / "colmap_sph"
+    stereo = workspace / "stereo"
     files = [*state.glob("pairs/*.npz"), *state.glob("photometric/**/*.npz")]
     for record in state.glob("state/**/*.json"):
         name = record.relative_to(state / "state").with_suffix(".bin")

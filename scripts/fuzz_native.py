@@ -62,31 +62,45 @@ def census(rng: Random) -> Arguments:
 
 
 def matching_cost(rng: Random) -> Arguments:
-    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
+    h, w = size(rng)
+    target = int(rng.integers(0, 70))
+    depth = 32 * int(rng.integers(1, 4))
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
     return [backend(rng), *words, filled(rng, (h, w), np.int32), np.zeros((h, w, depth), np.uint8)]
 
 
 def aggregation(rng: Random) -> Arguments:
-    (h, w), depth, p1 = size(rng), 32 * int(rng.integers(1, 4)), int(rng.integers(0, 64))
-    cost, image = filled(rng, (h, w, depth), np.uint8), filled(rng, (h, w), np.uint8)
+    h, w = size(rng)
+    depth = 32 * int(rng.integers(1, 4))
+    p1 = int(rng.integers(0, 64))
+    cost = filled(rng, (h, w, depth), np.uint8)
+    image = filled(rng, (h, w), np.uint8)
     p2 = rng.integers(p1, 128, 256).astype(np.uint8)
-    base, sums = filled(rng, (h, w), np.int32), np.zeros((h, w, depth), np.uint8)
+    base = filled(rng, (h, w), np.int32)
+    sums = np.zeros((h, w, depth), np.uint8)
     return [backend(rng), cost, base, image, p1, p2, int(rng.integers(0, 5)), np.zeros_like(cost), sums]
 
 
 def selection(rng: Random) -> Arguments:
-    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
-    sums, base = filled(rng, (h, w, depth), np.uint8), filled(rng, (h, w), np.int32)
+    h, w = size(rng)
+    target = int(rng.integers(0, 70))
+    depth = 32 * int(rng.integers(1, 4))
+    sums = filled(rng, (h, w, depth), np.uint8)
+    base = filled(rng, (h, w), np.int32)
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
     return [backend(rng), sums, base, *words, *rng.integers(0, (5, 99)).tolist(), np.zeros((h, w), np.int32)]
 
 
 def match(rng: Random) -> Arguments:
-    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
+    h, w = size(rng)
+    target = int(rng.integers(0, 70))
+    depth = 32 * int(rng.integers(1, 4))
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
-    base, image, p1 = filled(rng, (h, w), np.int32), filled(rng, (h, w), np.uint8), int(rng.integers(0, 64))
-    p2, limits = rng.integers(p1, 128, 256).astype(np.uint8), rng.integers(0, (5, 5, 99)).tolist()
+    base = filled(rng, (h, w), np.int32)
+    image = filled(rng, (h, w), np.uint8)
+    p1 = int(rng.integers(0, 64))
+    p2 = rng.integers(p1, 128, 256).astype(np.uint8)
+    limits = rng.integers(0, (5, 5, 99)).tolist()
     scratch = np.zeros((2, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
     return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
 
@@ -101,7 +115,8 @@ def fit_offsets(rng: Random) -> Arguments:
 
 
 def transfer_disparity(rng: Random) -> Arguments:
-    (h, w), target = size(rng), int(rng.integers(0, 70))
+    h, w = size(rng)
+    target = int(rng.integers(0, 70))
     return [filled(rng, (h, w), np.float32), number(rng), np.zeros((h, target), np.float32)]
 
 
@@ -115,7 +130,8 @@ def depth_candidates(rng: Random) -> Arguments:
 
 
 def vote_depth(rng: Random) -> Arguments:
-    (h, w), pairs = size(rng), int(rng.integers(0, 12))
+    h, w = size(rng)
+    pairs = int(rng.integers(0, 12))
     inputs = [filled(rng, (pairs, h, w), np.float32) for _ in range(2)]
     return [*inputs, number(rng), *(np.zeros((h, w), kind) for kind in (np.float32, np.float32, np.uint8))]
 
@@ -138,7 +154,8 @@ def fuse_partner(rng: Random) -> Arguments:
     matrices = [filled(rng, (3, 4), np.float64), filled(rng, (3, 3), np.float64)]
     if rng.random() < 0.5:  # a few pixels aside
         matrices[0] = np.hstack([np.eye(3), rng.uniform(-3, 3, (3, 1))])
-    image, gates = filled(rng, (*partner[0].shape, 3), np.uint8), [number(rng) for _ in range(3)]
+    image = filled(rng, (*partner[0].shape, 3), np.uint8)
+    gates = [number(rng) for _ in range(3)]
     rays = [filled(rng, (3, 3), np.float64) for _ in range(2)]
     flags = [bool(rng.integers(2)), int(rng.integers(64))]
     return [*reference, rays[0], *partner, rays[1], image, *matrices, *gates, *flags, *verdicts(rng, shape)]
@@ -172,7 +189,8 @@ def fit_planes(rng: Random) -> Arguments:
     h, w = size(rng)
     inputs = [filled(rng, (h, w), np.float32) for _ in range(2)]
     outputs = [np.zeros((h, w, 3), np.float32), np.zeros((h, w), np.float32)]
-    K, support = filled(rng, (3, 3), np.float64), filled(rng, (h, w), np.uint8)
+    K = filled(rng, (3, 3), np.float64)
+    support = filled(rng, (h, w), np.uint8)
     gates = [number(rng), number(rng), number(rng), int(rng.integers(-1, 5))]
     return [backend(rng), *inputs, support, K, int(rng.integers(1, 17)), number(rng), *gates, *outputs]
 
@@ -190,13 +208,16 @@ def add_patch_equations(rng: Random) -> Arguments:
     step = int(rng.integers(1, 4))
     first = int(rng.integers(0, h + 1))
     rows = int(rng.integers(0, (h - first + step - 1) // step + 1))
-    image, count = filled(rng, (h, w), np.uint8), int(rng.integers(1, 5))
-    sources, matrices = tuple(filled(rng, size(rng), np.uint8) for _ in range(count)), np.zeros((count, 3, 4))
+    image = filled(rng, (h, w), np.uint8)
+    count = int(rng.integers(1, 5))
+    sources = tuple(filled(rng, size(rng), np.uint8) for _ in range(count))
+    matrices = np.zeros((count, 3, 4))
     for matrix in matrices:
         # Half of them look at the same place, so that windows do meet.
         same = np.hstack([np.eye(3), np.zeros((3, 1))])
         matrix[:] = same if rng.random() < 0.5 else filled(rng, (3, 4), np.float64)
-    planes, equations = filled(rng, (3, rows, w), np.float32), np.zeros((12, rows, w), np.float32)
+    planes = filled(rng, (3, rows, w), np.float32)
+    equations = np.zeros((12, rows, w), np.float32)
     return [backend(rng), image, sources, matrices, planes, first, step, number(rng), number(rng) / 10, equations]
 
 

@@ -37,7 +37,8 @@ def read_visibility(path: Path) -> list[tuple[int, ...]]:
     """
     data = path.read_bytes()
     (num_points,) = struct.unpack_from("<Q", data)
-    offset, visible = 8, []
+    offset = 8
+    visible = []
     for _ in range(num_points):
         (count,) = struct.unpack_from("<I", data, offset)
         visible.append(struct.unpack_from(f"<{count}I", data, offset + 4))

@@ -53,7 +53,8 @@ def damage_bytes(data: bytes, rng: Random) -> bytes:
 def damage_text(data: bytes, rng: Random) -> bytes:
     """Remove, repeat or cut a line, or put another word into it; or damage the bytes."""
     lines = data.decode().splitlines()
-    kind, number = rng.integers(6), int(rng.choice([n for n, line in enumerate(lines) if line[:1] != "#"]))
+    kind = rng.integers(6)
+    number = int(rng.choice([n for n, line in enumerate(lines) if line[:1] != "#"]))
     if kind == 0:
         return damage_bytes(data, rng)
     if kind == 1:

@@ -36,7 +36,8 @@ def make_workspace(
     root: Path, *, names: list[str] = NAMES, origin: float = 0.0, tracks: bool = True, kind: str = "geometric"
 ) -> Workspace:
     """Pictures of noise, exact maps, and a model whose image ids are in the order of `names`."""
-    plane, cameras = slanted_plane(), cameras_above()
+    plane = slanted_plane()
+    cameras = cameras_above()
     rng = np.random.default_rng(0)
     sparse = syn.sample_sparse_points([plane], cameras, 100, rng)
     if not tracks:

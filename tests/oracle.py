@@ -29,7 +29,8 @@ def matching_cost(reference, target, base, depth):
     """Hamming costs (H, W, depth) uint8."""
     cost = np.zeros((*reference.shape, depth), dtype=np.uint8)
     for y, x, i in np.ndindex(cost.shape):
-        word, column = int(reference[y, x]), x + int(base[y, x]) + i
+        word = int(reference[y, x])
+        column = x + int(base[y, x]) + i
         if word >= CENSUS_INVALID:
             continue
         other = int(target[y, column]) if 0 <= column < target.shape[1] else CENSUS_INVALID
@@ -85,7 +86,8 @@ def selection(aggregated, base, reference, target, max_difference, max_excess):
         best_of_target: dict = {}  # column in the target: (sum, columns in the reference)
         for x in content:
             for i in range(depth):
-                r, vote = x + int(base[y, x]) + i, int(aggregated[y, x, i])
+                r = x + int(base[y, x]) + i
+                vote = int(aggregated[y, x, i])
                 if 0 <= r < target.shape[1]:
                     least, columns = best_of_target.get(r, (vote, []))
                     best_of_target[r] = (vote, [x]) if vote < least else (least, columns + [x] * (vote == least))
@@ -157,7 +159,9 @@ def fit_offsets(offset, reference, target):
         plane = _offset_plane(difference, there & (np.abs(difference) <= 512 * ring))
         if plane is None:
             continue
-        sums, rounded, count = np.zeros(3, dtype=int), 0, 0
+        sums = np.zeros(3, dtype=int)
+        rounded = 0
+        count = 0
         for j, i in np.argwhere(there):
             predicted = _nearest_256(plane[0] + plane[1] * (int(i) - 2) + plane[2] * (int(j) - 2))
             whole = _nearest_256(predicted + centre)
@@ -294,7 +298,8 @@ def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_
 
 def pixel_area(view, pixel, depth, normal):
     """Area of a tangent plane that a pixel (col, row) covers, by differences of where its rays meet the plane."""
-    inverse, step = np.linalg.inv(view.K), 1e-3
+    inverse = np.linalg.inv(view.K)
+    step = 1e-3
     point = depth * (inverse @ [*pixel, 1.0])
 
     def meet(column, row):
@@ -333,14 +338,17 @@ def fuse_view(reference, partners, options):
     `reference` and `partners` are `fusion.ViewMaps`. The clearance is the least relative distance from any gate,
     from a pixel's border and between two areas.
     """
-    view, points = reference.view, {}
+    view = reference.view
+    points = {}
     clearance = np.full(reference.depth.shape, np.inf)
     for row, col in zip(*np.nonzero(reference.depth > 0), strict=True):
         z = float(reference.depth[row, col])
         own = reference.normals[:, row, col].astype(float)
         world = view.R.T @ (np.linalg.solve(view.K, [col, row, 1.0]) * z - view.t)
         area = pixel_area(view, (col, row), z, own)
-        views, colours, covered = [reference.index], [reference.image[row, col].astype(int)], False
+        views = [reference.index]
+        colours = [reference.image[row, col].astype(int)]
+        covered = False
         for partner in partners:
             pixel, distance, agrees, margin = _agreement(world, view.R.T @ own, partner, options)
             clearance[row, col] = min(clearance[row, col], margin)

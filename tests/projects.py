@@ -75,7 +75,8 @@ def make_block_project(
     model = pycolmap.Reconstruction()
     rows: dict[tuple[int, int], int] = {}
     for number, (name, camera) in enumerate(cameras.items(), start=1):
-        image, called = by_name[name], (names or {}).get(name, name)
+        image = by_name[name]
+        called = (names or {}).get(name, name)
         camera = pycolmap.Camera(
             camera_id=number, model=camera.model, width=camera.width, height=camera.height, params=camera.params
         )

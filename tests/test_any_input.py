@@ -209,7 +209,8 @@ def test_panorama(block: DemoBlock, tmp_path: Path, command) -> None:
     model = make_block_project(tmp_path, block, {name: block_camera(block, name) for name in NADIR})
     reconstruction = pycolmap.Reconstruction(model)
     camera = reconstruction.camera(1)
-    camera.model, camera.params = pycolmap.CameraModelId.EQUIRECTANGULAR, [WIDTH, HEIGHT]
+    camera.model = pycolmap.CameraModelId.EQUIRECTANGULAR
+    camera.params = [WIDTH, HEIGHT]
     reconstruction.write_binary(model)
     done = command(model)
     assert done.code == 2

@@ -15,7 +15,9 @@ from colmap_sph.stereo.rectified_pair import PairDisparity
 from colmap_sph.stereo.resampling import resample
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
-SIZE, FOCAL, BASELINE = (240, 180), 300.0, 1.5
+SIZE = (240, 180)
+FOCAL = 300.0
+BASELINE = 1.5
 
 
 def reconstruct(surfaces, light, cameras):
@@ -75,7 +77,8 @@ def test_planes_come_out_at_their_place_with_their_normals(slant, tilt):
 
 def test_a_scene_with_occlusions_comes_out_whole():
     pair = syn.convergent_pair(12.0, focal_length=FOCAL, size=SIZE)
-    target, centre = np.array([0.0, 8.0, 1.2]), (pair.left.centre + pair.right.centre) / 2
+    target = np.array([0.0, 8.0, 1.2])
+    centre = (pair.left.centre + pair.right.centre) / 2
     cameras = [pair.left, pair.right]
     for offset in ((0, 0, 0.9), (0, 0, -0.7)):
         R, t = syn.look_at(centre + offset, target)

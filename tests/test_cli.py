@@ -480,7 +480,8 @@ def test_an_image_that_cannot_be_fused_is_left_out(small: Path, capsys: pytest.C
     """Its mask does not fit: the cloud is made without it, and made again once the mask is mended."""
     assert command(capsys, *RUN, *FAST)[0] == 0
     (small / "masks").mkdir()
-    mask, wanted = small / "masks" / f"{IMAGES[1]}.png", ["--fusion.mask-path", "masks"]
+    mask = small / "masks" / f"{IMAGES[1]}.png"
+    wanted = ["--fusion.mask-path", "masks"]
     cv2.imwrite(str(mask), np.full((24, 32), 255, np.uint8))
     for _ in range(2):
         code, output = command(capsys, *RUN, *FAST, *wanted)

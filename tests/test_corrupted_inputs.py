@@ -37,9 +37,11 @@ def run_cases(project: Path, first: int, last: int) -> tuple[dict[int, str], lis
         for line in done.stdout.splitlines():
             word, seed, *rest = line.split(" ", 2)
             if word == "BEGIN":
-                begun, first = line, int(seed) + 1
+                begun = line
+                first = int(seed) + 1
             elif word == "END":
-                begun, results[int(seed)] = "", "".join(rest)
+                begun = ""
+                results[int(seed)] = "".join(rest)
         if begun:
             deaths.append(f"{begun}: exit code {done.returncode}, {done.stderr[-500:]}")
         else:
@@ -65,7 +67,8 @@ def test_damaged_models_images_masks_and_workspaces(tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(NUM_MAPS))
 def test_damaged_maps(seed: int, tmp_path: Path) -> None:
     """What is read has the shape that the check before fusion saw; else both refuse the file."""
-    rng, path = np.random.default_rng(seed), tmp_path / "map.bin"
+    rng = np.random.default_rng(seed)
+    path = tmp_path / "map.bin"
     shape: tuple[int, ...] = (5, 7) if seed % 2 else (5, 7, 3)
     write, read = (write_depth_map, read_depth_map) if seed % 2 else (write_normal_map, read_normal_map)
     write(path, rng.random(shape, dtype=np.float32))

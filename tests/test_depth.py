@@ -343,7 +343,8 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
         depth[rng.random(depth.shape) < 0.1] = 0
         depth[rng.random(depth.shape) < 0.1] *= 0.6
     reference, partner = views[0], views[1]
-    shape, support = maps[0].shape, rng.integers(0, 4, maps[1].shape).astype(np.uint8)
+    shape = maps[0].shape
+    support = rng.integers(0, 4, maps[1].shape).astype(np.uint8)
     observing, agreeing, contradicting = (np.full(shape, counted, np.uint8) for _ in range(3))
     weighted, weight = np.full(shape, 0.5, np.float32), np.full(shape, 2, np.float32)
     forward = np.hstack([partner.R @ reference.R.T @ np.linalg.inv(reference.K), np.zeros((3, 1))])

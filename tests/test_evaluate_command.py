@@ -19,11 +19,14 @@ from colmap_sph.project.workspace import Workspace
 
 WIDTH, HEIGHT, FOCAL = 120, 90, 100.0
 # The ground n · x = 10 m, seen from three places above it: a ground sampling distance of about 0.1 m.
-NORMAL, DISTANCE = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0]), 10.0
+NORMAL = np.array([0.1, -0.2, 1.0]) / np.linalg.norm([0.1, -0.2, 1.0])
+DISTANCE = 10.0
 K = np.array([[FOCAL, 0, 60.0], [0, FOCAL, 45.0], [0, 0, 1]])
 CAMERAS = [syn.Camera(K, np.eye(3), np.array([-x, 0.0, 0.0]), WIDTH, HEIGHT) for x in (-1.0, 0.0, 1.0)]
 NAMES = ["a.jpg", "north/b.jpg", "north/c.jpg"]
-UP, EAST, UTM = np.array([0, 0, 1.0]), np.array([1.0, 0, 0]), np.array([455_000.0, 5_400_000.0, 100.0])
+UP = np.array([0, 0, 1.0])
+EAST = np.array([1.0, 0, 0])
+UTM = np.array([455_000.0, 5_400_000.0, 100.0])
 EXACT = dict(zip(NAMES, CAMERAS, strict=True))
 
 
@@ -160,7 +163,8 @@ def test_exact_depth_judges_clouds(folder, capsys):
 
 @pytest.mark.parametrize("error", [0.0, 1.5])
 def test_depth_maps_are_compared_at_colmaps_pixel_origin(folder, capsys, error):
-    workspace, result = write_workspace(folder / "dense", error), folder / "scores.json"
+    workspace = write_workspace(folder / "dense", error)
+    result = folder / "scores.json"
     options = ["--workspace", workspace.root, "--depth-scale", 0.0005, "--json", result]
     assert evaluate("--reference", folder / "depth", *options) == 0
     assert "geometric depth maps" in capsys.readouterr().out
@@ -174,7 +178,8 @@ def test_depth_maps_are_compared_at_colmaps_pixel_origin(folder, capsys, error):
 
 
 def test_depth_of_pixel_centres_is_off_by_the_slope(folder):
-    workspace, result = write_workspace(folder / "dense"), folder / "scores.json"
+    workspace = write_workspace(folder / "dense")
+    result = folder / "scores.json"
     for name, camera in EXACT.items():
         depth = plane_depth(camera, 0.5).astype(np.float32)
         write_depth_map(workspace.depth_map_path(name, "geometric"), depth)
@@ -218,7 +223,8 @@ def test_refuses_tau(folder, capsys, tau):
 
 @pytest.mark.parametrize("role", ["cloud", "reference"])
 def test_refuses_clouds_that_cannot_be_measured(folder, capsys, role):
-    points, good = ground(CAMERAS[1]), folder / "deep.ply"
+    points = ground(CAMERAS[1])
+    good = folder / "deep.ply"
 
     def refused(bad: Path) -> str:
         cloud, reference = (bad, good) if role == "cloud" else (good, bad)
@@ -261,7 +267,9 @@ def test_refuses_projected_clouds_against_exact_depth(folder, capsys):
 
 
 def test_refuses_options_that_contradict_each_other(folder, capsys):
-    cloud, depth, model = folder / "deep.ply", folder / "depth", ("--model", folder / "sparse")
+    cloud = folder / "deep.ply"
+    depth = folder / "depth"
+    model = ("--model", folder / "sparse")
     scale = ("--depth-scale", 0.0005)
     for arguments, words in [
         (("--reference", cloud), "at least one cloud"),
@@ -309,7 +317,8 @@ def test_refuses_what_is_not_exact_depth(folder, capsys):
 
 
 def test_refuses_models_and_workspaces_that_do_not_fit(folder, capsys):
-    cloud, reference = folder / "deep.ply", ("--reference", folder / "depth", "--depth-scale", 0.0005)
+    cloud = folder / "deep.ply"
+    reference = ("--reference", folder / "depth", "--depth-scale", 0.0005)
     assert evaluate(cloud, *reference, "--model", folder / "nowhere") == 2
     assert "does not exist" in sentence(capsys)
     distorted = write_model(folder / "distorted", "OPENCV")

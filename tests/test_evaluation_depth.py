@@ -61,7 +61,10 @@ def test_truth_leaves_out_edges_and_nothing_else():
     corner = truth_at_pixel_origin(depth)
     missing = corner == 0
     expected = np.zeros_like(missing)
-    expected[0], expected[:, 0], expected[:, 60], expected[30:32, 20:22] = True, True, True, True
+    expected[0] = True
+    expected[:, 0] = True
+    expected[:, 60] = True
+    expected[30:32, 20:22] = True
     np.testing.assert_array_equal(missing[:, :58], expected[:, :58])
     assert missing[:, 60].all() and not missing[1:, 61:].any()
 
@@ -134,7 +137,8 @@ def test_visible_surface_counts_views_and_knows_what_is_hidden():
         depths.append(view(f"camera {eye}", eye, depth))
     surface = visible_surface(depths, 0.05)
     counts = count_views(surface, depths)
-    on_wall, x = surface[:, 2] > 9, surface[:, 0]
+    on_wall = surface[:, 2] > 9
+    x = surface[:, 0]
     # Behind the screen the left camera misses -2 … 2 m of the wall, the right one -3 … 1: none sees -2 … 1.
     assert not np.any(on_wall & (x > -1.9) & (x < 0.9))
     assert set(counts[on_wall & (x > -2.9) & (x < -2.1)]) == {1}

@@ -119,7 +119,8 @@ def test_visibility_names_images_as_colmap_does(tmp_path):
     model.write_binary(workspace.sparse_dir)
     views = read_scene(workspace.sparse_dir).views
     write_fusion_cfg(workspace.fusion_cfg_path, [view.name for view in views])
-    image_ids, by_name = [1, 2, 4, 5, 6], [view.image_id for view in views]
+    image_ids = [1, 2, 4, 5, 6]
+    by_name = [view.image_id for view in views]
     assert sorted(by_name) == image_ids != by_name
 
     def shares():
@@ -185,7 +186,9 @@ def test_colmap_program_reads_points_and_visibility(workspace, tmp_path):
 
 def test_parts_are_joined_in_the_order_given(tmp_path):
     rng = np.random.default_rng(0)
-    stems, bodies, words = [tmp_path / name for name in ("7", "12", "3")], [], []
+    stems = [tmp_path / name for name in ("7", "12", "3")]
+    bodies = []
+    words = []
     for number, stem in enumerate(stems):
         body = rng.integers(0, 256, (number, 27), dtype=np.uint8)
         listed = np.arange(3 * number, dtype=np.uint32)

@@ -52,7 +52,8 @@ def fuse_one(maps, index, options=EVERY_PIXEL):
     others = [other for other in maps if other.index != index]
     parts = list(fuse_view(maps[index], others, options))
     points, words = (np.concatenate(column) for column in zip(*parts, strict=True))
-    views, position = [], 0
+    views = []
+    position = 0
     for _ in points:
         count = int(words[position])
         views.append(tuple(words[position + 1 : position + 1 + count].tolist()))
@@ -333,7 +334,8 @@ def noisy_maps(seed):
 )
 @pytest.mark.parametrize("seed", [0, 1])
 def test_fusion_is_the_oracles(seed, options):
-    maps, num_found = noisy_maps(seed), 0
+    maps = noisy_maps(seed)
+    num_found = 0
     for one in maps:
         others = [other for other in maps if other is not one]
         expected, clearance = oracle.fuse_view(one, others, options)
@@ -341,7 +343,8 @@ def test_fusion_is_the_oracles(seed, options):
         assert clear.mean() > 0.98
         (points, words), *more = fuse_view(one, others, options)
         assert not more
-        found, position = {}, 0
+        found = {}
+        position = 0
         for point in points:
             listed = tuple(words[position + 1 : position + 1 + words[position]].tolist())
             position += 1 + int(words[position])

@@ -247,7 +247,8 @@ WRITTEN = [
 @pytest.mark.parametrize("stage", range(len(WRITTEN)), ids=[name for name, _ in WRITTEN])
 def test_full_disk(stage: int, uninterrupted: Path, small_disk: Path) -> None:
     """One sentence, nothing half-written, and the work goes on when there is space."""
-    model, dense = uninterrupted.parent / "sparse/0", small_disk / "dense"
+    model = uninterrupted.parent / "sparse/0"
+    dense = small_disk / "dense"
     fits = sum(size_of(uninterrupted, *patterns) for _, patterns in WRITTEN[:stage])
     # Files take whole pages, and the state some more.
     room = fits + size_of(uninterrupted, *WRITTEN[stage][1]) // 2 + 60 * 4096
@@ -276,7 +277,8 @@ def test_read_only_disk(uninterrupted: Path, small_disk: Path, capsys: pytest.Ca
     shutil.copytree(uninterrupted, dense)
     subprocess.run(["mount", "-o", "remount,ro", str(small_disk)], check=True)
     for more in ([], ["--overwrite"], ["--normals.radius", "3"]):
-        code, said = cli.main(["run", "--workspace", str(dense), *more]), capsys.readouterr().err
+        code = cli.main(["run", "--workspace", str(dense), *more])
+        said = capsys.readouterr().err
         assert code == 3, said
         assert "Read-only file system" in said.splitlines()[-1]
         assert "Traceback" not in said
@@ -285,7 +287,8 @@ def test_read_only_disk(uninterrupted: Path, small_disk: Path, capsys: pytest.Ca
 
 def test_files_that_may_not_grow(uninterrupted: Path, tmp_path: Path) -> None:
     """A limit on the size of a file, which the normal maps exceed, for those who cannot mount a full disk."""
-    model, dense = uninterrupted.parent / "sparse/0", tmp_path / "dense"
+    model = uninterrupted.parent / "sparse/0"
+    dense = tmp_path / "dense"
     command = [sys.executable, "-P", "-m", "colmap_sph", "run", "--model", str(model), "--output", str(dense)]
 
     def limit() -> None:

@@ -374,7 +374,8 @@ def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, kind):
     valid = [np.where(rng.random(shape) < 0.1, 0, 1).astype(np.uint8) for shape in (size, (size[0], size[1] + 5))]
     reference, target = oracle.census(left, valid[0]), oracle.census(right, valid[1])
     np.testing.assert_array_equal(run_census(backend, right, valid[1]), target)
-    image, p2 = (left[3:-3, 4:-4] // 64).astype(np.uint8), p2_table(rng, 10, 30, 120)
+    image = (left[3:-3, 4:-4] // 64).astype(np.uint8)
+    p2 = p2_table(rng, 10, 30, 120)
     sums = oracle.aggregation(oracle.matching_cost(reference, target, base, depth), base, image, 10, p2, 2)
     expected = oracle.selection(sums, base, reference, target, 2, 5)
     # In one piece, and in bands of rows: to the bit the same.

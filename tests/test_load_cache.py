@@ -85,7 +85,9 @@ def test_a_failure_is_not_kept() -> None:
 
 
 def test_threads_that_want_one_value_load_it_once() -> None:
-    barrier, go, loaded = threading.Barrier(8), threading.Event(), []
+    barrier = threading.Barrier(8)
+    go = threading.Event()
+    loaded = []
 
     def load(key: str) -> bytes:
         go.wait(5)

@@ -51,7 +51,8 @@ def test_undistorted_mask_is_exact(tmp_path: Path) -> None:
     """White where all four original pixels around an undistorted pixel's centre are there and white."""
     camera = pycolmap.Camera.create_from_model_name(1, "OPENCV", 90.0, WIDTH, HEIGHT)
     camera.params = [90.0, 91.0, WIDTH / 2, HEIGHT / 2, *DISTORTION]
-    mask, options = blobs(5), pycolmap.UndistortCameraOptions()
+    mask = blobs(5)
+    options = pycolmap.UndistortCameraOptions()
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     undistort_mask(tmp_path / "mask.png", camera, options, tmp_path / "sub" / "out.png")
     found = read_picture(tmp_path / "sub" / "out.png", cv2.IMREAD_UNCHANGED)
@@ -175,7 +176,8 @@ def test_what_is_masked_is_not_reconstructed(block: DemoBlock, project: Path, fr
     else:
         report = colmap_sph.run(project / "sparse" / "0", masks=project / "masks", options=OPTIONS)
     assert report.images == len(NADIR)
-    workspace, gsd = Workspace(dense), block.gsd
+    workspace = Workspace(dense)
+    gsd = block.gsd
     for name in NADIR:
         camera = block.cameras[block.names.index(name)]
         truth = block.truth(name)[0]

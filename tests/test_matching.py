@@ -18,7 +18,8 @@ from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedIm
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.resampling import resample
 
-SIZE, FOCAL = (240, 180), 300.0
+SIZE = (240, 180)
+FOCAL = 300.0
 OPTIONS = MatchingOptions()
 
 
@@ -294,7 +295,8 @@ def test_a_range_beside_the_images_gives_nothing(search: tuple[float, float]):
 def test_disparities_stay_within_the_range_and_the_images(seed):
     """Also where there is nothing to find: two unrelated images of odd sizes."""
     rng = np.random.default_rng(seed)
-    height, widths = rng.integers(16, 300), rng.integers(16, 300, 2)
+    height = rng.integers(16, 300)
+    widths = rng.integers(16, 300, 2)
     low = rng.uniform(-100, 50)
     high = low + rng.uniform(1, 300)
     images = [random_image((height, width), seed + k) for k, width in enumerate(widths)]

@@ -49,7 +49,8 @@ def test_the_default_leaves_something_to_others():
 
 def test_work_waits_for_its_share():
     """Twelve pieces of work that need a third of the budget each: three at a time, never four."""
-    gate, lock = MemoryGate(resident() + 4 * GIB), threading.Lock()
+    gate = MemoryGate(resident() + 4 * GIB)
+    lock = threading.Lock()
     running, most = 0, 0
 
     def work():

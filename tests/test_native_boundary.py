@@ -573,7 +573,8 @@ def test_as_many_sources_as_are_allowed_are_accepted():
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_every_source_is_checked(place):
-    right, values = np.zeros((9, 20), np.uint8), arguments("add_patch_equations")
+    right = np.zeros((9, 20), np.uint8)
+    values = arguments("add_patch_equations")
     memory = np.zeros(values["out equations"].nbytes, np.uint8)
     for wrong, error, message in [
         (right.astype(np.float32), TypeError, "items of type"),
@@ -660,8 +661,10 @@ def test_target_without_columns_is_never_matched(backend):
 def test_empty_images_of_absurd_width_are_refused_or_no_work(backend):
     """Sizes whose product overflows fit into no memory, but an array without rows can claim them."""
     width = 2**56
-    base, p2 = np.empty((0, width), np.int32), np.full(256, 60, np.uint8)
-    volume, image = np.empty((0, width, 32), np.uint8), np.empty((0, width), np.uint8)
+    base = np.empty((0, width), np.int32)
+    p2 = np.full(256, 60, np.uint8)
+    volume = np.empty((0, width, 32), np.uint8)
+    image = np.empty((0, width), np.uint8)
     words = np.empty((0, width), np.uint64)
     for function, values in {
         "aggregation": (volume, base, image, 10, p2, 2, volume.copy(), volume.copy()),

@@ -201,7 +201,8 @@ def test_options_out_of_bounds_are_refused(name, value):
 def test_depths_off_their_plane_are_dropped():
     """A pixel that sticks out of a plane by several pixel sizes and standard deviations, and one within either."""
     plane = estimate(inverse_depth(plane_normal(20, 40)), noise=0.3)
-    depth, size = plane.depth.copy(), plane.depth / VIEW.K[0, 0]
+    depth = plane.depth.copy()
+    size = plane.depth / VIEW.K[0, 0]
     depth[30, 30] += 5 * plane.sigma[30, 30] + 3 * size[30, 30]
     depth[60, 60] += 0.5 * size[60, 60]
     noisy = DepthEstimate(depth, plane.sigma, plane.support)
@@ -218,7 +219,8 @@ def test_what_may_be_missing_to_a_plane_grows_with_its_slope():
     """On a plane at 72 degrees depth changes by about three pixel sizes from one pixel to the next."""
     exact = inverse_depth(plane_normal(72, 90))
     plane = DepthEstimate((1 / exact).astype(np.float32), np.zeros_like(exact), np.full(exact.shape, 9, np.uint8))
-    size, change = plane.depth / VIEW.K[0, 0], np.abs(np.gradient(plane.depth, axis=0))
+    size = plane.depth / VIEW.K[0, 0]
+    change = np.abs(np.gradient(plane.depth, axis=0))
     depth = plane.depth.copy()
     for row in (30, 45, 60):
         assert 2.5 < change[row, 30] / size[row, 30] < 4

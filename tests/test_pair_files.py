@@ -134,7 +134,8 @@ def test_any_single_damaged_byte_is_harmless(tmp_path: Path) -> None:
     """A flipped byte anywhere either leaves the content as it was or raises an `InputError`."""
     path = tmp_path / "pair.npz"
     write_pair(path, make_pair(random_disparity(0, 50)))
-    data, before = path.read_bytes(), read_pair(path)
+    data = path.read_bytes()
+    before = read_pair(path)
     for place in range(0, len(data), 7):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
         try:

@@ -345,7 +345,8 @@ def test_real_tracks_agree_with_colmap(data_dir: Path) -> None:
         shared.update(itertools.permutations(names, 2))
     theirs = pycolmap.MVSModel()
     theirs.read_from_colmap(root, "sparse/0", "images")
-    radians, index = theirs.compute_triangulation_angles(75), theirs.get_image_idx
+    radians = theirs.compute_triangulation_angles(75)
+    index = theirs.get_image_idx
     selection = select_pairs(scene, PairOptions())
     assert all(len(pairs) == 10 for pairs in selection.partners.values())
     for name, pairs in selection.partners.items():

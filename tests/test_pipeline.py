@@ -106,7 +106,8 @@ def test_depth_has_colmaps_pixel_origin(block: DemoBlock, finished: FinishedRun)
 
 
 def test_the_report_is_right(block: DemoBlock, finished: FinishedRun) -> None:
-    report, workspace = finished.report, Workspace(finished.dense)
+    report = finished.report
+    workspace = Workspace(finished.dense)
     assert report.images == len(block.names)
     assert report.skipped_images == {}
     assert report.skipped_pairs == {}
@@ -185,9 +186,11 @@ def test_progress_tells_every_step(project: Path) -> None:
 def test_a_run_can_be_repeated(project: Path) -> None:
     """Paths may be strings; a second run finds the undistorted images and gives the same."""
     keep_images(project, NADIR)
-    model, dense = str(project / "sparse/0"), project / "dense"
+    model = str(project / "sparse/0")
+    dense = project / "dense"
     colmap_sph.run(model, images=str(project / "images"), output=str(dense), options=FEW_PAIRS)
-    before, image = results(dense), (dense / "images" / NADIR[0]).stat()
+    before = results(dense)
+    image = (dense / "images" / NADIR[0]).stat()
     colmap_sph.run(model, options=FEW_PAIRS)
     assert results(dense) == before
     assert (dense / "images" / NADIR[0]).stat() == image

@@ -45,7 +45,8 @@ def equations_of_all(backend, image, partners, planes, options=OPTIONS):
 
 
 def add_equations(backend, image, partners, planes, options, equations):
-    sources, matrices = tuple(source for source, _ in partners), np.stack([matrix for _, matrix in partners])
+    sources = tuple(source for source, _ in partners)
+    matrices = np.stack([matrix for _, matrix in partners])
     _native.add_patch_equations(
         backend, image, sources, matrices, planes, 0, 1, options.contrast, options.min_score, equations
     )
@@ -54,9 +55,12 @@ def add_equations(backend, image, partners, planes, options, equations):
 @pytest.mark.parametrize("backend", _native.backends())
 @pytest.mark.parametrize(("first", "step"), [(0, 2), (3, 5), (39, 7), (45, 1)])
 def test_equations_of_some_rows_are_those_of_all(backend, first, step):
-    image, planes, rows = texture((40, 40), 1), slanted_planes((40, 40), 2), slice(first, None, step)
+    image = texture((40, 40), 1)
+    planes = slanted_planes((40, 40), 2)
+    rows = slice(first, None, step)
     expected = equations_of(backend, image, image, AFFINE, planes)[:, rows]
-    found, some = np.zeros(expected.shape, np.float32), np.ascontiguousarray(planes[:, rows])
+    found = np.zeros(expected.shape, np.float32)
+    some = np.ascontiguousarray(planes[:, rows])
     limits = OPTIONS.contrast, OPTIONS.min_score
     _native.add_patch_equations(backend, image, (image,), AFFINE[None], some, first, step, *limits, found)
     assert np.array_equal(found, expected)
@@ -80,8 +84,10 @@ PROJECTIVE = np.array([[1.02, 0.01, 1.3, 2], [0.02, 0.98, -0.6, 1], [3e-4, -2e-4
 @pytest.mark.parametrize(("matrix", "tolerance"), [(AFFINE, 2e-3), (TURNED, 2e-3), (PROJECTIVE, 3e-2)])
 @pytest.mark.parametrize("size", [(12, 21), (7, 8), (6, 6), (5, 30)])
 def test_equations_are_the_oracles(backend, matrix, tolerance, size):
-    image, source = texture((40, 40), 1)[: size[0], : size[1]].copy(), texture((33, 35), 1)
-    planes, options = slanted_planes(size, 2), replace(OPTIONS, min_score=-0.999)
+    image = texture((40, 40), 1)[: size[0], : size[1]].copy()
+    source = texture((33, 35), 1)
+    planes = slanted_planes(size, 2)
+    options = replace(OPTIONS, min_score=-0.999)
     expected = oracle.patch_equations(image, source, matrix, planes, options.contrast, options.min_score)
     found = equations_of(backend, image, source, matrix, planes, options)
     known = np.isfinite(expected)
@@ -96,7 +102,9 @@ def test_equations_are_the_oracles(backend, matrix, tolerance, size):
 @pytest.mark.parametrize("size", [(6, 6), (9, 7), (17, 40), (11, 29)])
 @pytest.mark.parametrize("matrix", [AFFINE, TURNED, PROJECTIVE])
 def test_equations_do_not_depend_on_the_backend(size, matrix):
-    image, source, planes = texture(size, 3), texture((30, 31), 4), slanted_planes(size, 5)
+    image = texture(size, 3)
+    source = texture((30, 31), 4)
+    planes = slanted_planes(size, 5)
     options = replace(OPTIONS, min_score=-0.5)
     results = [equations_of(backend, image, source, matrix, planes, options) for backend in _native.backends()]
     assert results[0].any()
@@ -108,7 +116,9 @@ def test_equations_do_not_depend_on_the_backend(size, matrix):
 @pytest.mark.parametrize("size", [(6, 6), (9, 7), (17, 40), (11, 29)])
 def test_sources_of_one_call_add_up_in_their_order(backend, size):
     """As by a call for each, to the bit: those of other sizes, and one too small for any window, included."""
-    image, planes, options = texture(size, 3), slanted_planes(size, 5), replace(OPTIONS, min_score=-0.5)
+    image = texture(size, 3)
+    planes = slanted_planes(size, 5)
+    options = replace(OPTIONS, min_score=-0.5)
     sources = [texture((30, 31), 4), texture((26, 50), 7), texture((6, 4), 8), texture((40, 28), 9)]
     partners = list(zip(sources, (AFFINE, TURNED, AFFINE, PROJECTIVE), strict=True))
     together, in_turn = (
@@ -134,7 +144,8 @@ def test_there_may_be_more_partners_than_one_call_takes(monkeypatch):
     depth = (truth * 1.002).astype(np.float32)
     estimate = DepthEstimate(depth, (0.01 * depth).astype(np.float32), np.ones(truth.shape, np.uint8))
     sources = [(other, texture((other.height, other.width), seed)) for seed in range(35)]
-    options, results = replace(OPTIONS, max_partners=35, min_score=-0.9), []
+    options = replace(OPTIONS, max_partners=35, min_score=-0.9)
+    results = []
     for most in (32, 3):
         monkeypatch.setattr("colmap_sph.stereo.refinement._SOURCES", most)
         maps = normals.astype(np.float32), depth.copy()
@@ -188,7 +199,9 @@ def test_planes_without_equations_or_freedom_stay():
     equations = np.ones((12, 2, 3), np.float32)
     equations[[7, 8, 10]] = 0
     planes, sigma = np.ones((3, 2, 3), np.float32), np.ones((2, 3), np.float32)
-    equations[0, 0, 0], sigma[0, 1], planes[0, 0, 2] = 0, 0, 0
+    equations[0, 0, 0] = 0
+    sigma[0, 1] = 0
+    planes[0, 0, 2] = 0
     equations[3:, 1, 0] = np.nan
     before = planes.copy()
     _native.refine_planes(equations, sigma, 0.1, planes)
@@ -266,7 +279,8 @@ def test_refinement_comes_nearer_to_the_truth(block, scene, name):
 
 def test_without_partners_or_rounds_maps_stay(block, scene):
     views, images = scene
-    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    view = views.view(NAME)
+    truth, true_normals = block.truth(NAME)
     estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
     sources = [(other, images[other.name]) for other in views.views if other.name != NAME]
     for partners, rounds in (([], 1), (sources, 0)):
@@ -281,7 +295,8 @@ def test_without_partners_or_rounds_maps_stay(block, scene):
 def test_partners_that_see_something_else_have_no_say(block, scene):
     """Pictures of noise correlate with nothing: depth stays where it was."""
     views, images = scene
-    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    view = views.view(NAME)
+    truth, true_normals = block.truth(NAME)
     estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=0)
     rng = np.random.default_rng(1)
     sources = [
@@ -298,10 +313,13 @@ def test_partners_that_see_something_else_have_no_say(block, scene):
 def test_partners_that_tell_most_are_chosen(block, scene):
     """Of true pictures and pictures of noise the true ones: the same maps as from these alone."""
     views, images = scene
-    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    view = views.view(NAME)
+    truth, true_normals = block.truth(NAME)
     estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
     others = [other for other in views.views if other.name != NAME][:4]
-    rng, true, mixed = np.random.default_rng(2), [], []
+    rng = np.random.default_rng(2)
+    true = []
+    mixed = []
     for other in others:
         true.append((other, images[other.name]))
         mixed += [(other, rng.integers(0, 256, images[other.name].shape, np.uint8)), true[-1]]
@@ -316,7 +334,8 @@ def test_partners_that_tell_most_are_chosen(block, scene):
 
 def test_bands_of_rows_leave_no_trace(block, scene, monkeypatch):
     views, images = scene
-    view, (truth, true_normals) = views.view(NAME), block.truth(NAME)
+    view = views.view(NAME)
+    truth, true_normals = block.truth(NAME)
     estimate, normals = disturbed(view, truth, true_normals, pixels=0.5, degrees=8)
     sources = [(other, images[other.name]) for other in views.views[:3]]
     results = []

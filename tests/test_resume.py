@@ -117,7 +117,8 @@ def counted(files: set[str]) -> dict[str, int]:
 
 
 def test_a_second_run_redoes_nothing(finished: Finished) -> None:
-    first, before = finished.report, results(finished.dense)
+    first = finished.report
+    before = results(finished.dense)
     assert first.made == {"match pairs": 6, "vote on depth": 4, "confirm depth": 4, "fuse": 1}
     assert first.reused == NOTHING
     second = finished.rerun()
@@ -211,7 +212,8 @@ def test_a_changed_image_redoes_its_pairs(finished: Finished) -> None:
 
 def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> None:
     """As a changed image does; and without it everything is as before."""
-    masks, number = finished.project / "masks", f"{finished.ids[NAMES[0]]:06d}"
+    masks = finished.project / "masks"
+    number = f"{finished.ids[NAMES[0]]:06d}"
     masks.mkdir()
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     before = results(finished.dense)
@@ -556,7 +558,8 @@ def test_plan_of_the_fusion(finished: Finished) -> None:
 
 
 def test_plan_of_a_finished_workspace(finished: Finished) -> None:
-    before, state = results(finished.dense), sorted(finished.dense.rglob("*"))
+    before = results(finished.dense)
+    state = sorted(finished.dense.rglob("*"))
     for project in (Project(finished.project / "sparse/0"), Project(workspace=finished.dense)):
         plan = make_plan(project, OPTIONS)
         assert not plan.undistort and not plan.fuse

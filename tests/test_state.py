@@ -119,7 +119,8 @@ def test_a_record_vouches_for_its_files_under_its_key(files: list[Path], tmp_pat
 
 
 def test_files_of_other_sizes_or_content_are_noticed(files: list[Path], tmp_path: Path) -> None:
-    record, content = tmp_path / "a.json", files[0].read_bytes()
+    record = tmp_path / "a.json"
+    content = files[0].read_bytes()
     vouch(record, "key", files)
     for changed in (content[:-1], content + b"1", bytes(len(content)), content[:-1] + b"!", b""):
         assert changed != content

@@ -58,7 +58,8 @@ def test_bounded_plane_ends_where_it_should():
 
 @pytest.mark.parametrize("distance", [4.0, 4e4])
 def test_sphere_depth_solves_the_quadratic(distance):
-    centre, radius = np.array([0.4, distance, 1.0]), 0.25 * distance
+    centre = np.array([0.4, distance, 1.0])
+    radius = 0.25 * distance
     camera = camera_at((0, 0, 0), centre)
     depth, normals, surface = syn.exact_geometry([syn.sphere(centre, radius, GREY)], camera)
     direction = rays(K, *SIZE, 0.5)
@@ -76,7 +77,9 @@ def test_sphere_depth_solves_the_quadratic(distance):
 
 
 def test_box_depth_lies_on_the_face_of_its_normal():
-    size, yaw, base = np.array([2.0, 1.2, 0.9]), 0.7, np.array([0.2, 3.0, -0.4])
+    size = np.array([2.0, 1.2, 0.9])
+    yaw = 0.7
+    base = np.array([0.2, 3.0, -0.4])
     solid = syn.box(base, tuple(size), (GREY,), yaw)
     camera = camera_at((0.6, -1.0, 1.9), base + np.array([0, 0, 0.45]))
     depth, normals, _ = syn.exact_geometry([solid], camera)

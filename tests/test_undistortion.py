@@ -182,7 +182,8 @@ def test_finished_workspace_is_reused(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    sparse, dense = make_project(tmp_path), tmp_path / "dense"
+    sparse = make_project(tmp_path)
+    dense = tmp_path / "dense"
 
     def interrupted(output: Path, *args: object, **kwargs: object) -> None:
         (output / "images").mkdir()
@@ -200,7 +201,8 @@ def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytes
 
 @pytest.mark.parametrize("num_moved", range(7))
 def test_interrupted_move_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_moved: int) -> None:
-    sparse, dense = make_project(tmp_path), tmp_path / "dense"
+    sparse = make_project(tmp_path)
+    dense = tmp_path / "dense"
     masks = tmp_path / "masks"
     masks.mkdir()
     assert cv2.imwrite(str(masks / "a.png.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
@@ -324,7 +326,8 @@ def test_grey_values_of_lossless_files_keep_their_fractions(tmp_path: Path) -> N
 
 def test_grey_values_of_jpeg_files_are_those_stored(tmp_path: Path) -> None:
     """A grey file comes back as it was written: whole numbers, up to JPEG's own loss."""
-    path, (row, column) = tmp_path / "image.JPG", np.indices((40, 50))
+    path = tmp_path / "image.JPG"
+    row, column = np.indices((40, 50))
     grey = (row + 2 * column).astype(np.uint8)
     cv2.imwrite(str(path), grey, [cv2.IMWRITE_JPEG_QUALITY, 100])
     read = read_grey(path)

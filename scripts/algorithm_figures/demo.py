@@ -103,7 +103,8 @@ class Demo:
 
     def exact_disparity(self, pair: MatchedPair) -> NDArray[np.float64]:
         """Disparity of the left rectified pixels on the sphere, from the exact depth; NaN outside the image."""
-        geometry, left = pair.geometry, pair.left
+        geometry = pair.geometry
+        left = pair.left
         rays = sphere_rays(geometry, "left")
         pixel = rays @ pixel_from_rectified_ray(left, geometry).T
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -22,7 +22,8 @@ Float = NDArray[np.float32]
 
 def _candidates(demo: Demo, name: str, options: VoteOptions) -> tuple[list[str], Float, Float]:
     """Partners in the order in which they vote, and depth and sigma (n, H, W) of their pairs."""
-    view, others = demo.scene.view(name), []
+    view = demo.scene.view(name)
+    others = []
     depths, sigmas = [], []
     for first, second in demo.selection.unique_pairs():
         if name not in (first, second):
@@ -80,7 +81,8 @@ def _telling_pixels(
 def vote(demo: Demo, path: Path) -> None:
     """Candidates along two rays, and how many pairs agree everywhere."""
     names, depths, sigmas = _candidates(demo, NAME, VoteOptions())
-    voted, (exact, _) = demo.voted(NAME), demo.truth(NAME)
+    voted = demo.voted(NAME)
+    exact, _ = demo.truth(NAME)
     pixels = _telling_pixels(depths, sigmas, exact, voted.support)
     figure = plt.figure(figsize=(9.6, 6.6), layout="constrained")
     above, below = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1, 1.05))))
@@ -132,7 +134,8 @@ _REASONS = {
 
 def _why_dropped(demo: Demo, name: str) -> NDArray[np.uint8]:
     """Index into `_REASONS` of each pixel: the first gate that stops it."""
-    view, estimate = demo.scene.view(name), demo.voted(name)
+    view = demo.scene.view(name)
+    estimate = demo.voted(name)
     partners = demo.matched_with(name)
     others = [(demo.scene.view(partner), demo.voted(partner)) for partner in partners]
     usual = ConfirmOptions()
@@ -151,7 +154,9 @@ def _why_dropped(demo: Demo, name: str) -> NDArray[np.uint8]:
 
 def confirmation(demo: Demo, path: Path) -> None:
     """What the neighbours confirm of a voted depth map, what they drop, and whether that was wrong."""
-    voted, (exact, _), reason = demo.voted(NAME), demo.truth(NAME), _why_dropped(demo, NAME)
+    voted = demo.voted(NAME)
+    exact, _ = demo.truth(NAME)
+    reason = _why_dropped(demo, NAME)
     gsd = exact / demo.scene.view(NAME).K[0, 0]
     wrong = (np.abs(voted.depth - exact) > 2 * gsd) & (exact > 0) & (voted.depth > 0)
     figure, panels = plt.subplots(2, 2, figsize=(9.6, 7.2), layout="constrained")

@@ -91,7 +91,9 @@ def _telling_pixel(cost: NDArray[np.uint8], wrong: NDArray[np.float64]) -> tuple
 def matching(demo: Demo, path: Path) -> None:
     """Left image, disparity and its error; the costs of one pixel."""
     pair, levels = matched(demo, NEAR)
-    finest, disparity, exact = levels[-1], pair.disparity, demo.exact_disparity(pair)
+    finest = levels[-1]
+    disparity = pair.disparity
+    exact = demo.exact_disparity(pair)
     error = np.abs(disparity - exact)
     figure = plt.figure(figsize=(9.6, 5.4), layout="constrained")
     above, below = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1))))
@@ -134,7 +136,8 @@ def matching(demo: Demo, path: Path) -> None:
 def _draw_fit(axes: Any, level: Level, row: int, column: int, truth: float, found: float) -> None:
     """The V of raw costs, summed over 5 x 5 pixels around each whole disparity beside the plane."""
     whole = -int(np.rint(level.offset[row, column] / 256))
-    shifts, sums = np.arange(-2, 3), []
+    shifts = np.arange(-2, 3)
+    sums = []
     for shift in shifts:
         total = 0
         for y in range(row - 2, row + 3):
@@ -187,7 +190,9 @@ def search_ranges(demo: Demo, path: Path) -> None:
     axes.plot(np.arange(width), pair.disparity[row], ".", color="tab:red", markersize=2.5, label="found")
     axes.set(xlabel="column of the left rectified image", ylabel="disparity [pixels]", xlim=(0, width))
     axes.set_ylim(-300, 700)
-    step, first, last = 2 ** (len(levels) - 1), levels[0].base[0, 0], levels[0].base[0, 0] + levels[0].depth - 1
+    step = 2 ** (len(levels) - 1)
+    first = levels[0].base[0, 0]
+    last = levels[0].base[0, 0] + levels[0].depth - 1
     axes.annotate(f"level {len(levels) - 1} reaches from {-last * step} to {-first * step}", (12, 650))
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     strip.set_xlim(0, width)

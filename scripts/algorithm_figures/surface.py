@@ -33,7 +33,8 @@ def _confirmed(demo: Demo, name: str) -> DepthEstimate:
 
 
 def _refined(demo: Demo, name: str, estimate: DepthEstimate, planes: Maps) -> Maps:
-    view, grey = demo.scene.view(name), cv2.IMREAD_GRAYSCALE
+    view = demo.scene.view(name)
+    grey = cv2.IMREAD_GRAYSCALE
     images = {
         other.name: np.asarray(cv2.imread(str(demo.workspace.image_path(other.name)), grey), np.uint8)
         for other in demo.scene.views
@@ -69,7 +70,8 @@ def _weights(estimate: DepthEstimate, row: int, column: int, options: NormalOpti
     near = np.outer(falloff, falloff) * there
     y, x = np.meshgrid(reach, reach, indexing="ij")
     terms = np.stack([np.ones_like(x), x, y]).reshape(3, -1)
-    plane, weights = np.zeros(3), near
+    plane = np.zeros(3)
+    weights = near
     for widening in (1 + options.radius, 2, 1):
         residual = relative - (plane @ terms).reshape(relative.shape)
         weights = near / (1 + (residual / (noise * widening)) ** 2) ** 2
@@ -78,7 +80,9 @@ def _weights(estimate: DepthEstimate, row: int, column: int, options: NormalOpti
 
 
 # A column down a roof and a wall to the ground, and a pixel at the eaves, where roof and wall meet.
-_COLUMN, _ROWS, _EAVES = 190, slice(292, 352), 314
+_COLUMN = 190
+_ROWS = slice(292, 352)
+_EAVES = 314
 
 
 def _draw_profile(
@@ -101,12 +105,14 @@ def _draw_profile(
 
 def normals(demo: Demo, path: Path) -> None:
     """Planes fitted to a confirmed depth map."""
-    view, (exact, exact_normals) = demo.scene.view(NAME), demo.truth(NAME)
+    view = demo.scene.view(NAME)
+    exact, exact_normals = demo.truth(NAME)
     estimate = _confirmed(demo, NAME)
     planes, fitted = fit_normals(view, estimate, NormalOptions())
     figure, panels = plt.subplots(2, 2, figsize=(9.6, 6.8), layout="constrained", height_ratios=(1.1, 1))
     show(panels[0, 0], _normal_picture(planes), "normals of the fitted planes, white = none")
-    error, there = _angular_error(planes, exact_normals), (fitted > 0) & (exact > 0)
+    error = _angular_error(planes, exact_normals)
+    there = (fitted > 0) & (exact > 0)
     title = f"angle to the exact normals, median {np.median(error[there]):.1f}°"
     drawn = show(panels[0, 1], masked(error, there), title, cmap="magma_r", vmin=0, vmax=20)
     figure.colorbar(drawn, ax=panels[0, 1], shrink=0.8, extend="max", label="[degrees]")
@@ -129,7 +135,8 @@ def normals(demo: Demo, path: Path) -> None:
 
 def refinement(demo: Demo, path: Path) -> None:
     """Normals and depth before and after the refinement on all images."""
-    view, (exact, exact_normals) = demo.scene.view(NAME), demo.truth(NAME)
+    view = demo.scene.view(NAME)
+    exact, exact_normals = demo.truth(NAME)
     estimate = _confirmed(demo, NAME)
     before = fit_normals(view, estimate, NormalOptions())
     after = _refined(demo, NAME, estimate, before)
@@ -168,7 +175,8 @@ def _cumulative(values: NDArray[np.float64], most: float) -> tuple[NDArray[np.fl
 
 def _view_maps(demo: Demo, name: str) -> ViewMaps:
     index = {image_id: number for number, image_id in enumerate(demo.scene.image_ids)}
-    view, (depth, planes) = demo.scene.view(name), demo.maps(name, "geometric")
+    view = demo.scene.view(name)
+    depth, planes = demo.maps(name, "geometric")
     image = np.ascontiguousarray(demo.picture(name)[..., ::-1])
     return ViewMaps(view, index[view.image_id], depth, np.ascontiguousarray(planes.transpose(2, 0, 1)), image)
 
@@ -199,7 +207,8 @@ def _sources_of_points(demo: Demo) -> tuple[NDArray[np.void], NDArray[np.int64]]
 
 def _first_images(words: NDArray[np.uint32], count: int) -> Iterator[int]:
     """A point's own image is the first that its entry names, behind their number."""
-    position, plain = 0, words.tolist()
+    position = 0
+    plain = words.tolist()
     for _ in range(count):
         yield plain[position + 1]
         position += 1 + plain[position]
@@ -244,7 +253,9 @@ def _draw_sources(axes: Any, demo: Demo, cloud: NDArray[np.void], source: NDArra
     palette = ("#9e9e9e", "#1b9e77", "#d95f02", "#7570b3", "#e7298a")
     name_of = {view.image_id: view.name for view in demo.scene.views}
     kind_of = np.array([list(kinds).index(name_of[image_id][0]) for image_id in demo.scene.image_ids])
-    kind, cells, extent = kind_of[source], 420, 60.0
+    kind = kind_of[source]
+    cells = 420
+    extent = 60.0
     column, row = np.floor((cloud["xyz"][:, :2] / extent + 1) / 2 * cells).astype(int).T
     inside = (column >= 0) & (column < cells) & (row >= 0) & (row < cells)
     order = np.flatnonzero(inside)[np.argsort(cloud["xyz"][inside, 2], kind="stable")]

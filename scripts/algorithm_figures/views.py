@@ -33,7 +33,8 @@ def from_above(demo: Demo, places: Float) -> Float:
 def _draw_cameras(axes: Any, demo: Demo, marked: dict[str, str]) -> None:
     for view in demo.scene.views:
         colour = marked.get(view.name, "0.6")
-        place, ahead = from_above(demo, view.center), view.viewing_direction[:2]
+        place = from_above(demo, view.center)
+        ahead = view.viewing_direction[:2]
         axes.plot(*place, "s", color=colour, markersize=6)
         if np.linalg.norm(ahead) > 0.1:
             axes.annotate(
@@ -62,7 +63,8 @@ def sparse_model(demo: Demo, path: Path) -> None:
 
 def _need(demo: Demo, view: View, partners: list[str]) -> Float:
     """What is left of the worth of a view's points, as `partner_choice.choose` counts it."""
-    points, need = demo.scene.points[view.point_indices], np.ones(len(view.point_indices))
+    points = demo.scene.points[view.point_indices]
+    need = np.ones(len(view.point_indices))
     for name in partners:
         partner = demo.scene.view(name)
         observed = np.isin(view.point_indices, partner.point_indices)
@@ -73,7 +75,8 @@ def _need(demo: Demo, view: View, partners: list[str]) -> Float:
 def partners(demo: Demo, path: Path) -> None:
     """The choice of partners, and what it is for."""
     name = "N_0_0.jpg"
-    view, chosen = demo.scene.view(name), demo.selection.partners[name]
+    view = demo.scene.view(name)
+    chosen = demo.selection.partners[name]
     shared = {
         other.name: len(np.intersect1d(view.point_indices, other.point_indices))
         for other in demo.scene.views
@@ -141,7 +144,8 @@ def _sphere_sketch(axes: Any) -> None:
         axes.plot(*ring, color="0.75", linewidth=0.8)
     axes.plot([-1.3, 1.9], [0, 0], [0, 0], color="black", linewidth=1.2)
     tilt = np.radians(21)
-    point, right = np.array([0.55, 1.5 * np.sin(tilt), 1.5 * np.cos(tilt)]), np.array([0.9, 0, 0])
+    point = np.array([0.55, 1.5 * np.sin(tilt), 1.5 * np.cos(tilt)])
+    right = np.array([0.9, 0, 0])
     for start, name in ((np.zeros(3), "left centre"), (right, "right centre")):
         axes.plot(*zip(start, point, strict=True), color=LINES[0], linewidth=1.2)
         axes.scatter(*start, color="black", s=18)

@@ -45,7 +45,8 @@ class ExactMaps:
 
     def errors(self, view: View, depth: Map) -> Map:
         """Error of every pixel in GSD (depth / focal length); NaN without a depth or without exact depth."""
-        error, truth = np.full(depth.shape, np.nan, np.float32), self.depth(view.name)
+        error = np.full(depth.shape, np.nan, np.float32)
+        truth = self.depth(view.name)
         if truth is not None:
             both = (depth > 0) & (truth > 0)
             error[both] = np.abs(depth[both] / truth[both] - 1) * np.float32(view.K[0, 0])

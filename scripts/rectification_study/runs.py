@@ -58,7 +58,9 @@ class StageMeter:
         """A stage begins: the one before it is done."""
         self.finish()
         print(f"{self.label}: {stage} ({total})", flush=True)
-        self._stage, self._started, self._cpu_started = stage, time.perf_counter(), time.process_time()
+        self._stage = stage
+        self._started = time.perf_counter()
+        self._cpu_started = time.process_time()
         # Linux: forget the peak so far. Where that is not allowed peaks are those since the start.
         with suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")
