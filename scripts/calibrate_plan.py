@@ -3,7 +3,7 @@
     python scripts/calibrate_plan.py --output FOLDER --scene block=block/sparse/0 --scene wall=wall/sparse/0@1536
 
 Every scene is planned and then run from scratch, with one thread and with all cores. Seconds are compared stage by
-stage with one thread, as the constants in `pipeline/{match,vote,confirm,fuse}.py` are processor seconds; the last
+stage with one thread, as the constants in `pipeline/stages/` are processor seconds; the last
 table says by what to multiply those of each stage so that this machine's runs come out right.
 """
 

@@ -183,8 +183,8 @@ def test_the_gate_that_takes_the_points_is_named(workspace, spoil, options, gate
     assert sum(shares.values()) == pytest.approx(1)
     assert max(shares, key=shares.__getitem__) == gate
     assert shares[gate] > 0.5
-    option = {"normal": "max_normal_error", "depth": "max_depth_error", "reprojection": "max_reproj_error"}
-    assert gate not in option or f"loosen {option[gate]}" in losses.sentence()
+    option = {"normal": "max-normal-error", "depth": "max-depth-error", "reprojection": "max-reproj-error"}
+    assert gate not in option or f"loosen --fusion.{option[gate]} or" in losses.sentence()
     # COLMAP's own fusion loses (or keeps) the points indeed.
     count = fuse_by_colmap(workspace, options.for_colmap(), threads=1)
     assert (count > WIDTH * HEIGHT / 5) == (gate == "kept")

@@ -15,15 +15,15 @@ from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_
 
 from colmap_sph.errors import NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import Mesh, read_geometry
-from colmap_sph.pipeline import fuse as fuse_module
 from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.fuse import fuse_stage
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import parse_memory
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.stage import Facts, Result
+from colmap_sph.pipeline.stages import fuse as fuse_module
+from colmap_sph.pipeline.stages.fuse import fuse_stage
+from colmap_sph.pipeline.stages.stage import Facts, Result
 from colmap_sph.project.cloud_files import join_parts, write_part
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
@@ -402,7 +402,7 @@ def test_no_point(workspace):
 
 def test_thin_clouds_of_many_images_are_no_reason_for_advice(workspace, monkeypatch):
     """Where most pixels are confirmed, few points only mean that many images see the same."""
-    monkeypatch.setattr("colmap_sph.pipeline.cloud._FEW_POINTS", 2.0)
+    monkeypatch.setattr("colmap_sph.pipeline.stages.cloud._FEW_POINTS", 2.0)
     assert fuse(workspace).advice == ""
     rng = np.random.default_rng(0)
     for name in NAMES[2:]:
@@ -410,7 +410,7 @@ def test_thin_clouds_of_many_images_are_no_reason_for_advice(workspace, monkeypa
         write_maps(workspace, name, normals=normals / np.linalg.norm(normals, axis=2, keepdims=True))
     report = fuse(workspace, fusion=FusionOptions(min_num_pixels=2, max_depth_error=0.011))
     assert report.points > 0
-    assert "loosen max_normal_error" in report.advice
+    assert "loosen --fusion.max-normal-error" in report.advice
 
 
 @pytest.mark.parametrize("coverage", [0.0, 1.0], ids=["before", "in fusion"])

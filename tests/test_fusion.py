@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, OptionError
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.view_maps import MapSources, read_view_maps
+from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import POINT, View
 from colmap_sph.stereo import fusion

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from colmap_sph.errors import InputError, OutputError
-from colmap_sph.pipeline.pair_files import read_pair, write_pair
+from colmap_sph.pipeline.stages.pair_files import read_pair, write_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
 
 HEIGHT, WIDTH = 6, 9

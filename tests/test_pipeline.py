@@ -16,15 +16,15 @@ from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import compare_depth_map
-from colmap_sph.pipeline.confirm import ConfirmStage
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.fuse import fuse_stage
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.match import _MATCH_BYTES, MatchStage
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.stage import keys_of
-from colmap_sph.pipeline.vote import VoteStage
+from colmap_sph.pipeline.stages.confirm import ConfirmStage
+from colmap_sph.pipeline.stages.fuse import fuse_stage
+from colmap_sph.pipeline.stages.match import _MATCH_BYTES, MatchStage
+from colmap_sph.pipeline.stages.stage import keys_of
+from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project
@@ -376,7 +376,7 @@ def test_images_of_noise_have_no_result(project: Path) -> None:
 def test_fusion_without_a_point_names_the_gate(project: Path) -> None:
     keep_images(project, NADIR)
     options = replace(FEW_PAIRS, fusion=FusionOptions(min_num_pixels=4, max_normal_error=0.01))
-    with pytest.raises(NoResultError, match="loosen max_normal_error"):
+    with pytest.raises(NoResultError, match=r"loosen --fusion\.max-normal-error"):
         colmap_sph.run(project / "sparse/0", options=options)
     assert json.loads((project / "dense/colmap_sph/report.json").read_text())["points"] < 10
 
@@ -386,7 +386,7 @@ def test_few_points_are_explained(project: Path) -> None:
     options = replace(FEW_PAIRS, fusion=FusionOptions(min_num_pixels=3, max_normal_error=0.15))
     report = colmap_sph.run(project / "sparse/0", options=options)
     assert report.points > 0
-    assert "loosen max_normal_error" in report.advice
+    assert "loosen --fusion.max-normal-error" in report.advice
 
 
 def test_a_map_that_cannot_be_written(project: Path) -> None:

@@ -362,7 +362,7 @@ def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Fin
 )
 def test_memory_refused_once(what: str, finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     """One item fails, the rest goes on, and the next run completes the work."""
-    place = f"colmap_sph.pipeline.{what}"
+    place = f"colmap_sph.pipeline.stages.{what}"
     original = pkgutil.resolve_name(place)
     calls = []
 
@@ -390,7 +390,7 @@ def test_memory_refused_for_all(finished: Finished, monkeypatch: pytest.MonkeyPa
     def refused(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("colmap_sph.pipeline.vote.vote_depth", refused)
+    monkeypatch.setattr("colmap_sph.pipeline.stages.vote.vote_depth", refused)
     with pytest.raises(NoResultError, match="not enough memory"):
         finished.rerun(vote=VoteOptions(tolerance=2.5))
 

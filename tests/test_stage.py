@@ -12,16 +12,16 @@ import pytest
 from conftest import SMALL_BLOCK, keep_images
 
 import colmap_sph
-from colmap_sph.pipeline.confirm import ConfirmStage
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.fuse import ColmapFuseStage, fuse_stage
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.match import MatchStage
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.stage import Facts, Result, Stage, keys_of
-from colmap_sph.pipeline.vote import VoteStage
+from colmap_sph.pipeline.stages.confirm import ConfirmStage
+from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
+from colmap_sph.pipeline.stages.match import MatchStage
+from colmap_sph.pipeline.stages.stage import Facts, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace

@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.maps import MapFiles
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.stages.maps import MapFiles
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Scene
 

@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.memory import MemoryGate
-from colmap_sph.pipeline.stage import Result, Stage
+from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.workers import for_all
 
 logger = logging.getLogger(__name__)

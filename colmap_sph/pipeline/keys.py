@@ -16,10 +16,10 @@ from colmap_sph.scene import View
 from colmap_sph.stereo.rectified_pair import RectifiedPair
 
 # The modules whose code makes each kind of result.
-_MATCH = "colmap_sph.pipeline.match"
-_VOTE = "colmap_sph.pipeline.vote"
-_CONFIRM = "colmap_sph.pipeline.confirm"
-_FUSE = "colmap_sph.pipeline.fuse"
+_MATCH = "colmap_sph.pipeline.stages.match"
+_VOTE = "colmap_sph.pipeline.stages.vote"
+_CONFIRM = "colmap_sph.pipeline.stages.confirm"
+_FUSE = "colmap_sph.pipeline.stages.fuse"
 
 
 class Keys:

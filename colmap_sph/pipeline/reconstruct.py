@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from colmap_sph.errors import NoResultError, OptionError
-from colmap_sph.pipeline.confirm import ConfirmStage
 from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.fuse import fuse_stage
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.match import MatchStage
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.stage import Result, Stage, keys_of
-from colmap_sph.pipeline.vote import VoteStage
+from colmap_sph.pipeline.stages.confirm import ConfirmStage
+from colmap_sph.pipeline.stages.fuse import fuse_stage
+from colmap_sph.pipeline.stages.match import MatchStage
+from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
+from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import claimed
 from colmap_sph.project.database import read_verified_matches

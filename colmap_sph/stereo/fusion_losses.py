@@ -39,14 +39,14 @@ class GateLosses:
     def sentence(self) -> str:
         """What a user should know of it."""
         gates = {
-            "max_depth_error": self.depth,
-            "max_reproj_error": self.reprojection,
-            "max_normal_error": self.normal,
+            "--fusion.max-depth-error": self.depth,
+            "--fusion.max-reproj-error": self.reprojection,
+            "--fusion.max-normal-error": self.normal,
         }
         worst = max(gates, key=lambda name: gates[name])
-        remedy = f"loosen {worst} or min_num_pixels first"
+        remedy = f"loosen {worst} or --fusion.min-num-pixels first"
         if self.unseen > sum(gates.values()):
-            remedy = "check the poses, or fuse the photometric maps, which cover more"
+            remedy = "check the poses, or try --fusion.input photometric, whose maps cover more"
         return (
             f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
             f"by no other depth map, and the rest fail the gates of depth ({self.depth:.0%}), reprojection "

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.evaluation import DepthView, truth_at_pixel_origin, truth_normals_at_pixel_origin
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.pair_files import read_pair
+from colmap_sph.pipeline.stages.pair_files import read_pair
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectified_pair import PairDisparity, Surface
 from colmap_sph.stereo.vote import depth_candidates, right_disparity

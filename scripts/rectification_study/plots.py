@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.evaluation import DepthView
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.pair_files import read_pair
+from colmap_sph.pipeline.stages.pair_files import read_pair
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.rectified_pair import Side, Surface
 from colmap_sph.stereo.resampling import resample

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.pipeline.records import forget, vouch, vouched_facts
-from colmap_sph.pipeline.stage import Facts
+from colmap_sph.pipeline.stages.stage import Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
 
 MAP_BYTES = 16.0
