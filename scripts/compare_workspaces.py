@@ -146,7 +146,8 @@ def main() -> int:
     if arguments.json:
         print(json.dumps(asdict(comparison) | {"differences": [as_dict(d) for d in comparison.differences]}))
     else:
-        print("\n".join(str(difference) for difference in comparison.differences))
+        for difference in comparison.differences:
+            print(difference)
         print(f"{len(comparison.differences)} of {comparison.files} files differ")
     return int(bool(comparison.differences))
 
