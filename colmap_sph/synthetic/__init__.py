@@ -22,17 +22,10 @@ from colmap_sph.synthetic.pairs import (
     pinhole,
     slanted_plane_pair,
 )
-from colmap_sph.synthetic.primitives import (
-    ConvexPolyhedron,
-    Ellipsoid,
-    Plane,
-    Surface,
-    box,
-    gabled_house,
-    sphere,
-)
+from colmap_sph.synthetic.primitives import ConvexPolyhedron, Ellipsoid, Plane, Surface
 from colmap_sph.synthetic.rays import Camera, Hits, trace_points
 from colmap_sph.synthetic.render import Rendering, exact_geometry, render
+from colmap_sph.synthetic.solids import box, gabled_house, sphere
 from colmap_sph.synthetic.terrain import Terrain
 from colmap_sph.synthetic.texture import Facade, Material, Mottled, Noise, Painting, RoofTiles
 from colmap_sph.synthetic.village import Village, build_village

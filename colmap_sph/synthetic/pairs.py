@@ -9,9 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from colmap_sph.synthetic.light import Light
-from colmap_sph.synthetic.primitives import FloatArray, Plane, Surface, box, gabled_house, sphere
+from colmap_sph.synthetic.primitives import FloatArray, Plane, Surface
 from colmap_sph.synthetic.rays import Camera
 from colmap_sph.synthetic.render import Rendering, render
+from colmap_sph.synthetic.solids import box, gabled_house, sphere
 from colmap_sph.synthetic.texture import Mottled, Noise
 
 _UP = (0.0, 0.0, 1.0)

@@ -7,14 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_sph.synthetic.ground import Plot, Road, paint_ground
-from colmap_sph.synthetic.primitives import (
-    ConvexPolyhedron,
-    Ellipsoid,
-    FloatArray,
-    Surface,
-    box,
-    gabled_house,
-)
+from colmap_sph.synthetic.primitives import ConvexPolyhedron, Ellipsoid, FloatArray, Surface
+from colmap_sph.synthetic.solids import box, gabled_house
 from colmap_sph.synthetic.terrain import Terrain
 from colmap_sph.synthetic.texture import Colour, Facade, Material, Mottled, Noise, RoofTiles
 
