@@ -399,6 +399,38 @@ def fuse_partner(
     colour : (H, W, 3) uint16, written
     """
 
+def find_gates(
+    depth: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    partner_depth: NDArray[np.float32],
+    partner_normals: NDArray[np.float32],
+    partner_from_reference: NDArray[np.floating[Any]],
+    normal_from_partner: NDArray[np.floating[Any]],
+    max_depth_error: float,
+    min_normal_cosine: float,
+    rows: NDArray[np.int32],
+    columns: NDArray[np.int32],
+    gate: NDArray[np.uint8],
+    distance: NDArray[np.float32],
+    /,
+) -> None:
+    """What keeps a partner from agreeing with pixels: 0 unseen, 1 depth, 2 normal, 3 nothing; and the distance of
+    their projections from the centre of the partner's pixel.
+
+    depth : (H, W) float32
+    normals : (3, H, W) float32
+    partner_depth : (PARTNER_H, PARTNER_W) float32
+    partner_normals : (3, PARTNER_H, PARTNER_W) float32
+    partner_from_reference : (3, 4) float64
+    normal_from_partner : (3, 3) float64
+    max_depth_error : float
+    min_normal_cosine : float
+    rows : (POINTS) int32
+    columns : (POINTS) int32
+    gate : (POINTS) uint8, written
+    distance : (POINTS) float32, written
+    """
+
 def count_points(
     depth: NDArray[np.float32],
     normals: NDArray[np.float32],

@@ -161,6 +161,16 @@ def fuse_partner(rng: Random) -> Arguments:
     return [*reference, rays[0], *partner, rays[1], image, *matrices, *gates, *flags, *verdicts(rng, shape)]
 
 
+def find_gates(rng: Random) -> Arguments:
+    maps = fuse_partner(rng)
+    reference, partner, matrices = maps[:2], maps[3:5], maps[7:9]
+    h, w = reference[0].shape
+    count = int(rng.integers(0, 50)) if h and w else 0
+    places = [rng.integers(0, max(most, 1), count).astype(np.int32) for most in (h, w)]
+    outputs = [np.zeros(count, np.uint8), np.zeros(count, np.float32)]
+    return [*reference, *partner, *matrices, number(rng), number(rng), *places, *outputs]
+
+
 def count_points(rng: Random) -> Arguments:
     maps = fused_maps(rng)
     first, end = sorted(int(row) for row in rng.integers(0, maps[0].shape[0] + 1, 2))
@@ -251,6 +261,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         vote_depth,
         compare_depths,
         fuse_partner,
+        find_gates,
         count_points,
         write_points,
         confirm_depth,

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from colmap_sph import synthetic as syn
-from colmap_sph.project.map_files import read_depth_map, read_normal_map, write_depth_map, write_normal_map
+from colmap_sph.project.map_files import read_depth_map, read_normal_planes, write_depth_map, write_normal_map
 from colmap_sph.project.pair_lists import write_fusion_cfg
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.fusion_losses import DepthAndNormals
@@ -67,6 +67,6 @@ def stored_maps(workspace: Workspace) -> Callable[[str], DepthAndNormals]:
 
     def maps_of(name: str) -> DepthAndNormals:
         depth, normals = (of(name, "geometric") for of in (workspace.depth_map_path, workspace.normal_map_path))
-        return read_depth_map(depth), read_normal_map(normals)
+        return read_depth_map(depth), read_normal_planes(normals)
 
     return maps_of

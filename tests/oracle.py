@@ -3,6 +3,8 @@
 Nothing here is shared with the C code: plain loops over pixels, 64-bit integers or float64 throughout.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 CENSUS_INVALID = 1 << 63
@@ -330,6 +332,18 @@ def _agreement(world, normal, partner, options):
     angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / options.max_normal_error
     clearance = min(clearance, abs(difference - 1), abs(angle - 1))
     return (x, y), np.hypot(u - x, v - y), difference <= 1 and angle <= 1, clearance
+
+
+def gate(world, normal, partner, options):
+    """What keeps a partner from agreeing with a world point: 0 unseen, 1 depth, 2 normal, 3 nothing; the distance
+    from its pixel's centre; clearance.
+    """
+    loose = replace(options, max_normal_error=180.0)
+    pixel, distance, agrees, clearance = _agreement(world, normal, partner, options)
+    if pixel is None:
+        return 0, 0.0, clearance
+    _, _, same_depth, _ = _agreement(world, normal, partner, loose)
+    return 1 + same_depth * (1 + agrees), distance, clearance
 
 
 def fuse_view(reference, partners, options):

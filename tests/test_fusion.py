@@ -1,5 +1,6 @@
 """Our fusion of exact maps against exact surfaces, of noisy ones against the oracle, and what its options do."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,12 +12,13 @@ from exact_maps import HEIGHT, WIDTH, make_workspace, stored_maps, write_maps
 from refusals import assert_refused
 from scipy.spatial import cKDTree
 
+from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, OptionError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.scene import POINT, View
+from colmap_sph.scene import POINT, View, pixel_transfer
 from colmap_sph.stereo import fusion
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.fusion_losses import explain_losses
@@ -362,6 +364,41 @@ def test_fusion_is_the_oracles(seed, options):
             np.testing.assert_allclose(point["xyz"], place, rtol=1e-6, atol=1e-6)
             np.testing.assert_allclose(point["normal"], normal, atol=1e-6)
     assert num_found > 100
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_gates_are_the_oracles(seed):
+    """Of every pixel with a depth: what keeps a partner from agreeing, how far it is from that one's centre."""
+    options = FusionOptions(max_depth_error=0.008, max_normal_error=15.0)
+    seen = set()
+    for one, other in itertools.permutations(noisy_maps(seed), 2):
+        rows, columns = np.nonzero(one.depth > 0)
+        gate = np.empty(len(rows), np.uint8)
+        distance = np.empty(len(rows), np.float32)
+        _native.find_gates(
+            one.depth,
+            one.normals,
+            other.depth,
+            other.normals,
+            pixel_transfer(one.view, other.view),
+            one.view.R @ other.view.R.T,
+            options.max_depth_error,
+            np.cos(np.radians(options.max_normal_error)),
+            rows.astype(np.int32),
+            columns.astype(np.int32),
+            gate,
+            distance,
+        )
+        for k, (row, column) in enumerate(np.argwhere(one.depth > 0).tolist()):
+            ray = np.linalg.solve(one.view.K, [column, row, 1.0])
+            world = one.view.R.T @ (ray * float(one.depth[row, column]) - one.view.t)
+            normal = one.view.R.T @ one.normals[:, row, column].astype(float)
+            expected, far, clearance = oracle.gate(world, normal, other, options)
+            if clearance > 1e-4:
+                assert gate[k] == expected
+                assert distance[k] == pytest.approx(far, abs=1e-4)
+                seen.add(expected)
+    assert seen == {0, 1, 2, 3}
 
 
 def test_bands_are_joined_in_order(yard, monkeypatch):

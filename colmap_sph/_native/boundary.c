@@ -348,7 +348,7 @@ PyObject *native_call(const native_function *function, PyObject *args, void *arg
     set.count = 0;
     int status = 0;
     const int ready =
-        read_arguments(function, args, &set, size, slots) && function->check(arguments) && check_disjoint(&set);
+        read_arguments(function, args, &set, size, slots) && check_disjoint(&set) && function->check(arguments);
     if (ready) {
         Py_BEGIN_ALLOW_THREADS;
         status = function->run(arguments);

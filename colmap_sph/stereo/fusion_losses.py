@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.scene import Scene, View
+from colmap_sph import _native
+from colmap_sph.scene import Scene, View, pixel_transfer
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.pairs import overlapping_views
 
@@ -71,7 +73,7 @@ def explain_losses(
     Parameters
     ----------
     maps_of : callable
-        Image name → its (H, W) depth and (H, W, 3) normals. Asked for some images many times.
+        Image name → its (H, W) depth and (3, H, W) normals. Asked for some images many times.
     scene : Scene
         Views with maps.
     options : FusionOptions
@@ -85,50 +87,64 @@ def explain_losses(
     GateLosses
     """
     overlapping = overlapping_views(scene, min(options.check_num_images, _EXPLAINED_PARTNERS))
-    counts = np.zeros(5)
+    counts = np.zeros(len(_Loss))
     for view in scene.views[:: -(-len(scene.views) // max_views)]:
-        points, normals = _sample_points(view, *maps_of(view.name), samples)
-        verdicts = np.zeros((len(points), 4), dtype=int)
+        pixels = _sample_pixels(maps_of(view.name)[0], samples)
+        losses = np.zeros((len(pixels[0]), len(_Loss)), dtype=int)
         for name in overlapping[view.name]:
-            verdicts += _verdicts(points, normals, scene.view(name), *maps_of(name), options)
-        enough = 1 + verdicts[:, 3] >= options.min_num_pixels
-        failed = np.where(verdicts[:, :3].any(axis=1), verdicts[:, :3].argmax(axis=1) + 1, 0)
-        counts += np.bincount(np.where(enough, 4, failed), minlength=5)
+            found = _losses_in(view, maps_of(view.name), scene.view(name), maps_of(name), pixels, options)
+            losses += np.eye(len(_Loss), dtype=int)[found]
+        enough = 1 + losses[:, _Loss.NONE] >= options.min_num_pixels
+        gates = losses[:, _Loss.DEPTH : _Loss.NONE]
+        failed = np.where(gates.any(axis=1), gates.argmax(axis=1) + _Loss.DEPTH, _Loss.UNSEEN)
+        counts += np.bincount(np.where(enough, _Loss.NONE, failed), minlength=len(_Loss))
     return GateLosses(*(counts / max(counts.sum(), 1)))
 
 
-def _sample_points(
-    view: View, depth: NDArray[np.float32], normals: NDArray[np.float32], samples: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """World points and world normals of evenly spread pixels with a depth."""
+class _Loss(IntEnum):
+    """What keeps a partner from agreeing with a pixel, in the order of `GateLosses`."""
+
+    UNSEEN = 0
+    DEPTH = 1
+    REPROJECTION = 2
+    NORMAL = 3
+    NONE = 4
+
+
+# Of the codes that the kernel gives.
+_LOSS_OF_GATE = np.array([_Loss.UNSEEN, _Loss.DEPTH, _Loss.NORMAL, _Loss.NONE])
+
+
+def _sample_pixels(depth: NDArray[np.float32], samples: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Rows and columns of evenly spread pixels with a depth."""
     rows, columns = np.nonzero(depth > 0)
     chosen = np.linspace(0, len(rows) - 1, min(samples, len(rows))).astype(int)
-    rows, columns = rows[chosen], columns[chosen]
-    rays = np.stack([columns, rows, np.ones_like(rows)], axis=1) @ np.linalg.inv(view.K).T
-    points = (rays * depth[rows, columns, None] - view.t) @ view.R
-    return points, normals[rows, columns] @ view.R
+    return rows[chosen].astype(np.int32), columns[chosen].astype(np.int32)
 
 
-def _verdicts(
-    points: NDArray[np.float64],
-    normals: NDArray[np.float64],
+def _losses_in(
     view: View,
-    depth: NDArray[np.float32],
-    view_normals: NDArray[np.float32],
+    maps: DepthAndNormals,
+    partner: View,
+    partner_maps: DepthAndNormals,
+    pixels: tuple[NDArray[np.int32], NDArray[np.int32]],
     options: FusionOptions,
-) -> NDArray[np.bool_]:
-    """(n, 4): stopped by depth, by reprojection, by normal; agrees. All false where the view has no depth."""
-    pixels, distance = view.project(points)
-    # Depth maps count integer pixels, the first one 0: a point is inside where the pixel next to it is in the map.
-    last = np.array([view.width, view.height]) - 0.5
-    inside = (distance > 0) & (pixels > -0.5).all(axis=1) & (pixels < last).all(axis=1)
-    columns, rows = (np.rint(np.where(inside[:, None], pixels, 0)).astype(int)).T
-    z = depth[rows, columns].astype(np.float64)
-    seen = inside & (z > 0)
-    far = seen & (np.abs(distance - z) > options.max_depth_error * z)
-    off = seen & ~far & (np.hypot(*(pixels - np.stack([columns, rows], axis=1)).T) > options.max_reproj_error)
-    if options.method != "colmap":  # what is farther away agrees all the same, and becomes a point of its own
-        off[:] = False
-    cosine = (normals * (view_normals[rows, columns] @ view.R)).sum(axis=1)
-    turned = seen & ~far & ~off & (cosine < np.cos(np.radians(options.max_normal_error)))
-    return np.stack([far, off, turned, seen & ~far & ~off & ~turned], axis=1)
+) -> NDArray[np.int64]:
+    """(n,): what keeps a partner from agreeing with pixels of a view, as `_Loss`."""
+    gate = np.empty(len(pixels[0]), np.uint8)
+    distance = np.empty(len(pixels[0]), np.float32)
+    _native.find_gates(
+        *maps,
+        *partner_maps,
+        pixel_transfer(view, partner),
+        view.R @ partner.R.T,
+        options.max_depth_error,
+        np.cos(np.radians(options.max_normal_error)),
+        *pixels,
+        gate,
+        distance,
+    )
+    losses = _LOSS_OF_GATE[gate]
+    if options.method == "colmap":  # for ours, what is farther away agrees all the same, as a point of its own
+        losses[(losses > _Loss.DEPTH) & (distance > options.max_reproj_error)] = _Loss.REPROJECTION
+    return losses

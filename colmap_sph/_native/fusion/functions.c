@@ -57,6 +57,47 @@ static int run_fuse_partner(void *arguments) {
 FUNCTION(fuse_partner, FUSE_PARTNER, check_fuse_partner,
          "Add a partner's verdict on a view's pixels: covered by a finer pixel, or seen by it, too.");
 
+#define FIND_GATES(X) \
+    X(IN, float32, depth, H, W) \
+    X(IN, float32, normals, 3, H, W) \
+    X(IN, float32, partner_depth, PARTNER_H, PARTNER_W) \
+    X(IN, float32, partner_normals, 3, PARTNER_H, PARTNER_W) \
+    X(IN, float64, partner_from_reference, 3, 4) \
+    X(IN, float64, normal_from_partner, 3, 3) \
+    X(VALUE, float, max_depth_error) \
+    X(VALUE, float, min_normal_cosine) \
+    X(IN, int32, rows, POINTS) \
+    X(IN, int32, columns, POINTS) \
+    X(OUT, uint8, gate, POINTS) \
+    X(OUT, float32, distance, POINTS)
+ARGUMENTS(find_gates, FIND_GATES);
+
+static int check_find_gates(const void *arguments) {
+    const find_gates_arguments *a = arguments;
+    int inside = 1;
+    for (ptrdiff_t k = 0; k < a->size.POINTS; k++) {
+        inside &= 0 <= a->rows[k] && a->rows[k] < a->size.H && 0 <= a->columns[k] && a->columns[k] < a->size.W;
+    }
+    return check(inside, "the rows and columns must lie in the map");
+}
+
+static int run_find_gates(void *arguments) {
+    const find_gates_arguments *a = arguments;
+    const view_maps reference = {a->depth, a->normals, a->size.H, a->size.W, {0}};
+    const view_maps partner = {a->partner_depth, a->partner_normals, a->size.PARTNER_H, a->size.PARTNER_W, {0}};
+    const fusion_gates gates = {0, a->max_depth_error, a->min_normal_cosine};
+    fusion_transfer transfer = {.partner_wins = 0};
+    split_transfer(a->partner_from_reference, transfer.pixel_from_reference, transfer.translation);
+    memcpy(transfer.reference_from_partner, a->normal_from_partner, sizeof transfer.reference_from_partner);
+    find_gates(&reference, &partner, &transfer, gates, a->rows, a->columns, a->size.POINTS, a->gate, a->distance);
+    return 0;
+}
+
+FUNCTION(
+    find_gates, FIND_GATES, check_find_gates,
+    "What keeps a partner from agreeing with pixels: 0 unseen, 1 depth, 2 normal, 3 nothing; and the distance of\n"
+    "their projections from the centre of the partner's pixel.");
+
 /* ---- points ------------------------------------------------------------------------------------------------ */
 
 #define FUSED_ROWS(X) \
@@ -137,5 +178,5 @@ FUNCTION(write_points, WRITE_POINTS, check_write_points,
          "Points as in a PLY file: position and normal as float32, red, green, blue; and for each the number of\n"
          "views that see it, and their indices. POINTS and WORDS are what count_points returns.");
 
-native_function *const fusion_functions[] = {&fuse_partner_function, &count_points_function,
+native_function *const fusion_functions[] = {&fuse_partner_function, &find_gates_function, &count_points_function,
                                              &write_points_function, NULL};

@@ -33,6 +33,17 @@ typedef struct {
     uint16_t *colour;   /* (..., 3) sums over these */
 } fusion_verdict;
 
+/* What keeps a partner from agreeing with a pixel: it has the point not in view or no depth there, its depth or
+ * its normal differs by too much, or nothing does. In the order in which they are asked. */
+typedef enum { GATE_UNSEEN, GATE_DEPTH, GATE_NORMAL, GATE_NONE } fusion_gate;
+
+/* The gate that so many pixels of the reference, each by its row and column, come to in a partner; and the
+ * distance, in pixels, of their projections from the centre of the partner's pixel, 0 where it is unseen. Of the
+ * gates' reprojection error nothing is asked: what is farther away agrees all the same. */
+void find_gates(const view_maps *reference, const view_maps *partner, const fusion_transfer *transfer,
+                fusion_gates gates, const int32_t *rows, const int32_t *columns, ptrdiff_t count, uint8_t *gate,
+                float *distance);
+
 /* Adds the verdict of the partner with this bit, whose `image` has three channels. Pixels that are covered already
  * are passed over. */
 void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
