@@ -3,8 +3,10 @@
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
+from typing import Protocol
 
 import pytest
 
@@ -23,13 +25,24 @@ class Loader:
         return key.encode() * self.size
 
 
-def cache_of(load: Callable[[str], bytes], capacity: int) -> Callable[[str], bytes]:
-    """A cache's `get` that loads by a function of the key."""
-    cache: LoadCache[bytes] = LoadCache(len, capacity)
-    return lambda key: cache.get(key, lambda: load(key))
+class CacheOf(Protocol):
+    def __call__(self, load: Callable[[str], bytes], capacity: int) -> Callable[[str], bytes]: ...
 
 
-def test_a_kept_value_is_loaded_once() -> None:
+@pytest.fixture
+def cache_of() -> Iterator[CacheOf]:
+    """A cache's `get` that loads by a function of the key; capacity is held while the test runs."""
+    with ExitStack() as held:
+
+        def make(load: Callable[[str], bytes], capacity: int) -> Callable[[str], bytes]:
+            cache: LoadCache[bytes] = LoadCache(len)
+            held.enter_context(cache.holding(capacity))
+            return lambda key: cache.get(key, lambda: load(key))
+
+        yield make
+
+
+def test_a_kept_value_is_loaded_once(cache_of: CacheOf) -> None:
     load = Loader()
     cache = cache_of(load, 100)
     first = cache("a")
@@ -38,7 +51,7 @@ def test_a_kept_value_is_loaded_once() -> None:
     assert load.loaded == ["a", "b"]
 
 
-def test_the_least_recently_used_goes_first() -> None:
+def test_the_least_recently_used_goes_first(cache_of: CacheOf) -> None:
     load = Loader()
     cache = cache_of(load, 30)
     for key in "abcadabc":
@@ -47,7 +60,7 @@ def test_the_least_recently_used_goes_first() -> None:
     assert load.loaded == [*"abcd", *"bc"]
 
 
-def test_capacity_counts_what_is_kept_alone() -> None:
+def test_capacity_counts_what_is_kept_alone(cache_of: CacheOf) -> None:
     """After many evictions and returns as much fits as at the start."""
     load = Loader()
     cache = cache_of(load, 30)
@@ -60,7 +73,7 @@ def test_capacity_counts_what_is_kept_alone() -> None:
     assert load.loaded == []
 
 
-def test_a_value_larger_than_the_capacity() -> None:
+def test_a_value_larger_than_the_capacity(cache_of: CacheOf) -> None:
     load = Loader(1000)
     cache = cache_of(load, 30)
     assert cache("a") is cache("a")
@@ -69,7 +82,7 @@ def test_a_value_larger_than_the_capacity() -> None:
     assert load.loaded == ["a", "b", "a"]
 
 
-def test_a_failure_is_not_kept() -> None:
+def test_a_failure_is_not_kept(cache_of: CacheOf) -> None:
     answers: Iterator[OSError | bytes] = iter([OSError("disk"), b"value"])
 
     def load(key: str) -> bytes:
@@ -84,7 +97,7 @@ def test_a_failure_is_not_kept() -> None:
     assert cache("a") == b"value"
 
 
-def test_threads_that_want_one_value_load_it_once() -> None:
+def test_threads_that_want_one_value_load_it_once(cache_of: CacheOf) -> None:
     barrier = threading.Barrier(8)
     go = threading.Event()
     loaded = []
@@ -108,7 +121,7 @@ def test_threads_that_want_one_value_load_it_once() -> None:
     assert all(value is values[0] for value in values)
 
 
-def test_different_values_load_at_the_same_time() -> None:
+def test_different_values_load_at_the_same_time(cache_of: CacheOf) -> None:
     both = threading.Barrier(2)
 
     def load(key: str) -> bytes:
@@ -120,7 +133,7 @@ def test_different_values_load_at_the_same_time() -> None:
         assert list(pool.map(cache, "ab")) == [b"a", b"b"]
 
 
-def test_many_threads_in_a_small_cache() -> None:
+def test_many_threads_in_a_small_cache(cache_of: CacheOf) -> None:
     load = Loader()
     cache = cache_of(load, 25)
     keys = [chr(ord("a") + number % 7) for number in range(700)]
@@ -146,3 +159,37 @@ def test_a_file_made_anew_is_another(tmp_path: Path) -> None:
         stamps.append(file_stamp(path))
     assert len(set(stamps)) == 3
     assert file_stamp(path) == stamps[-1]
+
+
+def test_outside_of_a_stage_nothing_is_kept() -> None:
+    load = Loader()
+    cache: LoadCache[bytes] = LoadCache(len)
+    for key in "aab":
+        cache.get(key, partial(load, key))
+    assert load.loaded == [*"aab"]
+
+
+def test_two_holders_at_once() -> None:
+    """The first to end takes back what it gave, and no more."""
+    load = Loader()
+    cache: LoadCache[bytes] = LoadCache(len)
+    with cache.holding(20):
+        with cache.holding(10):
+            for key in "abcabc":
+                cache.get(key, partial(load, key))
+            assert load.loaded == [*"abc"]
+        for key in "bcbc":
+            cache.get(key, partial(load, key))
+        assert load.loaded == [*"abc"]
+        cache.get("a", partial(load, "a"))
+    assert load.loaded == [*"abca"]
+
+
+def test_a_file_that_cannot_be_asked_has_a_key(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Whoever loads it says what is wrong."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(Path, "stat", refuse)
+    assert file_stamp(tmp_path / "a") != file_stamp(tmp_path / "b")

@@ -236,10 +236,15 @@ def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> Non
     assert {name for name in before if after[name][1] != before[name][1]} == set()
 
 
-def test_the_cloud_depends_on_the_origin(finished: Finished) -> None:
+def test_the_cloud_depends_on_where_the_scene_lies_and_how_images_are_numbered(finished: Finished) -> None:
     keys = Keys(Workspace(finished.dense), OPTIONS)
-    near, far = (keys.cloud({}, {}, np.full(3, height)) for height in (0.0, 1e6))
-    assert near != far == keys.cloud({}, {}, np.full(3, 1e6))
+    scene = read_scene(finished.dense / "sparse")
+    near = keys.cloud({}, {}, scene)
+    assert near == keys.cloud({}, {}, replace(scene))
+    elsewhere = replace(scene, origin=np.full(3, 1e6))
+    anchored_elsewhere = replace(scene, anchor=np.full(3, 1.0))
+    numbered_otherwise = replace(scene, image_ids=scene.image_ids[::-1])
+    assert all(keys.cloud({}, {}, one) != near for one in (elsewhere, anchored_elsewhere, numbered_otherwise))
 
 
 def test_a_changed_mask_redoes_the_cloud(finished: Finished) -> None:
@@ -572,6 +577,34 @@ def test_plan_of_a_finished_workspace(finished: Finished) -> None:
         assert fresh.disk > 2e6
     assert rewritten(before, finished.dense) == set()
     assert sorted(finished.dense.rglob("*")) == state
+
+
+def test_plan_of_an_overwrite_is_that_of_an_empty_workspace(finished: Finished) -> None:
+    fresh = make_plan(Project(workspace=finished.dense), OPTIONS, overwrite=True)
+    shutil.rmtree(finished.dense / "colmap_sph")
+    empty = make_plan(Project(workspace=finished.dense), OPTIONS)
+    # Memory is not compared: how large the disparity maps will be is better known where there are some.
+    assert [replace(one, memory=0.0) for one in fresh.stages] == [replace(one, memory=0.0) for one in empty.stages]
+
+
+@pytest.mark.parametrize("method", ["best-pixel", "colmap"])
+def test_plan_where_no_depth_was_confirmed(method: Any, finished: Finished) -> None:
+    """There are maps, all of them empty, and there is no cloud."""
+    options = replace(
+        OPTIONS,
+        vote=VoteOptions(min_support=200),
+        confirm=ConfirmOptions(min_consistent=200),
+        fusion=FusionOptions(method=method),
+    )
+    with pytest.raises(NoResultError):
+        colmap_sph.run(finished.project / "sparse/0", options=options)
+    plan = make_plan(Project(finished.project / "sparse/0"), options)
+    assert (plan.images_done, plan.fuse) == (4, True)
+
+
+def test_plan_keeps_to_the_memory(finished: Finished) -> None:
+    tight = replace(OPTIONS, memory="203MB", threads=16)
+    assert 200e6 <= make_plan(Project(workspace=finished.dense), tight, overwrite=True).memory <= 203e6
 
 
 def test_report_tells_what_was_done(finished: Finished) -> None:

@@ -1,6 +1,7 @@
 """The contract of the stages: a task can be pickled, and what it makes does not depend on where it is made."""
 
 import pickle
+import threading
 from collections.abc import Hashable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
@@ -8,14 +9,16 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
+import cv2
+import numpy as np
 import pytest
 from conftest import SMALL_BLOCK, keep_images
 
 import colmap_sph
+from colmap_sph.errors import InputError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
@@ -63,8 +66,7 @@ def made(dense: Path) -> dict[str, bytes]:
 
 def make_elsewhere(stage: Stage[Item, Task], pool: ProcessPoolExecutor) -> dict[Item, Result]:
     """All jobs of a stage, made by another process from their pickled tasks."""
-    kept = stage.kept_memory(MemoryGate(OPTIONS.memory_budget))
-    with stage.opened(kept):
+    with stage.opened():
         jobs = {item: stage.job(item) for item in stage.items}
         assert all(job.done is None for job in jobs.values())
         facts = pool.map(type(stage).make, [job.task for job in jobs.values()])
@@ -131,3 +133,36 @@ def test_fusion_by_colmap_is_one_job(project: Path) -> None:
     assert job.task.workspace == Workspace(project / "dense")
     pixels = 160 * 120
     assert job.cost.memory == 3 * 80 * pixels + 0.1 * 160 * 120**2
+
+
+def test_fusion_by_colmap_runs_in_the_calling_thread(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only there COLMAP's library heeds Ctrl-C; and its failure is that of the run."""
+    options = replace(OPTIONS, fusion=FusionOptions(method="colmap"))
+    context = replace(context_of(project, project / "dense"), options=options)
+    threads = []
+
+    def refuse(*_: object, **__: object) -> int:
+        threads.append(threading.current_thread())
+        raise InputError("The map a.bin is missing.")
+
+    monkeypatch.setattr("colmap_sph.pipeline.stages.fuse.fuse_by_colmap", refuse)
+    maps = {name: Result("another", False, Facts(coverage=1.0)) for name in NAMES}
+    with pytest.raises(InputError, match="The map a"):
+        execute(fuse_stage(context, {}, maps))
+    assert threads == [threading.current_thread()]
+    assert context.report.skipped_images == {}
+
+
+def test_what_is_made_follows_from_the_task_alone(project: Path, tmp_path: Path) -> None:
+    """Not from a task before it in the same process, which had other masks."""
+    masks = tmp_path / "masks"
+    masks.mkdir()
+    for name in NAMES:
+        cv2.imwrite(str(masks / f"{name}.png"), np.zeros((120, 160), np.uint8))
+    stage = finished_stages(project)[-1]
+    task = replace(stage.job(NAMES[0]).task, partners=(), stem=tmp_path / "part")
+    task = replace(task, options=replace(task.options, min_num_pixels=1))
+    masked = replace(task, reference=replace(task.reference, mask=masks / f"{NAMES[0]}.png"))
+    for _ in range(2):
+        assert type(stage).make(task).points > 1000
+        assert type(stage).make(masked).points == 0

@@ -1,10 +1,9 @@
 """A stage's jobs, executed: what is there is left alone, the rest is made by worker threads within the memory."""
 
 import logging
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 from typing import TypeVar
 
-from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.workers import for_all
@@ -42,23 +41,29 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
         with gate.reserve(job.cost.memory, stage.label(item)):
             return Result(job.key, made=True, facts=stage.make(job.task))
 
-    with stage.opened(kept):
-        with context.stage(stage.name, len(stage.items)):
-            results = for_all(
-                work,
-                stage.items,
-                threads=context.options.num_threads,
-                progress=context.progress,
-                skip=None if stage.whole else stage.skip,
-            )
-            stage.close(results)
-        _count(context, stage, results)
-    return results
-
-
-def _count(context: Context, stage: Stage[Item, Task], results: dict[Item, Result]) -> None:
+    with stage.opened(), context.stage(stage.name, len(stage.items)):
+        with stage.holding(kept):
+            results = _one_by_one(work, stage) if stage.whole else _by_threads(work, stage)
+        stage.close(results)
     made, reused = stage.count(results)
     context.report.made[stage.name] = made
     context.report.reused[stage.name] = reused
     if reused:
         logger.info("%s: %d were up to date", stage.name.capitalize(), reused)
+    return results
+
+
+def _by_threads(work: Callable[[Item], Result], stage: Stage[Item, Task]) -> dict[Item, Result]:
+    context = stage.context
+    return for_all(
+        work, stage.items, threads=context.options.num_threads, progress=context.progress, skip=stage.skip
+    )
+
+
+def _one_by_one(work: Callable[[Item], Result], stage: Stage[Item, Task]) -> dict[Item, Result]:
+    """In the calling thread, the only one in which COLMAP's library heeds Ctrl-C."""
+    results = {}
+    for item in stage.items:
+        results[item] = work(item)
+        stage.context.progress.advance()
+    return results

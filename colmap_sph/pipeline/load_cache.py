@@ -11,19 +11,17 @@ T = TypeVar("T")
 
 
 class LoadCache(Generic[T]):
-    """Loads each key once and keeps the most recently used values within a number of bytes.
+    """Loads each key once and keeps the most recently used values while bytes are held for them.
 
     Parameters
     ----------
     size : callable
         Value → bytes.
-    capacity : int
-        Bytes to keep; a single larger value is kept while nothing newer comes.
     """
 
-    def __init__(self, size: Callable[[T], int], capacity: int = 0) -> None:
+    def __init__(self, size: Callable[[T], int]) -> None:
         self._size = size
-        self._capacity = capacity
+        self._capacity = 0
         self._values: OrderedDict[str, T] = OrderedDict()
         self._loading: dict[str, threading.Lock] = {}
         self._lock = threading.Lock()
@@ -31,12 +29,15 @@ class LoadCache(Generic[T]):
 
     @contextmanager
     def holding(self, capacity: int) -> Iterator[None]:
-        """Keep up to so many bytes for a while, and nothing afterwards."""
-        self._empty(capacity)
+        """Keep up to so many bytes more for a while; a single larger value is kept while nothing newer comes."""
+        with self._lock:
+            self._capacity += capacity
         try:
             yield
         finally:
-            self._empty(0)
+            with self._lock:
+                self._capacity -= capacity
+                self._evict()
 
     def get(self, key: str, load: Callable[[], T]) -> T:
         """The value of `key`, loaded if need be: outside the lock, at most once at a time per key."""
@@ -51,20 +52,21 @@ class LoadCache(Generic[T]):
             with self._lock:
                 self._values[key] = value
                 self._bytes += self._size(value)
-                while self._bytes > self._capacity and len(self._values) > 1:
-                    _, oldest = self._values.popitem(last=False)
-                    self._bytes -= self._size(oldest)
+                self._evict()
             return value
 
-    def _empty(self, capacity: int) -> None:
-        with self._lock:
-            self._capacity = capacity
-            self._values.clear()
+    def _evict(self) -> None:
+        while self._bytes > self._capacity and len(self._values) > (self._capacity > 0):
+            _, oldest = self._values.popitem(last=False)
+            self._bytes -= self._size(oldest)
+        if not self._values:
             self._loading.clear()
-            self._bytes = 0
 
 
 def file_stamp(path: Path) -> str:
     """A file's key in a cache: its path, size and time, so that a file made anew is loaded anew."""
-    status = path.stat() if path.exists() else None
-    return f"{path} {status and (status.st_size, status.st_mtime_ns)}"
+    try:
+        status = path.stat()
+    except OSError:
+        return str(path)
+    return f"{path} {status.st_size} {status.st_mtime_ns}"

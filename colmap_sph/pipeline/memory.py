@@ -28,7 +28,7 @@ def parse_memory(text: str) -> int:
         return 0
     match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(i?B)?\s*", text, re.IGNORECASE)
     if not match:
-        raise OptionError(f"memory must be an amount such as 6GiB or 1500MB, not {text!r}.")
+        raise OptionError(f"memory must be an amount such as 6GiB or 1500MB, not {text!r}.", "memory")
     number, unit, suffix = match.groups()
     base = 1000 if suffix is not None and suffix.upper() == "B" else 1024
     return int(float(number) * base ** _UNITS[unit.upper()])

@@ -31,7 +31,7 @@ Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
 
 # Processor seconds and bytes per megapixel and pixel of the original images, while these are undistorted.
-_UNDISTORT_SECONDS = 0.12
+_UNDISTORT_SECONDS = 0.06
 _UNDISTORTED_BYTES = 1.0
 # Bytes that the interpreter and the libraries have in use.
 _BASE_MEMORY = 200e6
@@ -50,7 +50,7 @@ class StagePlan:
     seconds : float
         Estimated processor seconds of what is to do.
     memory, disk : float
-        Bytes of arrays at a time, and of files to be made.
+        Bytes in use at a time, and of files to be made.
     """
 
     name: str
@@ -125,16 +125,16 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     else:
         scene = anchored(foreseen.scene)
     selection = choose_pairs(dense if foreseen is None else None, scene, options, project.database())
-    keys = Keys(dense, options, foreseen=foreseen is not None)
+    keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
     context = Context(dense, wanted_scene(scene, selection), options, keys)
-    survey = Survey(fresh=overwrite or foreseen is not None)
+    survey = Survey()
     go_through_stages(context, selection.unique_pairs(), survey)
     stages = survey.stages
     pairs, _, images, cloud = stages
     if foreseen is not None:
         pixels = sum(view.width * view.height for view in context.scene.views)
         seconds = _UNDISTORT_SECONDS * foreseen.original_pixels / 1e6
-        stages = [StagePlan("undistort", 1, 0, seconds, 0.0, _UNDISTORTED_BYTES * pixels), *stages]
+        stages = [StagePlan("undistort", 1, 0, seconds, _BASE_MEMORY, _UNDISTORTED_BYTES * pixels), *stages]
     return Plan(
         undistort=foreseen is not None,
         pair_source=selection.source,
@@ -144,7 +144,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         images_done=images.done,
         fuse=cloud.done < cloud.total,
         seconds=sum(stage.seconds for stage in stages) / min(options.num_threads, num_cores()),
-        memory=_BASE_MEMORY + max(stage.memory for stage in stages),
+        memory=max(stage.memory for stage in stages),
         disk=sum(stage.disk for stage in stages),
         free_disk=_free_disk(project),
         stages=tuple(stages),
@@ -160,18 +160,12 @@ def _free_disk(project: Project) -> int:
 class Survey:
     """An executor that asks every stage for what is to do, and does nothing.
 
-    Parameters
-    ----------
-    fresh : bool
-        Whatever is there will be done again.
-
     Attributes
     ----------
     stages : list of StagePlan
         What the stages said, in their order.
     """
 
-    fresh: bool
     stages: list[StagePlan] = field(default_factory=list)
 
     def __call__(self, stage: Stage[Item, Task], /) -> dict[Item, Result]:
@@ -184,7 +178,7 @@ class Survey:
             except ColmapSphError as error:
                 logger.info("%s: %s", stage.label(item), error)
                 continue
-            if job.done is not None and not self.fresh:
+            if job.done is not None:
                 results[item] = Result(job.key, made=False, facts=job.done)
             else:
                 results[item] = Result(job.key, made=True, facts=Facts(coverage=1.0))
@@ -204,14 +198,14 @@ class Survey:
 
 
 def _memory_of(stage: Stage[Item, Task], costs: list[Cost]) -> float:
-    """Bytes of arrays at a time while a stage works: of as many of the costliest jobs as work side by side."""
+    """Bytes in use while a stage works: as many of the costliest jobs as work side by side, and what it keeps."""
     if not costs:
-        return 0.0
+        return _BASE_MEMORY
     threads = stage.context.options.num_threads
     working = sum(nlargest(threads, (cost.memory for cost in costs)))
     if stage.whole:
-        return working
+        return _BASE_MEMORY + working
     budget = stage.context.options.memory_budget
     kept: Kept = stage.kept_memory(MemoryGate(budget))
     held = min(threads, len(costs)) * kept.scratch + min(kept.caches * kept.cache, kept.filled)
-    return min(working + held, budget)
+    return min(_BASE_MEMORY + working + held, budget)

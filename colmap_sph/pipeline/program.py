@@ -1,7 +1,8 @@
 """Which code a result was made by: a digest of the modules that its maker reaches by import, and of the kernels.
 
 A hand-kept version would be forgotten, and a result of yesterday's code taken for today's. A digest of the whole
-package would make everything anew for the edit of a help text.
+package would make everything anew for the edit of a help text. What a stage says of its costs stands beside its
+maker, and changes the digest, too.
 """
 
 import ast

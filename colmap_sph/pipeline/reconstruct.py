@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
@@ -96,6 +96,7 @@ def run_project(
         See `run`.
     """
     check_input(project, options)
+    program_digests()
     progress = Silent() if progress is None else progress
     report = RunReport()
     if project.model is None:

@@ -23,7 +23,7 @@ def for_all(
     *,
     threads: int,
     progress: Progress,
-    skip: Callable[[T, str], None] | None,
+    skip: Callable[[T, str], None],
 ) -> dict[T, R]:
     """`work` on all items in worker threads.
 
@@ -36,9 +36,9 @@ def for_all(
     threads : int
     progress : Progress
         Advanced once per item.
-    skip : callable, optional
+    skip : callable
         Called with an item that raised a `ColmapSphError` or found no memory, and the reason. Any other error,
-        a wrong option and an output that cannot be written end the stage; without it every error does.
+        a wrong option and an output that cannot be written end the stage.
 
     Returns
     -------
@@ -56,11 +56,9 @@ def for_all(
                 except _FATAL:
                     raise
                 except ColmapSphError as error:
-                    if skip is None:
-                        raise
                     skip(item, str(error))
                 except (MemoryError, cv2.error) as error:
-                    if skip is None or not is_memory_error(error):
+                    if not is_memory_error(error):
                         raise
                     skip(item, str(OutOfMemoryError()))
                 # Nothing may keep a future: with its exception it keeps all arrays of the item that failed.

@@ -122,6 +122,15 @@ def read_undistorted(path: Path, colour: int) -> NDArray[np.uint8]:
     return np.asarray(image, dtype=np.uint8)
 
 
+def grey_bytes(path: Path) -> int:
+    """Bytes per pixel of what `read_grey` gives."""
+    return 1 if _is_jpeg(path) else 4
+
+
+def _is_jpeg(path: Path) -> bool:
+    return path.suffix.lower() in (".jpg", ".jpeg")
+
+
 def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
     """Read the grey values (0..255) of an undistorted image as exactly as its file holds them.
 
@@ -139,7 +148,7 @@ def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
     InputError
         It is missing or damaged.
     """
-    if path.suffix.lower() in (".jpg", ".jpeg"):
+    if _is_jpeg(path):
         return read_undistorted(path, cv2.IMREAD_GRAYSCALE)
     colours = read_undistorted(path, cv2.IMREAD_COLOR)
     grey = np.empty(colours.shape[:2], dtype=np.float32)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.records import vouch, vouched_facts
-from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.map_files import read_depth_map, read_normal_planes
 from colmap_sph.stereo.fusion_losses import DepthAndNormals, explain_losses
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ def facts_of_cloud(context: "Context", names: Sequence[str], points: int) -> Clo
 
     def read(name: str) -> DepthAndNormals:
         files = context.map_files(name, options.input)
-        return read_depth_map(files.depth), read_normal_map(files.normals)
+        return read_depth_map(files.depth), read_normal_planes(files.normals)
 
     with maps.holding(_CACHE_BYTES):
         losses = explain_losses(lambda name: maps.get(name, lambda: read(name)), scene, options)

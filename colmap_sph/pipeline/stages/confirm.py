@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.memory import MemoryGate
 
 # Processor seconds per megapixel of the image: per partner, and per partner's image that is matched in.
-_CONFIRM_SECONDS = 0.05
-_REFINE_SECONDS = 0.13
+_CONFIRM_SECONDS = 0.03
+_REFINE_SECONDS = 0.065
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
 _CONFIRM_BYTES = 40.0
 _REFINE_BYTES = 55.0
@@ -149,8 +149,8 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         return Kept(cache=cache, caches=2, filled=filled)
 
     @contextmanager
-    def opened(self, kept: Kept) -> Iterator[None]:
-        """See `Stage.opened`."""
+    def holding(self, kept: Kept) -> Iterator[None]:
+        """See `Stage.holding`."""
         with _images.holding(kept.cache), _estimates.holding(kept.cache):
             yield
 

@@ -76,7 +76,9 @@ def make_cloud_part(task: FuseTask) -> Facts:
 
 
 def _view_maps(sources: MapSources) -> ViewMaps:
-    return _maps.get(file_stamp(sources.depth), lambda: read_view_maps(sources))
+    files = (sources.depth, sources.normals, sources.image, sources.mask)
+    stamps = [file_stamp(file) for file in files if file is not None]
+    return _maps.get(f"{sources.index} {stamps}", lambda: read_view_maps(sources))
 
 
 def _partner_maps(partners: Sequence[MapSources]) -> Iterator[ViewMaps]:
@@ -123,9 +125,9 @@ def fuse_stage(context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[
     FuseStage or ColmapFuseStage
         On the images with any depth.
     """
-    filled = {name: result for name, result in maps.items() if result.facts.coverage > 0}
+    with_depth = {name: result for name, result in maps.items() if result.facts.coverage > 0}
     stage = ColmapFuseStage if context.options.fusion.method == "colmap" else FuseStage
-    return stage(context, pair_keys, filled)
+    return stage(context, pair_keys, with_depth)
 
 
 class FuseStage(Stage[str, FuseTask]):
@@ -137,10 +139,9 @@ class FuseStage(Stage[str, FuseTask]):
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
         super().__init__(context, list(maps))
         self._partners = _partners_in_fusion(context, pair_keys, self.items)
-        self._key = context.keys.cloud(
-            {name: maps[name].key for name in maps}, self._partners, context.scene.origin
-        )
+        self._key = context.keys.cloud({name: maps[name].key for name in maps}, self._partners, context.scene)
         self._known = known_cloud(context, self._key)
+        self._is_there = self._known is not None
         self._index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
         self._scratch = context.workspace.fusion_scratch_dir
 
@@ -189,7 +190,7 @@ class FuseStage(Stage[str, FuseTask]):
         return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
 
     @contextmanager
-    def opened(self, kept: Kept) -> Iterator[None]:
+    def opened(self) -> Iterator[None]:
         """Begin the cloud anew where it must be made; its parts are there until this ends."""
         write_fusion_cfg(self.context.workspace.fusion_cfg_path, self.items)
         if self._known is not None:
@@ -197,7 +198,13 @@ class FuseStage(Stage[str, FuseTask]):
             return
         check_places(self.context.workspace)
         forget(self.context.workspace.cloud_record_path)
-        with scratch_folder(self._scratch), _maps.holding(kept.cache):
+        with scratch_folder(self._scratch):
+            yield
+
+    @contextmanager
+    def holding(self, kept: Kept) -> Iterator[None]:
+        """See `Stage.holding`."""
+        with _maps.holding(kept.cache):
             yield
 
     def close(self, results: Mapping[str, Result]) -> None:
@@ -229,8 +236,7 @@ class FuseStage(Stage[str, FuseTask]):
 
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
         """One cloud."""
-        made = any(result.made for result in results.values())
-        return int(made), int(not made)
+        return int(not self._is_there), int(self._is_there)
 
 
 def _partners_in_fusion(
@@ -260,7 +266,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         # Without tracks COLMAP would find no images that overlap.
         self._partners = None if context.scene.has_tracks else partners_of(pair_keys)
         self._key = context.keys.cloud(
-            {name: maps[name].key for name in maps}, self._partners or {}, context.scene.origin
+            {name: maps[name].key for name in maps}, self._partners or {}, context.scene
         )
         self._known = known_cloud(context, self._key)
 
@@ -273,7 +279,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         memory = _COLMAP_BYTES * pixels
         if options.fusion.use_cache:
             memory = min(memory, options.fusion.cache_size * 1e9)
-        memory += _COLMAP_MASK_BYTES * max(view.width * view.height**2 for view in views)
+        memory += _COLMAP_MASK_BYTES * max((view.width * view.height**2 for view in views), default=0)
         cost = Cost(_COLMAP_SECONDS * pixels / 1e6, memory, _CLOUD_BYTES * pixels)
         task = ColmapFuseTask(context.workspace, options.fusion, options.num_threads, self._partners)
         return Job(self._key, None if self._known is None else Facts(), cost, task)
@@ -283,10 +289,11 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         return item
 
     @contextmanager
-    def opened(self, kept: Kept) -> Iterator[None]:
+    def opened(self) -> Iterator[None]:
         """Begin the cloud anew where it must be made."""
         write_fusion_cfg(self.context.workspace.fusion_cfg_path, self._names)
         if self._known is None:
+            check_places(self.context.workspace)
             forget(self.context.workspace.cloud_record_path)
             self._warn_of_memory()
         yield

@@ -16,7 +16,7 @@ from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.pair_files import stored_key, write_pair
 from colmap_sph.pipeline.stages.stage import Cost, Facts, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.images import read_grey
+from colmap_sph.project.images import grey_bytes, read_grey
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 # Processor seconds per megapixel of both rectified images.
-_SECONDS = 0.125
+_SECONDS = 0.1
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …
@@ -94,7 +94,8 @@ def make_disparity_map(task: MatchTask) -> Facts:
 def _rectified(photo: PhotoFile, geometry: RectifiedPair, side: Side) -> RectifiedImage:
     view = photo.view
     image = _images.get(file_stamp(photo.image), lambda: read_grey(photo.image))
-    mask = _masks.get(file_stamp(photo.mask), lambda: read_mask(photo.mask, view.width, view.height))
+    mask_key = f"{file_stamp(photo.mask)} {view.width} {view.height}"
+    mask = _masks.get(mask_key, lambda: read_mask(photo.mask, view.width, view.height))
     return RectifiedImage(*resample(image, view, geometry, side, mask=mask))
 
 
@@ -106,7 +107,7 @@ class MatchStage(Stage[Pair, MatchTask]):
 
     def __init__(self, context: "Context", pairs: Sequence[Pair]) -> None:
         super().__init__(context, pairs)
-        self._scratch_bytes = 0
+        self._scratch_bytes = _SCRATCH_BYTES
 
     def job(self, item: Pair) -> Job[MatchTask]:
         """See `Stage.job`; `RectificationError` for a pair that cannot be rectified."""
@@ -151,12 +152,19 @@ class MatchStage(Stage[Pair, MatchTask]):
         pixels = [view.width * view.height for view in self.context.scene.views]
         spare = int(max(gate.spare(_RECTIFIED_SHARE * _MATCH_BYTES * max(pixels)), gate.free / 8))
         scratch = min(_SCRATCH_BYTES, spare // (3 * self.context.options.num_threads))
-        return Kept(scratch, min(_CACHE_BYTES, spare // 6), 2, filled=sum(pixels))
+        paths = [self.context.workspace.image_path(view.name) for view in self.context.scene.views]
+        filled = sum(size * grey_bytes(path) for size, path in zip(pixels, paths, strict=True))
+        return Kept(scratch, min(_CACHE_BYTES, spare // 6), 2, filled)
 
     @contextmanager
-    def opened(self, kept: Kept) -> Iterator[None]:
+    def opened(self) -> Iterator[None]:
         """See `Stage.opened`."""
         make_dir(self.context.workspace.pairs_dir)
+        yield
+
+    @contextmanager
+    def holding(self, kept: Kept) -> Iterator[None]:
+        """See `Stage.holding`."""
         self._scratch_bytes = kept.scratch
         with _images.holding(kept.cache), _masks.holding(kept.cache):
             yield

@@ -126,8 +126,13 @@ class Stage(ABC, Generic[Item, Task]):
         return Kept()
 
     @contextmanager
-    def opened(self, kept: "Kept") -> Iterator[None]:
-        """Hold what the stage keeps from item to item."""
+    def opened(self) -> Iterator[None]:
+        """Make the folders that results go to; those for the time of the stage are there until this ends."""
+        yield
+
+    @contextmanager
+    def holding(self, kept: "Kept") -> Iterator[None]:
+        """Hold what the stage keeps in memory, while items are made."""
         yield
 
     def close(self, results: Mapping[Item, Result]) -> None:

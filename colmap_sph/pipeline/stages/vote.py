@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import disparity_bytes, read_arrays, read_pair, stored_key, write_arrays
-from colmap_sph.pipeline.stages.stage import Cost, Facts, Job, Kept, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Facts, Job, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
 # Processor seconds per megapixel of the image: per pair that votes, and of the normals of one kind of maps.
-_SECONDS = 0.07
-NORMALS_SECONDS = 0.25
+_SECONDS = 0.052
+NORMALS_SECONDS = 0.16
 # Bytes on disk per pixel: of the estimate.
 _ESTIMATE_BYTES = 9.0
 # Largest bytes in use at a time, per pixel: beside the pairs' disparity maps, and of one that is not made yet.
@@ -117,7 +117,7 @@ class VoteStage(Stage[str, VoteTask]):
         return item
 
     @contextmanager
-    def opened(self, kept: Kept) -> Iterator[None]:
+    def opened(self) -> Iterator[None]:
         """See `Stage.opened`."""
         for name in self.items:
             make_dir(self.context.estimate_path(name).parent)
