@@ -137,6 +137,7 @@ def test_every_text_of_the_help_is_a_sentence() -> None:
         (["--depth.consistency_tolerance", "2"], ["--confirm.tolerance", "2"]),
         (["--fusion-input", "photometric"], ["--fusion.input", "photometric"]),
         (["sparse/0", "--masks", "m"], ["--model", "sparse/0", "--masks", "m"]),
+        (["sparse/0", "--model=x"], ["sparse/0", "--model=x"]),  # which of the two is for the parser to refuse
         (["--vote.min-support", "2", "--dry-run"], ["--vote.min-support", "2", "--dry-run"]),
     ],
 )

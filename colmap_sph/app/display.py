@@ -28,14 +28,15 @@ class Display:
         self._task: rich.progress.TaskID | None = None
 
     def __enter__(self) -> "Display":
-        self._bars.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._bars.stop()
+        if self._task is not None:
+            self._bars.stop()
 
     def start(self, stage: str, total: int) -> None:
         """See `Progress`."""
+        self._bars.start()  # not before there is a bar: without any an empty line would be drawn
         self._task = self._bars.add_task(stage, total=total)
 
     def advance(self) -> None:

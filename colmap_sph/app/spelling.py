@@ -63,5 +63,5 @@ def in_full(arguments: Sequence[str]) -> list[str]:
             flag = flag.replace("_", "-")
             argument = full.get(flag, flag) + equals + value
         spelled.append(argument)
-    named = bool(spelled) and not spelled[0].startswith("-")
-    return ["--model", *spelled] if named else spelled
+    is_named = any(argument.partition("=")[0] == "--model" for argument in spelled)
+    return ["--model", *spelled] if spelled and not spelled[0].startswith("-") and not is_named else spelled
