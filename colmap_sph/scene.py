@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 
 SourceImages = list[str] | int | Literal["__all__"]
-"""Partners that a user asks for: names, how many the program may choose, or all."""
+"""Partners that a user asks for: names, all, or the program's choice, of which COLMAP reads a number."""
 
 POINT = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
 """A point of a cloud: world frame, model units; unit normal; red, green, blue."""

@@ -15,7 +15,7 @@ _HEAD = """# Options of `colmap_sph run`
 
 Made by `scripts/make_option_docs.py` from the records in the code; `colmap_sph run --help-all` shows the same.
 In Python the records are the fields of `colmap_sph.RunOptions`: `--vote.min-support 2` is
-`RunOptions(vote=VoteOptions(min_support=2))`, with `VoteOptions` of `colmap_sph.stereo.vote`.
+`RunOptions(vote=VoteOptions(min_support=2))`, both of `colmap_sph`.
 What the stages do is told in [algorithm.md](algorithm.md).
 """
 

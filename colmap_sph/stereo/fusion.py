@@ -36,7 +36,8 @@ class FusionOptions:
     min_num_pixels: int = 2
     """Pixels, of different images, that must agree on a point (COLMAP: 5)."""
     max_reproj_error: float = 0.5
-    """Pixels within this distance of a point's projection are merged into it (COLMAP: 2)."""
+    """A pixel makes no point of its own where it projects within this many pixels of the centre of a finer image's
+    pixel that agrees. COLMAP's fusion merges pixels this near (COLMAP: 2)."""
     max_depth_error: float = 0.01
     """Largest relative difference of depths that agree."""
     max_normal_error: float = 30.0

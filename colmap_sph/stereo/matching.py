@@ -47,7 +47,7 @@ class MatchingOptions:
     p2_min: int = 30
     """Penalty for larger changes across strong intensity edges."""
     p2_contrast: int = 2
-    """Intensity difference (grey values) at which the penalty has fallen halfway to `p2_min`."""
+    """Difference of neighbours in the left image, grey values, at which P2 has fallen halfway to `p2_min`."""
     disparities: int = 32
     """Disparities searched per pixel at full resolution; a multiple of 32."""
     coarse_disparities: int = 64

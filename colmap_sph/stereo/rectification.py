@@ -1,13 +1,7 @@
 """Image pair → rectified pair: rows are epipolar planes, on a sphere around the baseline or on a plane.
 
-Rectified frame: x along the baseline from the left to the right centre, z towards the scene. On the sphere
-(Elhashash & Qin, §3.2, after their swap of axes) the ray of a rectified pixel is
-
-    (sin θ, cos θ sin λ, cos θ cos λ),   λ = row angle about the baseline, θ = angle inside the epipolar plane
-
-and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. On the plane ("frame", §3.1) the
-ray is (x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described by one record, `RectifiedPair`:
-array coordinate = (angle or tangent) · scale − origin, with pixel centres at whole array coordinates.
+The frame and the layout are those of `rectified_pair` (Elhashash & Qin, §3.1, §3.2): the rotation comes from the
+baseline and the viewing directions, the rows from what both images see, the columns from the disparity range.
 """
 
 from dataclasses import dataclass
@@ -42,7 +36,8 @@ class RectificationOptions:
     sampling: float = 1.0
     """Rectified pixels per pixel of the finer image."""
     min_cosine: float = 0.1
-    """Rays closer to the baseline than acos of this (about 6° off the epipole) are left out."""
+    """Rays whose angle with the baseline has a smaller sine than this are left out: at 0.1, within 5.7° of the
+    epipole."""
     near_margin: float = 2.0
     """Surfaces are looked for down to the distance of the nearest sparse points divided by this: treetops and
     roofs often carry no sparse point."""

@@ -42,9 +42,10 @@ class RefinementOptions:
     max_partners: int = 8
     """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
     depth_freedom: float = 6.0
-    """How far a depth may move: the standard deviation it is given, in those of the confirmed depth."""
+    """How far a depth may move: the standard deviation of the pull to the confirmed depth, in those of that depth.
+    The images can move it farther."""
     slope_freedom: float = 5.0
-    """How far a plane may turn: the standard deviation it is given, degrees."""
+    """How far a plane may turn: the standard deviation of the pull to its slope, degrees."""
     contrast: float = 20.0
     """Pixels of a window that differ from its middle by more than this (grey values) hardly count."""
     min_score: float = 0.5

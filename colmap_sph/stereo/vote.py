@@ -62,7 +62,7 @@ def depth_candidates(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Triangulate a pair's disparities along the rays of one of its images.
 
-    On the sphere the distance along the ray is ρ = b cos θ_r / sin δ (left image), on the plane Z = b f / d
+    On the sphere the distance along the ray is ρ = b cos θ_r / sin δ (left image), on the plane Z = b f / (d + d₀)
     (Elhashash & Qin, §3.4).
 
     Parameters
