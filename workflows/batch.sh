@@ -4,8 +4,8 @@
 #     workflows/batch.sh ROOT [options of `colmap_sph run`]
 #
 # A project is a folder, at any depth below ROOT, with a sparse model in sparse/0; its result goes to dense/ beside
-# sparse/. A failure does not stop the batch. The exit code is 1 where a project has no complete result. Run it again
-# to try those once more: what is finished is not done again.
+# sparse/. A failure does not stop the batch. A project that finished without some of its images counts as done, with
+# a warning. The exit code is 1 where a project failed. Run it again to try those once more: finished results are kept.
 set -u
 root=${1:?usage: batch.sh ROOT [options of colmap_sph run]}
 shift
@@ -24,17 +24,17 @@ for model in "${models[@]}"; do
     case $code in
         130 | 143) echo "interrupted at $project; the same command goes on there" >&2; exit "$code" ;;
         0) result="$(points "$project") points" ;;
-        5) result="$(points "$project") points, but some images have no depth map" ;;
+        5) result="$(points "$project") points; WARNING: without some images, see dense/colmap_sph/report.json" ;;
         2) result="FAILED: input or options" ;;
         3) result="FAILED: cannot write" ;;
         4) result="FAILED: nothing to reconstruct" ;;
         6) result="FAILED: not enough memory" ;;
         *) result="FAILED: exit code $code" ;;
     esac
-    [ "$code" -eq 0 ] || failed=$((failed + 1))
+    case $code in 0 | 5) ;; *) failed=$((failed + 1)) ;; esac
     summary+=("$(printf '%-40s %s' "$project" "$result")")
 done
 
-printf '\n==== %d projects, %d without a complete result\n' "${#models[@]}" "$failed"
+printf '\n==== %d projects, %d failed\n' "${#models[@]}" "$failed"
 printf '%s\n' "${summary[@]}"
 [ "$failed" -eq 0 ]

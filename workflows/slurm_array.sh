@@ -6,7 +6,9 @@
 #
 # models.txt names one sparse model per line; the results go to dense/ beside each sparse/. `sacct -j JOB` tells
 # which tasks failed or ran out of time; submit those again with --array=3,7, and they go on where they stopped. A
-# task uses the cores that it is given below.
+# project that finished without some of its images counts as done, with a warning in the task's log. A task uses the
+# cores that it is given below; give `--memory` where it may use less than its node has free. `colmap_sph` must be on
+# the PATH: submit with its environment active.
 #SBATCH --job-name=colmap_sph
 #SBATCH --nodes=1
 #SBATCH --ntasks=1
@@ -24,7 +26,7 @@ model=$(sed -n "${SLURM_ARRAY_TASK_ID:?submit with sbatch --array}p" "$list")
 code=0
 colmap_sph run --model "$model" "$@" || code=$?
 case $code in
-    5) echo "$model: some images have no depth map; see dense/colmap_sph/report.json" ;;
+    5) echo "$model: WARNING: finished without some images, see dense/colmap_sph/report.json" ;;
     0) echo "$model: complete" ;;
     *) exit "$code" ;;
 esac
