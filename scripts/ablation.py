@@ -42,11 +42,11 @@ _VARIANTS: dict[str, list[str]] = {
     "a median of disparities at full resolution": ["--matching.median-filter", "True"],
     "what a single pair says contradicts, too": ["--confirm.min-contradicting-support", "1"],
     "P1 is 18, P2 falls over 16 grey values": ["--matching.p1", "18", "--matching.p2-contrast", "16"],
-    "rectified 1.2 times as fine": ["--sampling", "1.2"],
+    "rectified 1.2 times as fine": ["--rectification.sampling", "1.2"],
     "ranges do not follow slopes": ["--matching.max-slant", "0"],
     "64 disparities": ["--matching.disparities", "64"],
     "five pairs": ["--num-pairs", "5"],
-    "planar rectification": ["--rectification", "frame"],
+    "planar rectification": ["--rectification.surface", "frame"],
 }
 _MIN_TRACK = 5
 _MAX_ERROR = 0.7

@@ -116,6 +116,7 @@ def vote(demo: Demo, path: Path) -> None:
         axes.set_title(f"candidates along the ray of pixel {letter}")
         axes.set_xlabel("depth [m], bars: 3 standard deviations")
         axes.plot([], [], "o", color="tab:blue", label="cluster")
+        axes.plot([], [], "o", markersize=9, color="tab:blue", markerfacecolor="none", label="its centre")
         axes.plot([], [], "o", color="0.6", label="outvoted")
         axes.plot([], [], "--", color="tab:red", label="voted")
         axes.plot([], [], "-", color="tab:green", label="exact")

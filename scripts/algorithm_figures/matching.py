@@ -99,7 +99,7 @@ def matching(demo: Demo, path: Path) -> None:
     above, below = np.ravel(np.asarray(figure.subfigures(2, 1, height_ratios=(1.1, 1))))
     panels = above.subplots(1, 3)
     grey = np.where(pair.left_image.valid > 0, pair.left_image.image, 255)
-    show(panels[0], grey, "left, rectified", cmap="gray", vmin=0, vmax=255)
+    show(panels[0], grey, f"{NEAR[0]}, rectified with {NEAR[1]}", cmap="gray", vmin=0, vmax=255)
     drawn = show(panels[1], disparity, "disparity, white = none", cmap="turbo")
     above.colorbar(drawn, ax=panels[1], shrink=0.7, label="[pixels]")
     drawn = show(panels[2], error, "difference from exact disparity", cmap="magma_r", vmin=0, vmax=2)
@@ -153,8 +153,8 @@ def _draw_fit(axes: Any, level: Level, row: int, column: int, truth: float, foun
     axes.axvline(found, color="tab:red", linewidth=1, linestyle="--", label=f"fitted {found:.2f}")
     axes.set(xlabel="disparity [pixels]", ylabel="sum of 25 raw costs [bits]")
     axes.set_title("raw costs of 5 x 5 pixels on the plane")
-    axes.legend(loc="upper center")
-    axes.set_ylim(0, 1.5 * max(sums))
+    axes.legend(loc="lower left")
+    axes.set_ylim(0, 1.1 * max(sums))
 
 
 def search_ranges(demo: Demo, path: Path) -> None:
@@ -168,7 +168,8 @@ def search_ranges(demo: Demo, path: Path) -> None:
     width = pair.geometry.left_width
     part = slice(row - 40, row + 40)
     grey = np.where(pair.left_image.valid[part] > 0, pair.left_image.image[part], 255)
-    show(strip, grey, f"80 rows of the left rectified image around row {row} (red)", cmap="gray", aspect="auto")
+    title = f"{WIDE[0]}, rectified with {WIDE[1]}: 80 rows around row {row} (red)"
+    show(strip, grey, title, cmap="gray", aspect="auto")
     strip.axhline(40, color="tab:red", linewidth=1.5)
     colours = ("#dbe9f6", "#a5cde3", "#5ba3cf", "#2171b5", "#08306b")
     for number, level in enumerate(levels):

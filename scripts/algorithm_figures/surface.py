@@ -155,13 +155,13 @@ def refinement(demo: Demo, path: Path) -> None:
         drawn = show(axes, masked(angle, there)[part], words, cmap="magma_r", vmin=0, vmax=15)
     above.colorbar(drawn, ax=list(top), shrink=0.85, extend="max", label="[degrees]")
     left, right = below.subplots(1, 2)
-    for axes, values, most, label in (
-        (left, angles, 20, "angle to the exact normal [degrees]"),
-        (right, shifts, 1.0, "difference from exact depth [pixels on the ground]"),
+    for axes, values, most, label, median_of in (
+        (left, angles, 20, "angle to the exact normal [degrees]", "{:.1f}°"),
+        (right, shifts, 1.0, "difference from exact depth [pixels on the ground]", "{:.3f} pixels"),
     ):
         for numbers, title, colour in zip(values, ("before", "after"), ("0.55", "tab:red"), strict=True):
-            median = np.median(numbers)
-            axes.plot(*_cumulative(numbers, most), color=colour, label=f"{title}: median {median:.2g}")
+            words = f"{title}: median {median_of.format(np.median(numbers))}"
+            axes.plot(*_cumulative(numbers, most), color=colour, label=words)
         axes.set(xlabel=label, ylabel="share of the pixels below", xlim=(0, most), ylim=(0, 1))
         axes.grid(color="0.9")
         axes.legend(loc="lower right")
