@@ -22,8 +22,9 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import parse_memory
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages import fuse as fuse_module
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import fuse_stage
-from colmap_sph.pipeline.stages.stage import Facts, Result
+from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.cloud_files import join_parts, write_part
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
 from colmap_sph.project.map_files import read_depth_map, write_depth_map

@@ -21,9 +21,10 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
-from colmap_sph.pipeline.stages.stage import Facts, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene

@@ -109,7 +109,15 @@ def _print_options(options: Sequence[Option], console: Console) -> None:
 
 
 def print_plan(plan: Plan, workspace: Workspace, console: Console) -> None:
-    """What a run would do and need."""
+    """Print what a run would do and need.
+
+    Parameters
+    ----------
+    plan : Plan
+    workspace : Workspace
+        To which nothing was written.
+    console : Console
+    """
     facts = Table.grid(padding=(0, 2))
     facts.add_row("undistort", "to do" if plan.undistort else "done")
     for what, number, done in (
@@ -138,7 +146,15 @@ def _duration(seconds: float) -> str:
 
 
 def print_summary(report: RunReport, workspace: Workspace, console: Console) -> None:
-    """The closing summary of a run."""
+    """Print the closing summary of a run.
+
+    Parameters
+    ----------
+    report : RunReport
+    workspace : Workspace
+        With the results.
+    console : Console
+    """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
     table = Table("image", "coverage", title="Depth maps", title_justify="left")
     for name, share in sorted(listed[:_MAX_LISTED_IMAGES]):

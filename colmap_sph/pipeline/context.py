@@ -74,7 +74,17 @@ class Context:
 
 @contextmanager
 def timed_stage(name: str, total: int, progress: Progress, report: RunReport) -> Iterator[None]:
-    """Announce a stage of `total` steps, and report its wall time."""
+    """Announce a stage, and report its wall time.
+
+    Parameters
+    ----------
+    name : str
+    total : int
+        Steps that will be told by `progress.advance`.
+    progress : Progress
+    report : RunReport
+        Whose `seconds` get the time.
+    """
     logger.info("%s (%d)", name.capitalize(), total)
     progress.start(name, total)
     start = time.perf_counter()

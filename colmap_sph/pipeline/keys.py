@@ -59,7 +59,14 @@ class Keys:
         return digest(kind, self._programs.get(kind), self._fresh, *parts)
 
     def pair(self, left: View, right: View, geometry: RectifiedPair) -> str:
-        """Of a disparity map. The sparse points and the options of rectification are in `geometry`."""
+        """Of a disparity map.
+
+        Parameters
+        ----------
+        left, right : View
+        geometry : RectifiedPair
+            In which the sparse points and the options of rectification are, too.
+        """
         images = [self._image(view.name) for view in (left, right)]
         masks = [self._mask(view.name) for view in (left, right)]
         cameras = [_camera(view) for view in (left, right)]

@@ -18,7 +18,8 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions, num_cores
 from colmap_sph.pipeline.reconstruct import check_input, choose_pairs, go_through_stages, wanted_scene
-from colmap_sph.pipeline.stages.stage import Cost, Facts, Kept, Result, Stage
+from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
 from colmap_sph.project.undistortion import foresee_workspace

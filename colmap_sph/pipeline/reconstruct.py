@@ -184,7 +184,16 @@ class Executor(Protocol):
 
 
 def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executor) -> None:
-    """The stages in their order: each begins where all results of the one before are known."""
+    """Go through the stages in their order: each begins where all results of the one before are known.
+
+    Parameters
+    ----------
+    context : Context
+    pairs : sequence of (str, str)
+        Names of the images of each pair.
+    executor : callable
+        What is done with each stage, see `Executor`.
+    """
     pair_keys = keys_of(executor(MatchStage(context, pairs)))
     vote_keys = keys_of(executor(VoteStage(context, pair_keys)))
     maps = executor(ConfirmStage(context, pair_keys, vote_keys))

@@ -42,6 +42,15 @@ def vouched_facts(record: Path, key: str, files: Sequence[Path]) -> dict[str, An
 
     They must be made where the record is missing, damaged or of another key, and where a file is missing, cut
     off or was written by another program. Every block of a small file is looked at, but only some of a large one.
+
+    Parameters
+    ----------
+    record, key, files
+        As for `vouch`.
+
+    Returns
+    -------
+    dict or None
     """
     try:
         content = json.loads(record.read_bytes())

@@ -38,7 +38,15 @@ def known_cloud(context: "Context", key: str) -> CloudFacts | None:
 
 
 def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts) -> None:
-    """Record that the cloud is complete."""
+    """Record that the cloud is complete.
+
+    Parameters
+    ----------
+    context : Context
+    key : str
+        Under which it was made.
+    facts : CloudFacts
+    """
     vouch(context.workspace.cloud_record_path, key, context.cloud_paths, **asdict(facts))
 
 
@@ -51,7 +59,21 @@ def report_cloud(context: "Context", facts: CloudFacts) -> None:
 
 
 def facts_of_cloud(context: "Context", names: Sequence[str], points: int) -> CloudFacts:
-    """Facts of a cloud made of images `names`: where few of their pixels became points, which gate to loosen."""
+    """Find out what is to be known of a cloud: where few pixels became points, which gate to loosen.
+
+    Parameters
+    ----------
+    context : Context
+        With the coverage of the images in its report.
+    names : sequence of str
+        Images that were fused.
+    points : int
+        Points of the cloud.
+
+    Returns
+    -------
+    CloudFacts
+    """
     coverage = context.report.coverage
     options = context.options.fusion
     scene = replace(context.scene, views=tuple(map(context.scene.view, names)))

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
-from colmap_sph.pipeline.stages.stage import Cost, Facts, Job, Kept, Result, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS, read_estimate
 from colmap_sph.project.images import read_undistorted
 from colmap_sph.scene import View

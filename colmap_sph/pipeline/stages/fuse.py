@@ -18,7 +18,8 @@ from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.memory import format_memory, resident
 from colmap_sph.pipeline.records import forget
 from colmap_sph.pipeline.stages.cloud import facts_of_cloud, known_cloud, report_cloud, vouch_for_cloud
-from colmap_sph.pipeline.stages.stage import Cost, Facts, Job, Kept, Result, Stage
+from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.cloud_files import (
     check_places,

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.pipeline.records import forget, vouch, vouched_facts
-from colmap_sph.pipeline.stages.stage import Facts
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
 
 MAP_BYTES = 16.0
@@ -23,7 +23,20 @@ class MapFiles:
     record: Path
 
     def write(self, normals: NDArray[np.float32], depth: NDArray[np.float32], key: str) -> Facts:
-        """Write both maps: (H, W, 3) normals and (H, W) depth, under a key."""
+        """Write both maps.
+
+        Parameters
+        ----------
+        normals, depth : (H, W, 3) and (H, W) float32 ndarray
+            See `write_normal_map` and `write_depth_map`.
+        key : str
+            Under which they are vouched for.
+
+        Returns
+        -------
+        Facts
+            With the share of pixels with a depth.
+        """
         forget(self.record)
         write_depth_map(self.depth, depth)
         write_normal_map(self.normals, normals)

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import stored_key, write_pair
-from colmap_sph.pipeline.stages.stage import Cost, Facts, Job, Kept, Result, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images import grey_bytes, read_grey
 from colmap_sph.project.masks import read_mask

@@ -65,7 +65,21 @@ def read_pair(path: Path) -> PairDisparity:
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Any], key: str) -> None:
-    """Write named arrays as an ``.npz`` file under a key; `OutputError` where that fails."""
+    """Write named arrays as an ``.npz`` file.
+
+    Parameters
+    ----------
+    path : Path
+        Target file; its folder exists.
+    arrays : mapping of str to array
+    key : str
+        What `stored_key` shall return.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
     with atomic_file(path) as file:
         np.savez(file, key=key, **arrays)
 

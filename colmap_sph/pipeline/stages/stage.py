@@ -12,6 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
+from colmap_sph.pipeline.stages.facts import Facts
+
 if TYPE_CHECKING:  # what the code of a stage's results depends on is in its key, see `program`; these have no part
     from colmap_sph.pipeline.context import Context
     from colmap_sph.pipeline.memory import MemoryGate
@@ -37,22 +39,6 @@ class Cost:
     seconds: float
     memory: float
     disk: float
-
-
-@dataclass(frozen=True)
-class Facts:
-    """What is known of a result without reading it.
-
-    Attributes
-    ----------
-    coverage : float
-        Share of pixels with a depth, 0 to 1, where the stage makes maps.
-    points : int
-        Points of the cloud, where the stage makes them.
-    """
-
-    coverage: float = 0.0
-    points: int = 0
 
 
 @dataclass(frozen=True)

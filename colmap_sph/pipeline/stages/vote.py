@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import disparity_bytes, read_arrays, read_pair, stored_key, write_arrays
-from colmap_sph.pipeline.stages.stage import Cost, Facts, Job, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
