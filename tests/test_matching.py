@@ -14,7 +14,14 @@ from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
 from colmap_sph.stereo import matching, offsets
 from colmap_sph.stereo.kernels import backend
-from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.matching import (
+    SINGLE_PAIR,
+    MatchingOptions,
+    RectifiedImage,
+    Scratch,
+    match_pair,
+    scratch_bytes,
+)
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.resampling import resample
 
@@ -424,3 +431,12 @@ def test_options_out_of_bounds_are_refused(wrong):
 @pytest.mark.parametrize("wrong", [{"p1": 31, "p2_min": 30}, {"p2_min": 130, "p2": 120}, {"p2_min": -1}], ids=str)
 def test_penalties_out_of_order_are_refused(wrong):
     assert_refused(MatchingOptions(**wrong), "p2_min", "p1", "p2")
+
+
+@pytest.mark.parametrize("most", [20, 300])
+def test_scratch_memory_is_what_a_plan_says(most):
+    """Of a short range and of one that takes a pyramid of many levels."""
+    image = whole(np.random.default_rng(0).integers(0, 255, (320, 480)))
+    scratch = Scratch()
+    match_pair(image, image, 0, most, MatchingOptions(), scratch)
+    assert scratch._memory.size == pytest.approx(scratch_bytes(320 * 480, MatchingOptions()), rel=0.1)

@@ -132,6 +132,14 @@ class Scratch:
         return self._memory[:size].reshape(_BYTES_PER_SLOT, rows * width, depth)
 
 
+def scratch_bytes(pixels: int, options: MatchingOptions) -> int:
+    """Scratch memory that matching fills where it may: its finest levels need most.
+
+    A left image has so many pixels; each level above it a quarter of those of the one below.
+    """
+    return _BYTES_PER_SLOT * pixels * max(options.disparities, options.coarse_disparities // 4)
+
+
 @dataclass(frozen=True, eq=False)
 class RectifiedImage:
     """One image of a rectified pair: (H, W) float32 grey values (0..255), and 255 where they are image content."""

@@ -20,7 +20,7 @@ from colmap_sph.project.files import make_dir
 from colmap_sph.project.images import grey_bytes, read_grey
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
-from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair
+from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.pairing import Pair
 from colmap_sph.stereo.rectification import rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
@@ -123,6 +123,7 @@ class MatchStage(Stage[Pair, MatchTask]):
             seconds=_SECONDS * (left_pixels + geometry.height * geometry.right_width) / 1e6,
             memory=max(_MATCH_BYTES * left_pixels, _READ_BYTES * pixels + _RECTIFIED_BYTES * left_pixels),
             disk=_FILE_BYTES * left_pixels,
+            scratch=scratch_bytes(left_pixels, context.options.matching),
         )
         task = MatchTask(
             self._photo(left),

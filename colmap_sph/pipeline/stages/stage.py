@@ -34,11 +34,14 @@ class Cost:
         Largest bytes of arrays at a time, beside what the stage keeps; reserved before the work begins.
     disk : float
         Bytes of the files; an estimate.
+    scratch : float
+        Bytes that it would fill of a worker's scratch memory, where that were unlimited.
     """
 
     seconds: float
     memory: float
     disk: float
+    scratch: float = 0.0
 
 
 @dataclass(frozen=True)
