@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from colmap_sph.stereo.matching import match_pair as match_pair
     from colmap_sph.stereo.normals import NormalOptions as NormalOptions
     from colmap_sph.stereo.normals import fit_normals as fit_normals
-    from colmap_sph.stereo.pairs import PairOptions as PairOptions
-    from colmap_sph.stereo.pairs import select_pairs as select_pairs
+    from colmap_sph.stereo.partners.pairs import PairOptions as PairOptions
+    from colmap_sph.stereo.partners.pairs import select_pairs as select_pairs
     from colmap_sph.stereo.rectification import RectificationOptions as RectificationOptions
     from colmap_sph.stereo.rectification import rectify_pair as rectify_pair
     from colmap_sph.stereo.rectified_pair import PairDisparity as PairDisparity
@@ -61,7 +61,7 @@ _MODULE_OF = {
     "MatchingOptions": "stereo.matching",
     "NormalOptions": "stereo.normals",
     "PairDisparity": "stereo.rectified_pair",
-    "PairOptions": "stereo.pairs",
+    "PairOptions": "stereo.partners.pairs",
     "Progress": "pipeline.report",
     "Project": "project.project",
     "RectificationOptions": "stereo.rectification",
@@ -88,7 +88,7 @@ _MODULE_OF = {
     "resample": "stereo.resampling",
     "run": "pipeline.reconstruct",
     "run_project": "pipeline.reconstruct",
-    "select_pairs": "stereo.pairs",
+    "select_pairs": "stereo.partners.pairs",
     "vote_depth": "stereo.vote",
     "write_depth_map": "project.map_files",
     "write_normal_map": "project.map_files",

@@ -13,7 +13,7 @@ from colmap_sph.app.demo import DemoResult, run_demo
 from colmap_sph.errors import OutputError
 from colmap_sph.evaluation import mean_of_depth_maps
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.stereo.pairs import PairOptions
+from colmap_sph.stereo.partners.pairs import PairOptions
 
 TINY = replace(SMALL_BLOCK, strips=1, strip_images=3, oblique_images=0, supersample=1, width=240, height=180)
 TWO_PAIRS = RunOptions(threads=2, pairs=PairOptions(num_pairs=2))

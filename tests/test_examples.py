@@ -26,4 +26,4 @@ def test_examples_give_what_they_say(name: str) -> None:
 
 def test_what_a_user_of_the_library_calls_first_has_an_example() -> None:
     shown = {name.removeprefix("colmap_sph.stereo.") for name in modules_with_examples()}
-    assert {"pairs", "rectification", "matching", "vote", "normals", "colmap_sph.scene"} <= shown
+    assert {"partners.pairs", "rectification", "matching", "vote", "normals", "colmap_sph.scene"} <= shown

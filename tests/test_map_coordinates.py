@@ -20,7 +20,7 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.staging import discard_workspace
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.pairs import PairOptions
+from colmap_sph.stereo.partners.pairs import PairOptions
 
 UTM = (5e5 + 1 / 3, 5e6 + 1 / 7, 300.0)
 ECEF = (4201575.762, 168864.183, 4780229.051)

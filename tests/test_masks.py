@@ -23,7 +23,7 @@ from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.masks import read_mask, undistort_mask
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.pairs import PairOptions
+from colmap_sph.stereo.partners.pairs import PairOptions
 from colmap_sph.synthetic import Camera, DemoBlock
 
 NADIR = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]

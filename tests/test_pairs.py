@@ -20,9 +20,9 @@ from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import Scene, SourceImages, View
-from colmap_sph.stereo.pairing import partners_of
-from colmap_sph.stereo.pairs import PairOptions, PairSelection, overlapping_views, select_pairs
-from colmap_sph.stereo.partner_choice import choose, triangulation_angles, worth_of
+from colmap_sph.stereo.partners.pairing import partners_of
+from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, overlapping_views, select_pairs
+from colmap_sph.stereo.partners.partner_choice import choose, triangulation_angles, worth_of
 
 K = np.array([[1000.0, 0, 500], [0, 1000, 400], [0, 0, 1]])
 FEW = PairOptions(min_shared_points=1)

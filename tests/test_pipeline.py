@@ -34,7 +34,7 @@ from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import SourceImages
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
-from colmap_sph.stereo.pairs import PairOptions, select_pairs
+from colmap_sph.stereo.partners.pairs import PairOptions, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.vote import VoteOptions
 from colmap_sph.synthetic import DemoBlock

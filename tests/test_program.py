@@ -64,7 +64,7 @@ def digests() -> dict[str, str]:
         ("synthetic/village.py", set()),
         ("evaluation/evaluate.py", set()),
         ("project/undistortion.py", set()),
-        ("stereo/partner_choice.py", {"fuse"}),
+        ("stereo/partners/partner_choice.py", {"fuse"}),
         ("stereo/matching.py", {"match"}),
         ("stereo/vote.py", {"vote", "confirm"}),
         ("stereo/confirm.py", {"confirm"}),

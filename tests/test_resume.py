@@ -30,7 +30,7 @@ from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.normals import NormalOptions
-from colmap_sph.stereo.pairs import PairOptions, select_pairs
+from colmap_sph.stereo.partners.pairs import PairOptions, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.refinement import RefinementOptions
 from colmap_sph.stereo.vote import VoteOptions

@@ -11,7 +11,7 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.scene import View
-from colmap_sph.stereo.frusta import sees
+from colmap_sph.stereo.partners.frusta import sees
 
 
 def make_model(camera_model: str = "PINHOLE", num_images: int = 4) -> pycolmap.Reconstruction:

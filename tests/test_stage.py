@@ -32,7 +32,7 @@ from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspa
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
-from colmap_sph.stereo.pairs import select_pairs
+from colmap_sph.stereo.partners.pairs import select_pairs
 from colmap_sph.synthetic import make_demo_block
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]

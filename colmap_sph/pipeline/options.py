@@ -11,7 +11,7 @@ from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.normals import NormalOptions
-from colmap_sph.stereo.pairs import PairOptions
+from colmap_sph.stereo.partners.pairs import PairOptions
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.refinement import RefinementOptions
 from colmap_sph.stereo.vote import VoteOptions

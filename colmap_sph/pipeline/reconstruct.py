@@ -36,8 +36,8 @@ from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspa
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
-from colmap_sph.stereo.pairing import Pair
-from colmap_sph.stereo.pairs import PairSelection, select_pairs
+from colmap_sph.stereo.partners.pairing import Pair
+from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
 
 
 def run(
@@ -76,7 +76,8 @@ def run(
 
     Examples
     --------
-    >>> report = run("sparse/0", options=RunOptions(memory="6GiB"))  # doctest: +SKIP
+    >>> options = RunOptions(memory="6GiB")
+    >>> report = run("sparse/0", options=options)  # doctest: +SKIP
     >>> print(report.points, report.coverage)  # doctest: +SKIP
     """
     paths = (None if path is None else Path(path) for path in (model, images, masks, output, workspace))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.scene import Scene, View, pixel_transfer
 from colmap_sph.stereo.fusion import FusionOptions
-from colmap_sph.stereo.pairs import overlapping_views
+from colmap_sph.stereo.partners.pairs import overlapping_views
 
 DepthAndNormals = tuple[NDArray[np.float32], NDArray[np.float32]]
 

@@ -12,7 +12,7 @@ from colmap_sph.errors import OptionError, RectificationError
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.disparity_range import Range, columns_with_counterparts, few_digits, parallax_range
 from colmap_sph.stereo.extent import Extent, extent_on_plane, extent_on_sphere
-from colmap_sph.stereo.frusta import sees
+from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Surface
 
 # In units of the depth: a parallax of some hundredths of a pixel, and more than centres on a grid are off.

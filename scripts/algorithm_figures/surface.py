@@ -18,7 +18,7 @@ from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
-from colmap_sph.stereo.pairs import overlapping_views
+from colmap_sph.stereo.partners.pairs import overlapping_views
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
 
 NAME = "F_1.jpg"

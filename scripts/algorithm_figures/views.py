@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from algorithm_figures.demo import Demo, MatchedPair
 from algorithm_figures.drawing import LINES, faded, save, show
 from colmap_sph.scene import View
-from colmap_sph.stereo.partner_choice import worth_of
+from colmap_sph.stereo.partners.partner_choice import worth_of
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.rectified_pair import Side, pixel_from_rectified_ray
 

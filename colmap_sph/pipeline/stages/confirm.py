@@ -21,7 +21,7 @@ from colmap_sph.scene import View
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
-from colmap_sph.stereo.pairing import Pair, partners_of
+from colmap_sph.stereo.partners.pairing import Pair, partners_of
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
 
 if TYPE_CHECKING:

@@ -34,8 +34,8 @@ from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.staging import scratch_folder
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
-from colmap_sph.stereo.pairing import Pair, partners_of
-from colmap_sph.stereo.pairs import overlapping_views
+from colmap_sph.stereo.partners.pairing import Pair, partners_of
+from colmap_sph.stereo.partners.pairs import overlapping_views
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context

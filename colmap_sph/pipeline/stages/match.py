@@ -21,7 +21,7 @@ from colmap_sph.project.images import grey_bytes, read_grey
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
-from colmap_sph.stereo.pairing import Pair
+from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectification import rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample

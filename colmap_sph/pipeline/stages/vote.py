@@ -15,7 +15,7 @@ from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
-from colmap_sph.stereo.pairing import Pair, pairs_by_image
+from colmap_sph.stereo.partners.pairing import Pair, pairs_by_image
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
 if TYPE_CHECKING:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.scene import Scene, SourceImages
-from colmap_sph.stereo.covisibility import Covisibility, CovisibilitySource, find_covisibility
-from colmap_sph.stereo.pairing import Pair
-from colmap_sph.stereo.partner_choice import choose
+from colmap_sph.stereo.partners.covisibility import Covisibility, CovisibilitySource, find_covisibility
+from colmap_sph.stereo.partners.pairing import Pair
+from colmap_sph.stereo.partners.partner_choice import choose
 
 logger = logging.getLogger(__name__)
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_sph.scene import Scene
-from colmap_sph.stereo.frusta import observe_frusta, observe_points
-from colmap_sph.stereo.partner_choice import triangulation_angles, worth_of
+from colmap_sph.stereo.partners.frusta import observe_frusta, observe_points
+from colmap_sph.stereo.partners.partner_choice import triangulation_angles, worth_of
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.scene import View
-from colmap_sph.stereo.frusta import sees
+from colmap_sph.stereo.partners.frusta import sees
 
 # What a point that a view and a candidate both observe is worth; one that only lies in the candidate's view, where
 # something may hide it, is worth the rest.
