@@ -54,7 +54,7 @@ def compare(scene: Scene, folder: Path, threads: int) -> Comparison:
     dense = scene.workspace(folder)
     images = None if scene.images is None else str(scene.images)
     given = [str(scene.model), images, str(dense), scene.max_image_size or -1, threads]
-    _run([sys.executable, "-c", _PLAN, json.dumps(given)], folder / "plan.txt")
+    _run([sys.executable, "-P", "-c", _PLAN, json.dumps(given)], folder / "plan.txt")
     plan = json.loads((folder / "plan.txt").read_text().splitlines()[-1])
     _, _, peak = _run([*command(), *scene.arguments(folder, threads)], folder / "run.txt")
     report = json.loads((dense / "colmap_sph" / "report.json").read_text())

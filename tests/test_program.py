@@ -27,7 +27,7 @@ print(json.dumps([name for name, file in ours.items() if file.endswith(".py")]))
 @pytest.mark.parametrize("maker", MAKERS.values())
 def test_what_an_import_loads_is_in_the_key(maker: str) -> None:
     """As Python itself says, in a process of its own."""
-    done = subprocess.run([sys.executable, "-c", LOADED, maker], capture_output=True, text=True, check=True)
+    done = subprocess.run([sys.executable, "-P", "-c", LOADED, maker], capture_output=True, text=True, check=True)
     assert set(json.loads(done.stdout)) <= set(reached_modules(maker))
 
 
