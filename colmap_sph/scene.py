@@ -51,6 +51,11 @@ class View:
     point_indices: NDArray[np.int64]
 
     @property
+    def num_pixels(self) -> int:
+        """Pixels of the image."""
+        return self.width * self.height
+
+    @property
     def center(self) -> NDArray[np.float64]:
         """(3,) projection centre in the world frame."""
         return np.asarray(-self.R.T @ self.t)

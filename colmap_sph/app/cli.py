@@ -47,9 +47,9 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments and arguments[0] in ("--version", "-V"):
         print(f"colmap_sph {colmap_sph.__version__}")
         return 0
-    if arguments[:1] == ["run"] and not {"-h", "--help", "--help-all", "--help_all"}.isdisjoint(arguments):
-        everything = not {"--help-all", "--help_all"}.isdisjoint(arguments)
-        print(help_text(everything=everything), flush=True)
+    asks_for_all = not {"--help-all", "--help_all"}.isdisjoint(arguments)
+    if arguments[:1] == ["run"] and (asks_for_all or not {"-h", "--help"}.isdisjoint(arguments)):
+        print(help_text(everything=asks_for_all), flush=True)
         return 0
     command = _parsed(arguments)
 

@@ -6,7 +6,6 @@ the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
 """
 
 import logging
-import shutil
 from collections.abc import Hashable
 from dataclasses import dataclass, field
 from heapq import nlargest
@@ -20,6 +19,7 @@ from colmap_sph.pipeline.options import RunOptions, num_cores
 from colmap_sph.pipeline.reconstruct import check_input, choose_pairs, go_through_stages, wanted_scene
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
+from colmap_sph.project.files import free_space
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
 from colmap_sph.project.undistortion import foresee_workspace
@@ -133,7 +133,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     stages = survey.stages
     pairs, _, images, cloud = stages
     if foreseen is not None:
-        pixels = sum(view.width * view.height for view in context.scene.views)
+        pixels = sum(view.num_pixels for view in context.scene.views)
         seconds = _UNDISTORT_SECONDS * foreseen.original_pixels / 1e6
         stages = [StagePlan("undistort", 1, 0, seconds, _BASE_MEMORY, _UNDISTORTED_BYTES * pixels), *stages]
     return Plan(
@@ -147,14 +147,9 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         seconds=sum(stage.seconds for stage in stages) / min(options.num_threads, num_cores()),
         memory=max(stage.memory for stage in stages),
         disk=sum(stage.disk for stage in stages),
-        free_disk=_free_disk(project),
+        free_disk=free_space(project.root),
         stages=tuple(stages),
     )
-
-
-def _free_disk(project: Project) -> int:
-    root = project.root
-    return shutil.disk_usage(next(path for path in (root, *root.absolute().parents) if path.exists())).free
 
 
 @dataclass

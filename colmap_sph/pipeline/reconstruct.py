@@ -97,7 +97,7 @@ def run_project(
         See `run`.
     """
     check_input(project, options)
-    program_digests()
+    program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
     report = RunReport()
     if project.model is None:

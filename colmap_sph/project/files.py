@@ -27,6 +27,11 @@ def make_dir(folder: Path) -> None:
         ) from error
 
 
+def free_space(path: Path) -> int:
+    """Free bytes on the disk where a file or folder is, or would be."""
+    return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free
+
+
 @contextmanager
 def atomic_file(path: Path) -> Iterator[BinaryIO]:
     """Open a file for writing that appears under its name only when it is complete.

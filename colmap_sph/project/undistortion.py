@@ -16,7 +16,7 @@ import pycolmap
 from colmap_sph.errors import InputError, OptionError, OutputError, reason_of
 from colmap_sph.project.cameras import make_pinhole, replace_ideal_fisheyes, undistort_cameras
 from colmap_sph.project.colmap_library import quiet_colmap
-from colmap_sph.project.files import make_dir
+from colmap_sph.project.files import free_space, make_dir
 from colmap_sph.project.images import image_problem
 from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.originals import Originals, read_originals
@@ -117,8 +117,9 @@ def prepare_workspace(project: Project, options: UndistortionOptions, *, overwri
     options.check()
     originals = read_originals(project)
     workspace = Workspace(project.root)
-    if overwrite or not _is_made(workspace, _marker(originals, options)):
-        _make_workspace(originals, workspace, options, overwrite=overwrite)
+    marker = _marker(originals, options)
+    if overwrite or not _is_made(workspace, marker):
+        _make_workspace(originals, workspace, marker, options, overwrite=overwrite)
     return Prepared(workspace, tuple(image_names(originals.model)))
 
 
@@ -174,13 +175,17 @@ def _is_made(workspace: Workspace, marker: dict[str, Any]) -> bool:
 
 
 def _make_workspace(
-    originals: Originals, workspace: Workspace, options: UndistortionOptions, *, overwrite: bool
+    originals: Originals,
+    workspace: Workspace,
+    marker: dict[str, Any],
+    options: UndistortionOptions,
+    *,
+    overwrite: bool,
 ) -> None:
     usable = originals.usable()
     if overwrite:
         discard_workspace(workspace)
     _check_space(originals, usable.images, workspace.root, options)
-    marker = _marker(originals, options)
     scratch = workspace.undistortion_scratch_dir
     with scratch_folder(scratch):
         kept = _undistort(originals, usable.images, scratch, options)
@@ -268,7 +273,7 @@ def _check_space(originals: Originals, names: list[str], output: Path, options: 
         scale = min(1.0, limit / longest) if limit > 0 else 1.0
         needed += int(scale**2 * (originals.image_dir / name).stat().st_size)
     needed *= _SPACE_FACTOR
-    free = shutil.disk_usage(next(path for path in (output, *output.absolute().parents) if path.exists())).free
+    free = free_space(output)
     if free < needed:
         raise OutputError(
             f"The undistorted images need about {needed / 1e6:.0f} MB, but on the disk of {output} only "
@@ -286,5 +291,5 @@ def _load_written_model(workspace: Workspace) -> pycolmap.Reconstruction:
 
 
 def _raise_if_disk_is_full(folder: Path) -> None:
-    if shutil.disk_usage(folder).free < _FULL_DISK_BYTES:
+    if free_space(folder) < _FULL_DISK_BYTES:
         raise OutputError(f"The disk of {folder} is full; free some space or choose another --output.")

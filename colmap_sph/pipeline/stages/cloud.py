@@ -77,7 +77,7 @@ def facts_of_cloud(context: "Context", names: Sequence[str], points: int) -> Clo
     coverage = context.report.coverage
     options = context.options.fusion
     scene = replace(context.scene, views=tuple(map(context.scene.view, names)))
-    pixels = sum(coverage[view.name] * view.width * view.height for view in scene.views)
+    pixels = sum(coverage[view.name] * view.num_pixels for view in scene.views)
     if points >= _FEW_POINTS * pixels:
         return CloudFacts(points, "")
     maps: LoadCache[DepthAndNormals] = LoadCache(lambda pair: pair[0].nbytes + pair[1].nbytes)

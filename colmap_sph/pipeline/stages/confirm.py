@@ -135,12 +135,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         return Cost(seconds * pixels / 1e6, memory, MAP_BYTES * pixels)
 
     def _pixels(self, name: str) -> int:
-        view = self.context.scene.view(name)
-        return view.width * view.height
-
-    def label(self, item: str) -> str:
-        """See `Stage.label`."""
-        return item
+        return self.context.scene.view(name).num_pixels
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """See `Stage.kept_memory`."""

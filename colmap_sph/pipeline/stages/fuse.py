@@ -150,7 +150,7 @@ class FuseStage(Stage[str, FuseTask]):
         """See `Stage.job`; all parts are done where the cloud is."""
         scene = self.context.scene
         view = scene.view(item)
-        pixels = view.width * view.height
+        pixels = view.num_pixels
         partners = self._partners[item]
         seconds = _SECONDS + _PARTNER_SECONDS * len(partners)
         cost = Cost(seconds * pixels / 1e6, _FUSE_BYTES * pixels, _CLOUD_BYTES * pixels)
@@ -179,13 +179,9 @@ class FuseStage(Stage[str, FuseTask]):
     def _stem(self, name: str) -> Path:
         return self._scratch / f"{self.context.scene.view(name).image_id}"
 
-    def label(self, item: str) -> str:
-        """See `Stage.label`."""
-        return item
-
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """See `Stage.kept_memory`."""
-        pixels = [view.width * view.height for view in map(self.context.scene.view, self.items)]
+        pixels = [view.num_pixels for view in map(self.context.scene.view, self.items)]
         filled = _MAPS_BYTES * sum(pixels)
         spare = gate.spare(2 * _FUSE_BYTES * max(pixels, default=0)) / 2
         return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
@@ -264,6 +260,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
         super().__init__(context, ["the cloud"])
         self._names = list(maps)
+        self._views = [context.scene.view(name) for name in self._names]
         # Without tracks COLMAP would find no images that overlap.
         self._partners = None if context.scene.has_tracks else partners_of(pair_keys)
         self._key = context.keys.cloud(
@@ -275,19 +272,14 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         """See `Stage.job`."""
         context = self.context
         options = context.options
-        views = [context.scene.view(name) for name in self._names]
-        pixels = sum(view.width * view.height for view in views)
+        pixels = sum(view.num_pixels for view in self._views)
         memory = _COLMAP_BYTES * pixels
         if options.fusion.use_cache:
             memory = min(memory, options.fusion.cache_size * 1e9)
-        memory += _COLMAP_MASK_BYTES * max((view.width * view.height**2 for view in views), default=0)
+        memory += _COLMAP_MASK_BYTES * max((view.num_pixels * view.height for view in self._views), default=0)
         cost = Cost(_COLMAP_SECONDS * pixels / 1e6, memory, _CLOUD_BYTES * pixels)
         task = ColmapFuseTask(context.workspace, options.fusion, options.num_threads, self._partners)
         return Job(self._key, None if self._known is None else Facts(), cost, task)
-
-    def label(self, item: str) -> str:
-        """See `Stage.label`."""
-        return item
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -303,8 +295,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         """COLMAP's cache bounds its memory, but makes it many times slower."""
         context = self.context
         total = context.options.memory_budget
-        pixels = sum(view.width * view.height for view in map(context.scene.view, self._names))
-        needed = resident() + _COLMAP_BYTES * pixels
+        needed = resident() + _COLMAP_BYTES * sum(view.num_pixels for view in self._views)
         if needed > total and not context.options.fusion.use_cache:
             logger.warning(
                 "COLMAP's fusion will take about %s of memory, more than the %s allowed; "

@@ -118,7 +118,7 @@ class MatchStage(Stage[Pair, MatchTask]):
         key = context.keys.pair(left, right, geometry)
         target = context.pair_path(*item)
         left_pixels = geometry.height * geometry.left_width
-        pixels = max(left.width * left.height, right.width * right.height)
+        pixels = max(left.num_pixels, right.num_pixels)
         cost = Cost(
             seconds=_SECONDS * (left_pixels + geometry.height * geometry.right_width) / 1e6,
             memory=max(_MATCH_BYTES * left_pixels, _READ_BYTES * pixels + _RECTIFIED_BYTES * left_pixels),
@@ -151,11 +151,11 @@ class MatchStage(Stage[Pair, MatchTask]):
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """Scratch memory and caches take of what the largest pair leaves, but never starve."""
-        pixels = [view.width * view.height for view in self.context.scene.views]
-        spare = int(max(gate.spare(_RECTIFIED_SHARE * _MATCH_BYTES * max(pixels)), gate.free / 8))
+        views = self.context.scene.views
+        largest = max(view.num_pixels for view in views)
+        spare = int(max(gate.spare(_RECTIFIED_SHARE * _MATCH_BYTES * largest), gate.free / 8))
         scratch = min(_SCRATCH_BYTES, spare // (3 * self.context.options.num_threads))
-        paths = [self.context.workspace.image_path(view.name) for view in self.context.scene.views]
-        filled = sum(size * grey_bytes(path) for size, path in zip(pixels, paths, strict=True))
+        filled = sum(view.num_pixels * grey_bytes(self.context.workspace.image_path(view.name)) for view in views)
         return Kept(scratch, min(_CACHE_BYTES, spare // 6), 2, filled)
 
     @contextmanager

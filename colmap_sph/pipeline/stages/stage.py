@@ -102,9 +102,9 @@ class Stage(ABC, Generic[Item, Task]):
     def make(task: Task) -> Facts:
         """Make one result: a plain function of its task, for any thread, process or machine."""
 
-    @abstractmethod
     def label(self, item: Item) -> str:
-        """What an item is called in messages."""
+        """What an item is called in messages: itself, where it is a name."""
+        return str(item)
 
     def skip(self, item: Item, reason: str) -> None:
         """Report that an item failed."""

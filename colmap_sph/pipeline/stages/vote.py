@@ -107,15 +107,11 @@ class VoteStage(Stage[str, VoteTask]):
         return Job(key, maps.facts(maps_key) if is_voted else None, self._cost(view, files, is_voted), task)
 
     def _cost(self, view: View, files: tuple[Path, ...], is_voted: bool) -> Cost:
-        pixels = view.width * view.height
+        pixels = view.num_pixels
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
         seconds = NORMALS_SECONDS + (0 if is_voted else _SECONDS * len(files))
         disk = MAP_BYTES + (0 if is_voted else _ESTIMATE_BYTES)
         return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities, disk * pixels)
-
-    def label(self, item: str) -> str:
-        """See `Stage.label`."""
-        return item
 
     @contextmanager
     def opened(self) -> Iterator[None]:
