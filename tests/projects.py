@@ -1,13 +1,18 @@
 """Projects on disk made of a rendered block's pictures, seen by whatever cameras, formats and names."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
+from conftest import SMALL_BLOCK, keep_images
 
-from colmap_sph.synthetic import DemoBlock
+from colmap_sph.project.project import Project
+from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.synthetic import DemoBlock, make_demo_block
 
 Writer = Callable[[Path, np.ndarray], None]
 
@@ -100,3 +105,28 @@ def make_block_project(
     (root / "sparse" / "0").mkdir(parents=True)
     model.write_binary(root / "sparse" / "0")
     return root / "sparse" / "0"
+
+
+def prepare(
+    model: Path,
+    output: Path,
+    options: UndistortionOptions | None = None,
+    *,
+    masks: Path | None = None,
+    overwrite: bool = False,
+) -> Workspace:
+    """The workspace of a model's undistorted images, which are found."""
+    project = Project(model, masks=masks, output=output)
+    return prepare_workspace(project, options or UndistortionOptions(), overwrite=overwrite).workspace
+
+
+FOUR_NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
+FOUR_SIZE = (160, 120)
+
+
+def render_four_images(folder: Path) -> None:
+    """Small pictures of one strip: all six pairs among them can be matched."""
+    width, height = FOUR_SIZE
+    small = replace(SMALL_BLOCK, width=width, height=height, nadir_gsd=0.4, oblique_gsd=0.44)
+    make_demo_block(folder, small, threads=2)
+    keep_images(folder, FOUR_NAMES)

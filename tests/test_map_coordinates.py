@@ -9,7 +9,8 @@ import pycolmap
 import pytest
 from clouds import read_fused, read_points, read_visibility
 from conftest import keep_images
-from test_undistortion import make_project, prepare
+from projects import prepare
+from test_undistortion import make_project
 
 import colmap_sph
 from colmap_sph.pipeline.options import RunOptions

@@ -10,8 +10,8 @@ import pytest
 from clouds import read_points
 from conftest import keep_images
 from PIL import Image
-from projects import read_picture
-from test_undistortion import HEIGHT, NAMES, WIDTH, make_project, prepare
+from projects import prepare, read_picture
+from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 
 import colmap_sph
 from colmap_sph.app import cli

@@ -10,6 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import FinishedRun, keep_images
+from projects import prepare
 
 import colmap_sph
 from colmap_sph import _native
@@ -27,9 +28,8 @@ from colmap_sph.pipeline.stages.stage import keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_patch_match_cfg
-from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import SourceImages
 from colmap_sph.stereo.anchor import anchored
@@ -144,16 +144,11 @@ def test_results_do_not_depend_on_threads_or_kernels(project: Path, monkeypatch:
         assert result == first, which
 
 
-def prepared(project: Path, dense: Path) -> Workspace:
-    """The dense workspace of undistorted images."""
-    return prepare_workspace(Project(project / "sparse/0", output=dense), UndistortionOptions()).workspace
-
-
 def test_stages_one_by_one(project: Path) -> None:
     """The public stages give what `run` gives."""
     keep_images(project, NADIR)
     whole = colmap_sph.run(project / "sparse/0", output=project / "whole", options=FEW_PAIRS)
-    workspace = prepared(project, project / "stages")
+    workspace = prepare(project / "sparse/0", project / "stages")
     scene = anchored(read_scene(workspace.sparse_dir))
     selection = select_pairs(scene, FEW_PAIRS.pairs)
     context = Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS))
@@ -215,7 +210,7 @@ def test_workspace_of_colmap(project: Path) -> None:
 
 def test_explicit_patch_match_cfg_is_obeyed(project: Path) -> None:
     dense = project / "dense"
-    workspace = prepared(project, dense)
+    workspace = prepare(project / "sparse/0", dense)
     sources: dict[str, SourceImages] = {
         "N_0_1.jpg": ["N_0_0.jpg", "N_0_2.jpg"],
         "N_1_1.jpg": ["N_0_1.jpg"],
@@ -337,7 +332,7 @@ def test_one_unreadable_image_is_skipped(project: Path, caplog: pytest.LogCaptur
 def test_one_unreadable_image_of_a_workspace_is_skipped(project: Path) -> None:
     keep_images(project, NADIR)
     dense = project / "dense"
-    prepared(project, dense)
+    prepare(project / "sparse/0", dense)
     (dense / "images" / NADIR[3]).write_bytes(b"\xff\xd8 not an image")
     report = colmap_sph.run(workspace=dense, options=FEW_PAIRS)
     assert list(report.skipped_images) == [NADIR[3]]
@@ -392,7 +387,7 @@ def test_few_points_are_explained(project: Path) -> None:
 def test_a_map_that_cannot_be_written(project: Path) -> None:
     keep_images(project, NADIR)
     in_the_way = project / f"dense/stereo/normal_maps/{NADIR[1]}.photometric.bin"
-    prepared(project, project / "dense")
+    prepare(project / "sparse/0", project / "dense")
     in_the_way.mkdir()
     with pytest.raises(OutputError, match=in_the_way.name):
         colmap_sph.run(project / "sparse/0", options=FEW_PAIRS)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pycolmap
 import pytest
-from test_undistortion import NAMES, make_project, prepare
+from projects import prepare
+from test_undistortion import NAMES, make_project
 
 from colmap_sph.app import cli
 from colmap_sph.errors import ColmapSphError, InputError, OptionError

@@ -12,8 +12,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from conftest import SMALL_BLOCK, keep_images
-from projects import read_picture
+from conftest import keep_images
+from projects import FOUR_NAMES, FOUR_SIZE, read_picture, render_four_images
 
 import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
@@ -34,11 +34,9 @@ from colmap_sph.stereo.partners.pairs import PairOptions, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.refinement import RefinementOptions
 from colmap_sph.stereo.vote import VoteOptions
-from colmap_sph.synthetic import make_demo_block
 
-# Four images of one strip, and the pairs among them: all six.
-NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
-WIDTH, HEIGHT = 160, 120
+NAMES = FOUR_NAMES
+WIDTH, HEIGHT = FOUR_SIZE
 OPTIONS = RunOptions(threads=2)
 NOTHING = {"match pairs": 0, "vote on depth": 0, "confirm depth": 0, "fuse": 0}
 
@@ -66,10 +64,7 @@ class Finished:
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """Not to be changed. Small pictures: most tests run twice."""
     project = tmp_path_factory.mktemp("resume")
-    make_demo_block(
-        project, replace(SMALL_BLOCK, width=WIDTH, height=HEIGHT, nadir_gsd=0.4, oblique_gsd=0.44), threads=2
-    )
-    keep_images(project, NAMES)
+    render_four_images(project)
     return Finished(project, colmap_sph.run(project / "sparse/0", options=OPTIONS))
 
 

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 import pytest
-from conftest import SMALL_BLOCK, keep_images
+from projects import FOUR_NAMES, prepare, render_four_images
 
 import colmap_sph
 from colmap_sph.errors import InputError
@@ -26,16 +26,13 @@ from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
-from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.partners.pairs import select_pairs
-from colmap_sph.synthetic import make_demo_block
 
-NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
+NAMES = FOUR_NAMES
 OPTIONS = RunOptions(threads=2)
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
@@ -45,17 +42,14 @@ Task = TypeVar("Task")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four images, and what a run makes of them; not to be changed."""
     folder = tmp_path_factory.mktemp("stages")
-    small = replace(SMALL_BLOCK, width=160, height=120, nadir_gsd=0.4, oblique_gsd=0.44)
-    make_demo_block(folder, small, threads=2)
-    keep_images(folder, NAMES)
+    render_four_images(folder)
     colmap_sph.run(folder / "sparse/0", options=OPTIONS)
     return folder
 
 
 def context_of(project: Path, dense: Path) -> Context:
     """A run whose workspace is prepared."""
-    undistorted = prepare_workspace(Project(project / "sparse/0", output=dense), UndistortionOptions())
-    workspace = undistorted.workspace
+    workspace = prepare(project / "sparse/0", dense)
     scene = anchored(read_scene(workspace.sparse_dir))
     return Context(workspace, scene, OPTIONS, Keys(workspace, OPTIONS))
 

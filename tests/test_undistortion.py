@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from projects import prepare
 
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.project import staging
@@ -15,7 +16,6 @@ from colmap_sph.project.originals import find_images
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, foresee_workspace, prepare_workspace
-from colmap_sph.project.workspace import Workspace
 
 WIDTH, HEIGHT, FOCAL = 96, 64, 90.0
 NAMES = ["a.png", "b.png", "cam/c.png", "cam/d.png"]
@@ -50,19 +50,6 @@ def make_project(
     sparse.mkdir(parents=True)
     (model.write_text if text else model.write_binary)(sparse)
     return sparse
-
-
-def prepare(
-    model: Path,
-    output: Path,
-    options: UndistortionOptions = OPTIONS,
-    *,
-    masks: Path | None = None,
-    overwrite: bool = False,
-) -> Workspace:
-    """The workspace of a model's undistorted images, which are found."""
-    project = Project(model, masks=masks, output=output)
-    return prepare_workspace(project, options, overwrite=overwrite).workspace
 
 
 @pytest.mark.parametrize("text", [False, True])
