@@ -8,7 +8,7 @@ import itertools
 import json
 import resource
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +18,10 @@ from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.pipeline.records import discard_results
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.stages.check_images import CheckStage
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
@@ -30,9 +33,8 @@ from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
-from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
-from colmap_sph.project.staging import discard_results
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
@@ -100,24 +102,17 @@ def run_project(
     program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
     report = RunReport()
+    dense = Workspace(project.root)
     if project.model is None:
         dense = open_workspace(project)
         with claimed(dense):
             if overwrite:
                 discard_results(dense)
             return reconstruct(dense, options, progress=progress, report=report)
-    with claimed(Workspace(project.root)):
-        with timed_stage("undistort", 1, progress, report):
-            prepared = prepare_workspace(project, options.undistortion, overwrite=overwrite)
-            progress.advance()
-        return reconstruct(
-            prepared.workspace,
-            options,
-            progress=progress,
-            report=report,
-            database=project.database(),
-            expected=prepared.expected,
-        )
+    with claimed(dense):
+        preparation = Preparation(project, options, overwrite=overwrite, progress=progress, report=report)
+        preparation.run(execute)
+        return reconstruct(dense, options, progress=progress, report=report, database=project.database())
 
 
 def check_input(project: Project, options: RunOptions) -> None:
@@ -135,7 +130,6 @@ def reconstruct(
     progress: Progress | None = None,
     report: RunReport | None = None,
     database: Path | None = None,
-    expected: Iterable[str] = (),
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -148,8 +142,6 @@ def reconstruct(
         What is known of the run so far.
     database : Path, optional
         COLMAP's database, whose verified matches serve where the model has no tracks.
-    expected : iterable of str
-        Names of images that are reported as skipped where the workspace does not have them.
 
     Returns
     -------
@@ -159,17 +151,17 @@ def reconstruct(
     report = report or RunReport()
     make_dir(workspace.state_dir)
     with one_opencv_thread():
-        whole = anchored(read_scene(workspace.sparse_dir))
-        scene = leave_out_bad_images(whole, workspace)
-        for name in sorted({*expected, *whole.index_of} - scene.index_of.keys()):
-            report.skipped_images[name] = "its image is missing, damaged or not of its camera's size; see the log"
+        scene = anchored(read_scene(workspace.sparse_dir))
+        context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
+        images = check_workspace_images(context, execute)
+        scene = scene.only(images)
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
             selection = choose_pairs(workspace, scene, options, database)
             report.pair_source = selection.source
             progress.advance()
         scene = wanted_scene(scene, selection)
-        context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
+        context = replace(context, scene=scene, keys=Keys(workspace, options, keys_of(images)))
         go_through_stages(context, selection.unique_pairs(), execute)
     _write_report(context)
     if not report.points:
@@ -201,6 +193,14 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     executor(fuse_stage(context, pair_keys, maps))
 
 
+def check_workspace_images(context: Context, executor: Executor) -> dict[str, Result]:
+    """Check the undistorted images of a scene; returns the results of those that are good."""
+    workspace = context.workspace
+    sizes = {view.name: (view.width, view.height) for view in context.scene.views}
+    where = f"{workspace.images_dir} is usable."
+    return executor(CheckStage(context, sizes, workspace.image_path, "images", where))
+
+
 def choose_pairs(
     workspace: Workspace | None, scene: Scene, options: RunOptions, database: Path | None
 ) -> PairSelection:
@@ -227,8 +227,7 @@ def choose_pairs(
 
 def wanted_scene(scene: Scene, selection: PairSelection) -> Scene:
     """Return the scene without the views that are not asked for."""
-    wanted = {*selection.partners, *itertools.chain(*selection.unique_pairs())}
-    return replace(scene, views=tuple(view for view in scene.views if view.name in wanted))
+    return scene.only({*selection.partners, *itertools.chain(*selection.unique_pairs())})
 
 
 def _write_report(context: Context) -> None:

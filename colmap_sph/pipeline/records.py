@@ -12,7 +12,8 @@ from typing import Any
 
 from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.pipeline.digests import digest, new_digest
-from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.files import atomic_file, make_dir, remove
+from colmap_sph.project.workspace import Workspace
 
 _STAMP_BLOCKS = 16
 _BLOCK_BYTES = 4096
@@ -73,6 +74,34 @@ def forget(record: Path) -> None:
         raise OutputError(f"{record} cannot be removed ({reason_of(error)}); check permissions.") from error
 
 
+def begin(record: Path) -> None:
+    """Declare that files are in the making: whatever is in their place is no longer the user's."""
+    make_dir(record.parent)
+    with atomic_file(record) as file:
+        file.write(b'{"making": true}')
+
+
+def is_for(record: Path, key: str) -> bool:
+    """Whether a record is of a key, whatever became of the files."""
+    try:
+        return bool(json.loads(record.read_bytes()).get("key") == key)
+    except (OSError, ValueError, AttributeError, RecursionError):
+        return False
+
+
+def foreign_files(record: Path, files: Sequence[Path]) -> list[Path]:
+    """Those of the files that are there, and not as the record says."""
+    there = [path for path in files if path.exists()]
+    try:
+        content = json.loads(record.read_bytes())
+        if content.get("making"):
+            return []
+        stamps = set(content["stamps"])
+        return [path for path in there if _stamp(path) not in stamps]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return there
+
+
 def _stamp(path: Path) -> str:
     """Size, and digest of evenly spread blocks: reading all of the maps again would take minutes."""
     state = new_digest()
@@ -86,3 +115,11 @@ def _stamp(path: Path) -> str:
     except OSError as error:
         raise OutputError(f"{path} cannot be read back ({reason_of(error)}); run again.") from error
     return f"{size} {state.hexdigest()}"
+
+
+def discard_results(workspace: Workspace) -> None:
+    """Make a run in a workspace forget what earlier ones computed there; maps and cloud stay until replaced."""
+    # The records first: nothing may vouch for what is no longer whole.
+    remove(workspace.cloud_record_path)
+    for folder in (workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir):
+        remove(folder)

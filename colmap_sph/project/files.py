@@ -76,3 +76,32 @@ def remove(path: Path) -> None:
             path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{path} cannot be removed ({reason_of(error)}); check permissions.") from error
+
+
+def set_aside(path: Path) -> Path:
+    """Give a file that is in the way another name beside it, and return that; `OutputError` where it cannot be."""
+    numbers = ("", *range(2, 10_000))
+    kept = next(k for n in numbers if not (k := path.with_name(f"{path.name}.backup{n}")).exists())
+    try:
+        path.rename(kept)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be renamed ({reason_of(error)}); check permissions.") from error
+    return kept
+
+
+def remove_empty_folders(folder: Path) -> None:
+    """Remove the folders below a folder, and itself, that hold nothing."""
+    for path, _, _ in os.walk(folder, topdown=False):
+        with suppress(OSError):  # not empty
+            Path(path).rmdir()
+
+
+@contextmanager
+def scratch_folder(scratch: Path) -> Iterator[None]:
+    """Start with an empty scratch folder and leave nothing behind, on success as on failure."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    make_dir(scratch)
+    try:
+        yield
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)

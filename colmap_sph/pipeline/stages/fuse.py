@@ -29,9 +29,9 @@ from colmap_sph.project.cloud_files import (
     write_part,
 )
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.pair_lists import write_fusion_cfg
 from colmap_sph.project.sparse_model import load_model
-from colmap_sph.project.staging import scratch_folder
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.partners.pairing import Pair, partners_of

@@ -1,0 +1,206 @@
+"""With a sparse model: every original image → the undistorted one, with its mask."""
+
+import logging
+import shutil
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.pipeline.records import begin, foreign_files, forget, is_for, vouch, vouched_facts
+from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
+from colmap_sph.project.cameras import plain_camera, undistorted_camera
+from colmap_sph.project.files import make_dir, remove, scratch_folder, set_aside
+from colmap_sph.project.images import image_problem
+from colmap_sph.project.sparse_model import cameras_of_images
+from colmap_sph.project.undistortion.image import ImageToUndistort, undistort
+from colmap_sph.project.undistortion.originals import Originals
+from colmap_sph.project.undistortion.process import ChildProcess
+from colmap_sph.project.workspace import Workspace
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+
+logger = logging.getLogger(__name__)
+
+# Processor seconds and bytes on disk per pixel of the original image; largest bytes in use, and of a process.
+_SECONDS = 0.06e-6
+_FILE_BYTES = 1.0
+_BYTES = 14.0
+_PROCESS_BYTES = 120e6
+
+_RECORD = ".undistorted.json"
+
+_thread = threading.local()
+_children: list[ChildProcess] = []
+
+
+@dataclass(frozen=True, eq=False)
+class UndistortTask:
+    """An image to undistort in a scratch folder, where it goes from there, and what vouches for it.
+
+    Attributes
+    ----------
+    image : ImageToUndistort
+    is_changed : bool
+        Whether the undistorted image will differ from the original one.
+    target, mask_target : Path
+        The undistorted image in the workspace, and its mask.
+    record : Path
+    key : str
+    """
+
+    image: ImageToUndistort
+    is_changed: bool
+    target: Path
+    mask_target: Path
+    record: Path
+    key: str
+
+
+def make_undistorted_image(task: UndistortTask) -> Facts:
+    """Undistort an image and its mask; writes both into the workspace."""
+    image = task.image
+    make_dir(image.mask_folder)
+    try:
+        if task.is_changed:
+            _child().call(undistort, image, str(task.target))
+        else:
+            undistort(image)
+        _publish(task)
+    except OSError as error:
+        raise OutputError(
+            f"{task.target} cannot be written ({reason_of(error)}); check space and permissions."
+        ) from error
+    finally:
+        shutil.rmtree(image.folder, ignore_errors=True)
+    return Facts()
+
+
+def _publish(task: UndistortTask) -> None:
+    """Move what was made into its place, where nothing of the user's is in the way."""
+    moves = {task.target: task.image.image_path}
+    if task.image.mask is not None:
+        moves[task.mask_target] = task.image.mask_path
+    foreign = foreign_files(task.record, [task.target, task.mask_target])
+    for path in foreign:
+        if path in moves:
+            logger.warning("%s was not made by this program; it is now %s", path, set_aside(path).name)
+    begin(task.record)
+    for target, made in moves.items():
+        make_dir(target.parent)
+        made.replace(target)
+    if task.image.mask is None and task.mask_target not in foreign:
+        remove(task.mask_target)  # of an earlier run, which had one
+    vouch(task.record, task.key, list(moves))
+
+
+def _child() -> ChildProcess:
+    """The process for COLMAP of the current thread."""
+    if getattr(_thread, "child", None) is None:
+        _thread.child = ChildProcess()
+        _children.append(_thread.child)
+    child: ChildProcess = _thread.child
+    return child
+
+
+def undistorted_record(workspace: Workspace, name: str) -> Path:
+    """Record that vouches for an undistorted image and its mask."""
+    return workspace.records_dir / f"{name}{_RECORD}"
+
+
+def discard_undistorted(workspace: Workspace) -> None:
+    """Remove the undistorted images and masks that are as they were made, and all that vouches for any."""
+    for record in sorted(workspace.records_dir.rglob(f"*{_RECORD}")):
+        name = str(record.relative_to(workspace.records_dir)).removesuffix(_RECORD)
+        files = [workspace.image_path(name), workspace.mask_path(name)]
+        foreign = foreign_files(record, files)
+        for path in files:
+            if path not in foreign:
+                remove(path)
+        forget(record)
+
+
+class UndistortStage(Stage[str, UndistortTask]):
+    """Undistorts images of a sparse model.
+
+    Parameters
+    ----------
+    context : Context
+    originals : Originals
+    digests : mapping of str to str
+        Digest of the content of each original image that is good.
+    """
+
+    name = "undistort"
+    make = staticmethod(make_undistorted_image)
+
+    def __init__(self, context: "Context", originals: Originals, digests: Mapping[str, str]) -> None:
+        super().__init__(context, sorted(digests))
+        self._originals = originals
+        self._digests = digests
+        self._cameras = cameras_of_images(originals.model)
+        self._numbers = {name: number for number, name in enumerate(self.items)}
+
+    def job(self, item: str) -> Job[UndistortTask]:
+        """See `Stage.job`."""
+        context = self.context
+        workspace = context.workspace
+        options = context.options.undistortion
+        camera = plain_camera(self._cameras[item])
+        mask = self._originals.mask_of(item)
+        # Of its own for each image, as its name may be another's without the folders.
+        scratch = workspace.undistortion_scratch_dir / str(self._numbers[item])
+        image = ImageToUndistort(
+            self._originals.image_path(item), mask, camera, options, scratch, scratch / "masks"
+        )
+        camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params))
+        key = context.keys.undistorted(self._digests[item], camera_parts, mask)
+        target = workspace.image_path(item)
+        record = undistorted_record(workspace, item)
+        files = [target] if mask is None else [target, workspace.mask_path(item)]
+        task = UndistortTask(
+            image,
+            undistorted_camera(camera, options.for_colmap()) is not None,
+            target,
+            workspace.mask_path(item),
+            record,
+            key,
+        )
+        known = vouched_facts(record, key, files) is not None or self._is_changed_by_user(task, files)
+        pixels = camera.width * camera.height
+        cost = Cost(_SECONDS * pixels, _PROCESS_BYTES + _BYTES * pixels, _FILE_BYTES * pixels)
+        return Job(key, Facts() if known else None, cost, task)
+
+    def _is_changed_by_user(self, task: UndistortTask, files: list[Path]) -> bool:
+        """Whether an image was made and then exchanged for another good one, or its mask was: they are used."""
+        if not is_for(task.record, task.key) or not all(path.is_file() for path in files):
+            return False
+        camera = undistorted_camera(task.image.camera, task.image.options.for_colmap()) or task.image.camera
+        return image_problem(task.target, camera.width, camera.height) is None
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Undistort in a folder of its own, which is there until this ends."""
+        with scratch_folder(self.context.workspace.undistortion_scratch_dir):
+            yield
+
+    @contextmanager
+    def holding(self, kept: Kept) -> Iterator[None]:
+        """Keep the processes of COLMAP until the end."""
+        try:
+            yield
+        finally:
+            while _children:
+                _children.pop().close()
+            # A thread of a later stage begins with a process of its own.
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """See `Stage.close`."""
+        if not results:
+            reason = next(iter(self.context.report.skipped_images.values()))
+            raise InputError(f"None of the images could be undistorted ({reason})")
