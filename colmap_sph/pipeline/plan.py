@@ -22,6 +22,7 @@ from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
 from colmap_sph.project.files import free_space
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
+from colmap_sph.project.state.ownership import foreign_files, named
 from colmap_sph.project.undistortion import foresee_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
@@ -128,6 +129,9 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     selection = choose_pairs(dense if foreseen is None else None, scene, options, project.database())
     keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
     context = Context(dense, wanted_scene(scene, selection), options, keys)
+    foreign = foreign_files(context.places, overwrite=overwrite)
+    if foreign:
+        logger.warning("Would get another name, as this program did not make it: %s", named(foreign))
     survey = Survey()
     go_through_stages(context, selection.unique_pairs(), survey)
     stages = survey.stages

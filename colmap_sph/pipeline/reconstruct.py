@@ -6,6 +6,7 @@ deviations, geometric maps, the cloud. What an earlier run finished with the sam
 
 import itertools
 import json
+import logging
 import resource
 import sys
 from collections.abc import Iterable, Sequence
@@ -31,13 +32,15 @@ from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
-from colmap_sph.project.staging import discard_results
+from colmap_sph.project.state.ownership import damaged_files, discard_results, named, results_of, take_places
 from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
+
+logger = logging.getLogger(__name__)
 
 
 def run(
@@ -50,6 +53,7 @@ def run(
     options: RunOptions | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """From a sparse model, or a dense workspace, to depth maps, normal maps and a fused cloud.
 
@@ -63,7 +67,9 @@ def run(
     progress : Progress, optional
     overwrite : bool
         Do everything again. A workspace that this program undistorted is removed first; one given as `workspace`
-        keeps its images and model.
+        keeps its images and model. Files that this program did not make, where it will write, get another name.
+    verify : bool
+        Look at every byte of earlier results first, and make again what is damaged.
 
     Returns
     -------
@@ -81,11 +87,18 @@ def run(
     >>> print(report.points, report.coverage)  # doctest: +SKIP
     """
     paths = (None if path is None else Path(path) for path in (model, images, masks, output, workspace))
-    return run_project(Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite)
+    return run_project(
+        Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite, verify=verify
+    )
 
 
 def run_project(
-    project: Project, options: RunOptions, *, progress: Progress | None = None, overwrite: bool = False
+    project: Project,
+    options: RunOptions,
+    *,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """Do what `run` does, for what is in one record.
 
@@ -93,7 +106,7 @@ def run_project(
     ----------
     project : Project
     options : RunOptions
-    progress, overwrite
+    progress, overwrite, verify
         See `run`.
     """
     check_input(project, options)
@@ -105,7 +118,9 @@ def run_project(
         with claimed(dense):
             if overwrite:
                 discard_results(dense)
-            return reconstruct(dense, options, progress=progress, report=report)
+            return reconstruct(
+                dense, options, progress=progress, report=report, overwrite=overwrite, verify=verify
+            )
     with claimed(Workspace(project.root)):
         with timed_stage("undistort", 1, progress, report):
             prepared = prepare_workspace(project, options.undistortion, overwrite=overwrite)
@@ -117,6 +132,8 @@ def run_project(
             report=report,
             database=project.database(),
             expected=prepared.expected,
+            overwrite=overwrite,
+            verify=verify,
         )
 
 
@@ -136,6 +153,8 @@ def reconstruct(
     report: RunReport | None = None,
     database: Path | None = None,
     expected: Iterable[str] = (),
+    overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -150,6 +169,11 @@ def reconstruct(
         COLMAP's database, whose verified matches serve where the model has no tracks.
     expected : iterable of str
         Names of images that are reported as skipped where the workspace does not have them.
+    overwrite : bool
+        Files that this program did not make, where maps and cloud go, get another name; without it they are
+        refused.
+    verify : bool
+        See `run`.
 
     Returns
     -------
@@ -170,11 +194,28 @@ def reconstruct(
             progress.advance()
         scene = wanted_scene(scene, selection)
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
+        take_places(context.places, overwrite=overwrite)
+        if verify:
+            _verify(context)
         go_through_stages(context, selection.unique_pairs(), execute)
     _write_report(context)
     if not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
+
+
+def _verify(context: Context) -> None:
+    """Look at every byte of earlier results; what is damaged is not there for the stages that follow."""
+    results = list(results_of(context.workspace))
+    damaged = []
+    with timed_stage("verify", len(results), context.progress, context.report):
+        for result in results:
+            damaged += damaged_files(result)
+            context.progress.advance()
+    if damaged:
+        logger.warning("Damaged, and made again: %s", named(damaged))
+    else:
+        logger.info("No earlier result is damaged")
 
 
 class Executor(Protocol):

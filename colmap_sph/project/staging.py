@@ -18,6 +18,7 @@ from typing import Any, get_args
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.files import atomic_file, make_dir, remove
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
+from colmap_sph.project.state.ownership import remove_recorded
 from colmap_sph.project.workspace import MapKind, Workspace
 
 # What COLMAP's undistortion makes; the model comes last, as it is what makes a folder look like a workspace.
@@ -65,14 +66,6 @@ def _foreign_workspace(workspace: Workspace, there: Iterable[str]) -> str:
     )
 
 
-def discard_results(workspace: Workspace) -> None:
-    """Make a run in a workspace forget what earlier ones computed there; maps and cloud stay until replaced."""
-    # The records first: nothing may vouch for what is no longer whole.
-    remove(workspace.cloud_record_path)
-    for folder in (workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir):
-        remove(folder)
-
-
 def check_discardable(workspace: Workspace) -> None:
     """Raise `InputError` where a workspace, or a file in its folders, was made by something else."""
     there = _parts_in(workspace)
@@ -94,10 +87,10 @@ def discard_workspace(workspace: Workspace) -> None:
         Something cannot be removed.
     """
     check_discardable(workspace)
-    discard_results(workspace)
-    for path in (*workspace.cloud_paths, *(workspace.root / part for part in _PARTS)):
-        remove(path)
-    for path in (workspace.local_dir, workspace.undistortion_scratch_dir, workspace.marker_path):
+    remove_recorded(workspace)
+    for part in _PARTS:
+        remove(workspace.root / part)
+    for path in (workspace.undistortion_scratch_dir, workspace.marker_path):
         remove(path)
 
 
