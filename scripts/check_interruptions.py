@@ -9,6 +9,7 @@ is compared, and a new one is begun. Exit code 1: something was not as it must b
 """
 
 import filecmp
+import json
 import random
 import shutil
 import signal
@@ -149,13 +150,18 @@ def finished_files(workspace: Path) -> dict[Path, int]:
     """Time stamps of the results that are complete: of maps and cloud those which a record vouches for."""
     state = workspace / "colmap_sph"
     stereo = workspace / "stereo"
-    files = [*state.glob("pairs/*.npz"), *state.glob("photometric/**/*.npz")]
-    for record in state.glob("state/**/*.json"):
+    files = [*state.glob("pairs/*.sph"), *state.glob("photometric/**/*.sph")]
+    for record in filter(is_done, state.glob("state/**/*.json")):
         name = record.relative_to(state / "state").with_suffix(".bin")
         files += [stereo / "depth_maps" / name, stereo / "normal_maps" / name]
-    if (state / "cloud.json").exists():
+    if is_done(state / "cloud.json"):
         files += Workspace(workspace).cloud_paths
     return {path: path.stat().st_mtime_ns for path in files}
+
+
+def is_done(record: Path) -> bool:
+    """Whether a record vouches for complete files: it is there while they are made, too."""
+    return record.exists() and json.loads(record.read_bytes())["state"] == "done"
 
 
 def kind_of(path: Path, workspace: Path) -> str:

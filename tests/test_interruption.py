@@ -85,19 +85,19 @@ def test_the_check_of_kills_finds_faults(tmp_path: Path) -> None:
             (tmp_path / root / name).write_bytes(b"1")
     killed, whole = tmp_path / "killed", tmp_path / "whole"
     files = {
-        "pairs/1-2.npz": "pairs",
-        "photometric/cam/a.jpg.npz": "votes",
+        "pairs/1-2.sph": "pairs",
+        "photometric/cam/a.jpg.sph": "votes",
         "state/cam/a.jpg.geometric.json": None,
         "cloud.json": None,
     }
     for name in files:
         (killed / "colmap_sph" / name).parent.mkdir(parents=True, exist_ok=True)
-        (killed / "colmap_sph" / name).write_bytes(b"1")
+        (killed / "colmap_sph" / name).write_bytes(b'{"state": "done"}')
     finished = script.finished_files(killed)
     kill = script.judge(1.0, finished, killed, whole)
     assert kill.finished == {"pairs": 1, "votes": 1, "maps": 2, "cloud": 2}
     assert (kill.remade, kill.different) == (0, 0)
-    os.utime(killed / "colmap_sph/pairs/1-2.npz", ns=(5, 5))
+    os.utime(killed / "colmap_sph/pairs/1-2.sph", ns=(5, 5))
     (killed / "stereo/normal_maps/cam/a.jpg.geometric.bin").write_bytes(b"2")
     (killed / "stereo/depth_maps/cam/a.jpg.geometric.bin").unlink()
     (killed / "stereo/.1-2.tmp").touch()
@@ -114,7 +114,7 @@ def test_the_check_of_kills_finds_faults(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("moment", "number", "code"),
     [
-        ("colmap_sph/pairs/*.npz", *STOPS[0]),
+        ("colmap_sph/pairs/*.sph", *STOPS[0]),
         ("stereo/depth_maps/*.photometric.bin", *STOPS[1]),
         ("stereo/depth_maps/*.geometric.bin", *STOPS[0]),
     ],
@@ -135,7 +135,7 @@ def test_signals_stop_a_run_which_then_goes_on(
     assert said.splitlines()[-1].startswith("interrupted; what is finished is kept")
     assert not (dense / "fused.ply").exists()
     assert not list(dense.rglob(".*.tmp"))
-    kept = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.npz")}
+    kept = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.sph")}
     assert len(kept) >= 2
     complete("--model", project / "sparse/0")
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -264,7 +264,7 @@ def test_full_disk(stage: int, uninterrupted: Path, small_disk: Path) -> None:
     assert not (dense / "fused.ply").exists()
     truth = maps(uninterrupted)
     assert {name: content for name, content in maps(dense).items() if truth[name] != content} == {}
-    done = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.npz")}
+    done = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.sph")}
     assert len(done) >= [0, 1, 6, 10, 10][stage]
     ballast.unlink()
     complete("--model", model, "--output", dense)

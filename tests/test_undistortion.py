@@ -249,7 +249,7 @@ def test_users_own_files_in_a_workspace_stay(tmp_path: Path, caplog: pytest.LogC
     prepare(sparse, workspace.root, overwrite=True)
     # What has to make room is named, and kept beside the new one.
     moved = workspace.image_path("a.png")
-    assert f"{moved} was not made by this program; it is now a.png.backup" in caplog.text
+    assert f"{moved} is not what this program wrote there; it is now a.png.backup" in caplog.text
     assert moved.with_name("a.png.backup").read_bytes() == theirs.pop(moved)
     model = workspace.sparse_dir / "points3D.bin"
     assert model.with_name("points3D.bin.backup").read_bytes() == theirs.pop(model)

@@ -29,6 +29,7 @@ from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage, keys_of
 from colmap_sph.project.files import free_space
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.ownership import foreign_files, named
 from colmap_sph.stereo.anchor import anchored
 
 logger = logging.getLogger(__name__)
@@ -137,9 +138,11 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     scene = scene.only({*images, *to_make})
     selection = choose_pairs(dense if foreseen is None else None, scene, options, project.database())
     keys = Keys(dense, options, keys_of(images), fresh=overwrite)
-    go_through_stages(
-        Context(dense, wanted_scene(scene, selection), options, keys), selection.unique_pairs(), survey
-    )
+    context = Context(dense, wanted_scene(scene, selection), options, keys)
+    foreign = foreign_files(context.places, overwrite=overwrite)
+    if foreign:
+        logger.warning("Would get another name, as this program did not make it: %s", named(foreign))
+    go_through_stages(context, selection.unique_pairs(), survey)
     stages = survey.stages
     pairs, _, maps, cloud = stages[-4:]
     return Plan(

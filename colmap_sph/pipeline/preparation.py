@@ -13,15 +13,21 @@ from typing import TYPE_CHECKING
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.records import discard_results, vouch
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.check_images import CheckStage
 from colmap_sph.pipeline.stages.stage import Result, keys_of
-from colmap_sph.pipeline.stages.undistort import UndistortStage, discard_undistorted, undistorted_record
-from colmap_sph.project.files import remove_empty_folders, scratch_folder
+from colmap_sph.pipeline.stages.undistort import UndistortStage
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, has_model, image_names
+from colmap_sph.project.state.ownership import (
+    remove_empty_folders,
+    remove_recorded,
+    remove_undistorted,
+    undistorted_place,
+)
+from colmap_sph.project.state.records import claim
 from colmap_sph.project.undistortion.marker import (
     Marker,
     adopt,
@@ -61,6 +67,8 @@ class Preparation:
     options : RunOptions
     overwrite : bool
         What there is does not count.
+    verify : bool
+        What is known of images from earlier runs does not count.
     progress, report : optional
         See `Context`.
 
@@ -83,6 +91,7 @@ class Preparation:
         options: RunOptions,
         *,
         overwrite: bool = False,
+        verify: bool = False,
         progress: Progress | None = None,
         report: RunReport | None = None,
     ) -> None:
@@ -91,6 +100,7 @@ class Preparation:
         self._originals.check_outside(self.workspace)
         self._options = options
         self._overwrite = overwrite
+        self._verify = verify
         self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
         self.names = tuple(image_names(self._originals.model))
@@ -123,7 +133,11 @@ class Preparation:
         cameras = cameras_of_images(originals.model)
         sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
         where = f"{originals.image_dir} is usable; check --images."
-        return keys_of(executor(CheckStage(self._context, sizes, originals.image_path, "originals", where)))
+        return keys_of(
+            executor(
+                CheckStage(self._context, sizes, originals.image_path, "originals", where, verify=self._verify)
+            )
+        )
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""
@@ -185,17 +199,14 @@ class Preparation:
             child.close()
 
     def _adopt_images(self, names: Sequence[str]) -> None:
-        """Vouch for what an earlier version undistorted, so that it may be replaced."""
+        """Take what an earlier version undistorted for this program's, so that it may be replaced."""
         for name in names:
-            image = self.workspace.image_path(name)
-            mask = self.workspace.mask_path(name)
-            vouch(undistorted_record(self.workspace, name), "", [path for path in (image, mask) if path.is_file()])
+            claim(undistorted_place(self.workspace, name).record)
 
     def _discard(self, found: Marker) -> None:
         workspace = self.workspace
-        discard_undistorted(workspace)
+        remove_undistorted(workspace)
         remove_model(workspace, found)
         write_marker(workspace, self._marker)
-        discard_results(workspace)
-        for folder in (workspace.images_dir, workspace.masks_dir, workspace.stereo_dir, workspace.sparse_dir):
-            remove_empty_folders(folder)
+        remove_recorded(workspace)
+        remove_empty_folders(workspace.images_dir, workspace.masks_dir, workspace.stereo_dir, workspace.sparse_dir)

@@ -6,6 +6,7 @@ deviations, geometric maps, the cloud. What an earlier run finished with the sam
 
 import itertools
 import json
+import logging
 import resource
 import sys
 from collections.abc import Sequence
@@ -19,7 +20,6 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
-from colmap_sph.pipeline.records import discard_results
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.check_images import CheckStage
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
@@ -34,12 +34,15 @@ from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.ownership import damaged_files, discard_results, named, results_of, take_places
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
+
+logger = logging.getLogger(__name__)
 
 
 def run(
@@ -52,6 +55,7 @@ def run(
     options: RunOptions | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """From a sparse model, or a dense workspace, to depth maps, normal maps and a fused cloud.
 
@@ -65,7 +69,9 @@ def run(
     progress : Progress, optional
     overwrite : bool
         Do everything again. A workspace that this program undistorted is removed first; one given as `workspace`
-        keeps its images and model.
+        keeps its images and model. Files that this program did not make, where it will write, get another name.
+    verify : bool
+        Look at every byte of earlier results first, and make again what is damaged.
 
     Returns
     -------
@@ -83,11 +89,18 @@ def run(
     >>> print(report.points, report.coverage)  # doctest: +SKIP
     """
     paths = (None if path is None else Path(path) for path in (model, images, masks, output, workspace))
-    return run_project(Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite)
+    return run_project(
+        Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite, verify=verify
+    )
 
 
 def run_project(
-    project: Project, options: RunOptions, *, progress: Progress | None = None, overwrite: bool = False
+    project: Project,
+    options: RunOptions,
+    *,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """Do what `run` does, for what is in one record.
 
@@ -95,7 +108,7 @@ def run_project(
     ----------
     project : Project
     options : RunOptions
-    progress, overwrite
+    progress, overwrite, verify
         See `run`.
     """
     check_input(project, options)
@@ -108,11 +121,23 @@ def run_project(
         with claimed(dense):
             if overwrite:
                 discard_results(dense)
-            return reconstruct(dense, options, progress=progress, report=report)
+            return reconstruct(
+                dense, options, progress=progress, report=report, overwrite=overwrite, verify=verify
+            )
     with claimed(dense):
-        preparation = Preparation(project, options, overwrite=overwrite, progress=progress, report=report)
+        preparation = Preparation(
+            project, options, overwrite=overwrite, verify=verify, progress=progress, report=report
+        )
         preparation.run(execute)
-        return reconstruct(dense, options, progress=progress, report=report, database=project.database())
+        return reconstruct(
+            dense,
+            options,
+            progress=progress,
+            report=report,
+            database=project.database(),
+            overwrite=overwrite,
+            verify=verify,
+        )
 
 
 def check_input(project: Project, options: RunOptions) -> None:
@@ -130,6 +155,8 @@ def reconstruct(
     progress: Progress | None = None,
     report: RunReport | None = None,
     database: Path | None = None,
+    overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -142,6 +169,11 @@ def reconstruct(
         What is known of the run so far.
     database : Path, optional
         COLMAP's database, whose verified matches serve where the model has no tracks.
+    overwrite : bool
+        Files that this program did not make, where maps and cloud go, get another name; without it they are
+        refused.
+    verify : bool
+        See `run`.
 
     Returns
     -------
@@ -153,7 +185,7 @@ def reconstruct(
     with one_opencv_thread():
         scene = anchored(read_scene(workspace.sparse_dir))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
-        images = check_workspace_images(context, execute)
+        images = check_workspace_images(context, execute, verify=verify)
         scene = scene.only(images)
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
@@ -162,11 +194,28 @@ def reconstruct(
             progress.advance()
         scene = wanted_scene(scene, selection)
         context = replace(context, scene=scene, keys=Keys(workspace, options, keys_of(images)))
+        take_places(context.places, overwrite=overwrite)
+        if verify:
+            _verify(context)
         go_through_stages(context, selection.unique_pairs(), execute)
     _write_report(context)
     if not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
+
+
+def _verify(context: Context) -> None:
+    """Look at every byte of earlier results; what is damaged is not there for the stages that follow."""
+    results = list(results_of(context.workspace))
+    damaged = []
+    with timed_stage("verify", len(results), context.progress, context.report):
+        for result in results:
+            damaged += damaged_files(result)
+            context.progress.advance()
+    if damaged:
+        logger.warning("Damaged, and made again: %s", named(damaged))
+    else:
+        logger.info("No earlier result is damaged")
 
 
 class Executor(Protocol):
@@ -193,12 +242,12 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     executor(fuse_stage(context, pair_keys, maps))
 
 
-def check_workspace_images(context: Context, executor: Executor) -> dict[str, Result]:
-    """Check the undistorted images of a scene; returns the results of those that are good."""
+def check_workspace_images(context: Context, executor: Executor, *, verify: bool = False) -> dict[str, Result]:
+    """Check the undistorted images of a scene, with `verify` all anew; return the results of the good ones."""
     workspace = context.workspace
     sizes = {view.name: (view.width, view.height) for view in context.scene.views}
     where = f"{workspace.images_dir} is usable."
-    return executor(CheckStage(context, sizes, workspace.image_path, "images", where))
+    return executor(CheckStage(context, sizes, workspace.image_path, "images", where, verify=verify))
 
 
 def choose_pairs(

@@ -6,11 +6,10 @@ its digest, and decoded only if that is new.
 
 import json
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.digests import file_digest
@@ -18,6 +17,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.images import image_problem
+from colmap_sph.project.state.records import read_json
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 Size = tuple[int, int]
+
+_MAX_BYTES = 1 << 30
 
 # Processor seconds per megapixel, and largest bytes in use per pixel, while an image is decoded.
 _SECONDS = 0.012
@@ -48,7 +50,7 @@ def check_image(task: ImageFile) -> Facts:
 
 
 @dataclass(frozen=True)
-class _Known:
+class Known:
     """Of an image that was found good: its size, the digest of its content, and when that was read."""
 
     size: Size
@@ -70,12 +72,21 @@ class CheckStage(Stage[str, ImageFile]):
         What they are called in messages and on disk: "originals" or "images".
     where : str
         The folder and the option to look at, for the message if none is good.
+    verify : bool
+        Whether what is known does not count.
     """
 
     make = staticmethod(check_image)
 
     def __init__(
-        self, context: "Context", sizes: Mapping[str, Size], path_of: Callable[[str], Path], what: str, where: str
+        self,
+        context: "Context",
+        sizes: Mapping[str, Size],
+        path_of: Callable[[str], Path],
+        what: str,
+        where: str,
+        *,
+        verify: bool = False,
     ) -> None:
         super().__init__(context, sorted(sizes))
         self.name = f"check {what}"  # type: ignore[misc]
@@ -83,8 +94,11 @@ class CheckStage(Stage[str, ImageFile]):
         self._path_of = path_of
         self._where = where
         self._file = context.workspace.state_dir / f"{what}.json"
-        self._known = {} if context.keys.fresh else _read_known(self._file)
-        self._seen: dict[str, _Known] = {}
+        known = (
+            None if context.keys.fresh or verify else read_json(self._file, dict[str, Known], max_bytes=_MAX_BYTES)
+        )
+        self._known = known or {}
+        self._seen: dict[str, Known] = {}
 
     def job(self, item: str) -> Job[ImageFile]:
         """See `Stage.job`."""
@@ -95,7 +109,7 @@ class CheckStage(Stage[str, ImageFile]):
         known = self._known.get(item)
         is_read = known is not None and known.stamp == stamp
         digest = known.digest if known is not None and is_read else file_digest(image.path)
-        self._seen[item] = _Known(image.size, digest, stamp)
+        self._seen[item] = Known(image.size, digest, stamp)
         is_good = known is not None and (known.digest, known.size) == (digest, image.size)
         pixels = image.size[0] * image.size[1]
         cost = Cost(_SECONDS * pixels / 1e6, _DECODE_BYTES * pixels, 0.0)
@@ -121,15 +135,3 @@ def _stamp_of(path: Path) -> tuple[int, ...]:
     """What changes whenever a file's content may have: also the time of the last change of its size or times."""
     status = path.stat()
     return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_dev, status.st_ino
-
-
-def _read_known(path: Path) -> dict[str, _Known]:
-    with suppress(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return {name: _parsed(entry) for name, entry in json.loads(path.read_bytes()).items()}
-    return {}
-
-
-def _parsed(entry: Mapping[str, Any]) -> _Known:
-    width, height = entry["size"]
-    numbers: Sequence[Any] = entry["stamp"]
-    return _Known((int(width), int(height)), str(entry["digest"]), tuple(int(number) for number in numbers))

@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.pipeline.records import begin, foreign_files, forget, is_for, vouch, vouched_facts
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.cameras import plain_camera, undistorted_camera
-from colmap_sph.project.files import make_dir, remove, scratch_folder, set_aside
+from colmap_sph.project.files import make_dir, remove, scratch_folder, sync_file, sync_folder, whole_digest
 from colmap_sph.project.images import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
+from colmap_sph.project.state.ownership import undistorted_place
+from colmap_sph.project.state.records import altered_files, begin, read_record, vouch, vouched_facts
 from colmap_sph.project.undistortion.image import ImageToUndistort, undistort
 from colmap_sph.project.undistortion.originals import Originals
 from colmap_sph.project.undistortion.process import ChildProcess
-from colmap_sph.project.workspace import Workspace
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -32,8 +32,6 @@ _SECONDS = 0.06e-6
 _FILE_BYTES = 1.0
 _BYTES = 14.0
 _PROCESS_BYTES = 120e6
-
-_RECORD = ".undistorted.json"
 
 _thread = threading.local()
 _children: list[ChildProcess] = []
@@ -82,21 +80,25 @@ def make_undistorted_image(task: UndistortTask) -> Facts:
 
 
 def _publish(task: UndistortTask) -> None:
-    """Move what was made into its place, where nothing of the user's is in the way."""
+    """Move what was made into its place."""
     moves = {task.target: task.image.image_path}
     if task.image.mask is not None:
         moves[task.mask_target] = task.image.mask_path
-    foreign = foreign_files(task.record, [task.target, task.mask_target])
-    for path in foreign:
-        if path in moves:
-            logger.warning("%s was not made by this program; it is now %s", path, set_aside(path).name)
-    begin(task.record)
+    elif _is_mask_of_earlier_run(task):
+        remove(task.mask_target)
+    digests = {target: whole_digest(made) for target, made in moves.items()}
+    begin(task.record, list(moves))
     for target, made in moves.items():
         make_dir(target.parent)
+        sync_file(made)
         made.replace(target)
-    if task.image.mask is None and task.mask_target not in foreign:
-        remove(task.mask_target)  # of an earlier run, which had one
-    vouch(task.record, task.key, list(moves))
+        sync_folder(target.parent)
+    vouch(task.record, task.key, digests)
+
+
+def _is_mask_of_earlier_run(task: UndistortTask) -> bool:
+    """Whether there is a mask that was made when the original image had one."""
+    return task.mask_target not in altered_files(read_record(task.record), [task.target, task.mask_target])
 
 
 def _child() -> ChildProcess:
@@ -106,23 +108,6 @@ def _child() -> ChildProcess:
         _children.append(_thread.child)
     child: ChildProcess = _thread.child
     return child
-
-
-def undistorted_record(workspace: Workspace, name: str) -> Path:
-    """Record that vouches for an undistorted image and its mask."""
-    return workspace.records_dir / f"{name}{_RECORD}"
-
-
-def discard_undistorted(workspace: Workspace) -> None:
-    """Remove the undistorted images and masks that are as they were made, and all that vouches for any."""
-    for record in sorted(workspace.records_dir.rglob(f"*{_RECORD}")):
-        name = str(record.relative_to(workspace.records_dir)).removesuffix(_RECORD)
-        files = [workspace.image_path(name), workspace.mask_path(name)]
-        foreign = foreign_files(record, files)
-        for path in files:
-            if path not in foreign:
-                remove(path)
-        forget(record)
 
 
 class UndistortStage(Stage[str, UndistortTask]):
@@ -161,7 +146,7 @@ class UndistortStage(Stage[str, UndistortTask]):
         camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params))
         key = context.keys.undistorted(self._digests[item], camera_parts, mask)
         target = workspace.image_path(item)
-        record = undistorted_record(workspace, item)
+        record = undistorted_place(workspace, item).record
         files = [target] if mask is None else [target, workspace.mask_path(item)]
         task = UndistortTask(
             image,
@@ -171,14 +156,16 @@ class UndistortStage(Stage[str, UndistortTask]):
             record,
             key,
         )
-        known = vouched_facts(record, key, files) is not None or self._is_changed_by_user(task, files)
+        known = vouched_facts(record, key, files, Facts) is not None or self._is_changed_by_user(task, files)
         pixels = camera.width * camera.height
         cost = Cost(_SECONDS * pixels, _PROCESS_BYTES + _BYTES * pixels, _FILE_BYTES * pixels)
         return Job(key, Facts() if known else None, cost, task)
 
     def _is_changed_by_user(self, task: UndistortTask, files: list[Path]) -> bool:
         """Whether an image was made and then exchanged for another good one, or its mask was: they are used."""
-        if not is_for(task.record, task.key) or not all(path.is_file() for path in files):
+        record = read_record(task.record)
+        is_made = record is not None and (record.key, record.state) == (task.key, "done")
+        if not is_made or not all(path.is_file() for path in files):
             return False
         camera = undistorted_camera(task.image.camera, task.image.options.for_colmap()) or task.image.camera
         return image_problem(task.target, camera.width, camera.height) is None

@@ -7,16 +7,17 @@ place. A model file that is not as the marker says is the user's: it is neither 
 import hashlib
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.files import atomic_file, make_dir, remove, set_aside
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
+from colmap_sph.project.state.records import read_json
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -60,21 +61,26 @@ class Marker:
         return bool(self.images) or self.version == 1
 
 
+@dataclass(frozen=True)
+class _OldMarker:
+    """What is needed of a marker of version 1, whose `images` is a digest."""
+
+    version: Literal[1]
+    model: str
+    options: dict[str, Any]
+
+
 def read_marker(workspace: Workspace) -> Marker | None:
     """Return the marker, or None where there is no readable one."""
+    # Earlier versions had it in the scratch folder until all was in its place.
     for path in (workspace.marker_path, workspace.undistortion_scratch_dir / workspace.marker_path.name):
-        with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-            if path.is_file() and path.stat().st_size < _MAX_BYTES:
-                return _parsed(json.loads(path.read_bytes()))
+        marker = read_json(path, Marker, max_bytes=_MAX_BYTES)
+        if marker is not None and marker.version == _VERSION:
+            return marker
+        old = read_json(path, _OldMarker, max_bytes=_MAX_BYTES)
+        if old is not None:
+            return Marker(old.model, old.options, version=1)
     return None
-
-
-def _parsed(content: Mapping[str, Any]) -> Marker:
-    if content["version"] == 1:
-        return Marker(str(content["model"]), dict(content["options"]), version=1)
-    files = {str(path): str(digest) for path, digest in content["files"].items()}
-    images = tuple(str(name) for name in content["images"])
-    return Marker(str(content["model"]), dict(content["options"]), images, files)
 
 
 def write_marker(workspace: Workspace, marker: Marker) -> None:
@@ -163,7 +169,7 @@ def remove_model(workspace: Workspace, marker: Marker) -> None:
         if not marker.is_finished or marker.files.get(name) == digest:
             remove(path)
         else:
-            logger.warning("%s was not made by this program; it is now %s", path, set_aside(path).name)
+            logger.warning("%s is not what this program wrote there; it is now %s", path, set_aside(path).name)
     if _is_default_pair_list(workspace.patch_match_cfg_path):
         remove(workspace.patch_match_cfg_path)
 
