@@ -349,7 +349,7 @@ def test_unfinished_workspace_is_not_worked_in(tmp_path: Path) -> None:
 
 def test_colmaps_end_is_that_of_one_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its process is gone, with its last words; the next images get another."""
-    child = ChildProcess()
+    child = ChildProcess(tmp_path)
     with pytest.raises(InputError, match=r"COLMAP ended with exit code 7 at x\.jpg \(so it ends\)"):
         child.call(end_process, "so it ends", "x.jpg")
     with pytest.raises(OutputError, match=r"x\.jpg cannot be written"):

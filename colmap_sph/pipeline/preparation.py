@@ -10,6 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
@@ -43,8 +44,6 @@ from colmap_sph.project.undistortion.model import (
     check_space,
     foreseen_scene,
     undistort_model,
-    write_final_model,
-    write_plain_model,
 )
 from colmap_sph.project.undistortion.originals import read_originals
 from colmap_sph.project.undistortion.process import ChildProcess
@@ -171,9 +170,8 @@ class Preparation:
             return
         scratch = self.workspace.undistortion_scratch_dir
         with scratch_folder(scratch):
-            self._undistort_model(scratch)
-            write_final_model(scratch / "sparse", scratch / "final", names)
-            publish_model(self.workspace, self._marker, scratch / "final", names)
+            made = self._undistort_model(scratch, names)
+            publish_model(self.workspace, self._marker, made, names)
         logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
 
     def scene(self, results: Mapping[str, Result]) -> Scene | None:
@@ -188,15 +186,21 @@ class Preparation:
             return None
         return foreseen_scene(self._originals, results, self._options.undistortion)
 
-    def _undistort_model(self, scratch: Path) -> None:
-        plain = scratch / "plain"
-        write_plain_model(self._originals, plain)
-        child = ChildProcess()
+    def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
+        """Undistort the model in a process of its own; return the folder where it is."""
+        task = ModelToUndistort(self._originals.model_dir, tuple(names), self._options.undistortion, scratch)
+        child = ChildProcess(scratch)
         try:
-            task = ModelToUndistort(plain, self._options.undistortion, scratch)
-            child.call(undistort_model, task, str(self._originals.model_dir))
+            child.call(undistort_model, task, f"the model in {self.workspace.root}")
+        except InputError as error:
+            # The model was read before: what can go wrong is that the disk does not take the new one.
+            raise OutputError(
+                f"The model of the undistorted images cannot be written ({reason_of(error)}); check space and "
+                "permissions."
+            ) from error
         finally:
             child.close()
+        return task.final_dir
 
     def _adopt_images(self, names: Sequence[str]) -> None:
         """Take what an earlier version undistorted for this program's, so that it may be replaced."""

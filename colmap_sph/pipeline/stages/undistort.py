@@ -66,7 +66,7 @@ def make_undistorted_image(task: UndistortTask) -> Facts:
     make_dir(image.mask_folder)
     try:
         if task.is_changed:
-            _child().call(undistort, image, str(task.target))
+            _child(image.folder.parent).call(undistort, image, str(task.target))
         else:
             undistort(image)
         _publish(task)
@@ -101,12 +101,13 @@ def _is_mask_of_earlier_run(task: UndistortTask) -> bool:
     return task.mask_target not in altered_files(read_record(task.record), [task.target, task.mask_target])
 
 
-def _child() -> ChildProcess:
-    """The process for COLMAP of the current thread."""
-    if getattr(_thread, "child", None) is None:
-        _thread.child = ChildProcess()
-        _children.append(_thread.child)
-    child: ChildProcess = _thread.child
+def _child(folder: Path) -> ChildProcess:
+    """The process for COLMAP of the current thread, and of the run whose scratch folder this is."""
+    child: ChildProcess | None = getattr(_thread, "child", None)
+    if child is None or child.folder != folder:
+        child = ChildProcess(folder)
+        _thread.child = child
+        _children.append(child)
     return child
 
 
@@ -184,7 +185,6 @@ class UndistortStage(Stage[str, UndistortTask]):
         finally:
             while _children:
                 _children.pop().close()
-            # A thread of a later stage begins with a process of its own.
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""

@@ -6,7 +6,6 @@ model it writes; that is mended here.
 
 import errno
 import os
-import shutil
 import tempfile
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
@@ -38,62 +37,76 @@ def foreseen_scene(originals: Originals, names: Collection[str], options: Undist
 
 @dataclass(frozen=True)
 class ModelToUndistort:
-    """A model on disk, and the folder into which COLMAP writes that of the undistorted images, as ``sparse``."""
+    """A model to undistort.
+
+    Attributes
+    ----------
+    model_dir : Path
+        The original model, which is whole.
+    names : tuple of str
+        Its images that are undistorted.
+    options : UndistortionOptions
+    folder : Path
+        To work in; the model of the undistorted images is left in its folder ``final``.
+    """
 
     model_dir: Path
+    names: tuple[str, ...]
     options: UndistortionOptions
     folder: Path
 
+    @property
+    def final_dir(self) -> Path:
+        """Where the new model goes."""
+        return self.folder / "final"
+
 
 def undistort_model(task: ModelToUndistort) -> None:
-    """Let COLMAP undistort cameras and features of a model; it undistorts no image, as it is told of none.
+    """Write the model of the undistorted images, with PINHOLE cameras; cameras and features are COLMAP's work.
 
     Raises
     ------
-    InputError
-        COLMAP cannot do it.
+    InputError, OutputError
+        COLMAP cannot do it, or nothing more can be written.
     """
+    model = load_model(task.model_dir)
+    plain = task.folder / "plain"
+    _write_plain_model(model, plain)
+    # COLMAP undistorts the images that it is told of, or all: it gets one, and does not find it.
     nowhere = task.folder / "no images"
     make_dir(nowhere)
-    names = [next(iter(cameras_of_images(load_model(task.model_dir))))]
     try:
-        with quiet_colmap(int(pycolmap.logging.FATAL)):  # it misses that one image
+        with quiet_colmap(int(pycolmap.logging.FATAL)):
             pycolmap.undistort_images(
                 task.folder,
-                task.model_dir,
+                plain,
                 nowhere,
-                image_names=names,
+                image_names=[task.names[0]],
                 undistort_options=task.options.for_colmap(),
                 num_threads=1,
             )
     except (RuntimeError, ValueError, OSError) as error:
         raise_if_disk_is_full(task.folder)
         raise InputError(f"COLMAP cannot undistort {task.model_dir}: {reason_of(error)}") from error
+    _write_final_model(task.folder / "sparse", task.final_dir, task.names)
 
 
-def write_plain_model(originals: Originals, folder: Path) -> None:
-    """Write the original model with cameras that COLMAP undistorts rightly, see `plain_camera`."""
-    model = originals.model
+def _write_plain_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model with cameras that COLMAP undistorts rightly, see `plain_camera`."""
     for camera in model.cameras.values():
         change_camera(camera, plain_camera(camera))
     make_dir(folder)
     model.write_binary(folder)
+    _load_written_model(folder)
 
 
-def write_final_model(source: Path, target: Path, names: Collection[str]) -> None:
-    """Write the model that COLMAP left in `source` with images `names` alone, and PINHOLE cameras.
-
-    Raises
-    ------
-    OutputError
-        The disk is full.
-    """
+def _write_final_model(source: Path, target: Path, names: Collection[str]) -> None:
+    """Write the model that COLMAP left in `source` with images `names` alone, and PINHOLE cameras."""
     model = _load_written_model(source)
     if len(names) < model.num_reg_images():
         model = submodel(model, set(names))
     for camera in model.cameras.values():
         make_pinhole(camera)
-    shutil.rmtree(target, ignore_errors=True)
     make_dir(target)
     model.write_binary(target)
     _load_written_model(target)

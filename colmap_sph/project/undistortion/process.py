@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from pathlib import Path
 from typing import IO, Any
 
 from colmap_sph.errors import ColmapSphError, InputError, OutputError, reason_of
@@ -24,9 +25,15 @@ class ChildProcess:
     """Calls functions in a process of its own, one after the other.
 
     It is started with the first call, and again after it was lost.
+
+    Parameters
+    ----------
+    folder : Path
+        Exists, and is thrown away later: there the process leaves what it has to say, and its library what else.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
         self._process: subprocess.Popen[bytes] | None = None
         self._words: IO[bytes] | None = None
 
@@ -73,13 +80,14 @@ class ChildProcess:
     def _start(self) -> subprocess.Popen[bytes]:
         # By name, not by a module of the folder that the user happens to be in.
         program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
-        self._words = tempfile.TemporaryFile()  # noqa: SIM115 (closed with the process)
+        self._words = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115 (closed with the process)
         try:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", program],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._words,
+                env=os.environ | {"TMPDIR": str(self.folder)},
                 start_new_session=True,  # Ctrl-C is for this process, which then ends the other
             )
         except OSError as error:
