@@ -23,7 +23,7 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
-from colmap_sph.pipeline.reconstruct import check_workspace_images
+from colmap_sph.pipeline.reconstruct import with_good_images
 from colmap_sph.project.images import image_problem, read_grey
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -458,7 +458,7 @@ def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCapture
     scene = read_scene(workspace.sparse_dir)  # an OPENCV camera without distortion
     workspace.image_path("a.png").unlink()
     context = Context(workspace, scene, RunOptions(), Keys(workspace, RunOptions()))
-    assert sorted(check_workspace_images(context, execute)) == NAMES[1:]
+    assert [view.name for view in with_good_images(context, execute).scene.views] == NAMES[1:]
     assert "a.png is missing" in caplog.text
 
 
