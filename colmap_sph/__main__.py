@@ -28,11 +28,12 @@ def main() -> int:
         print("interrupted", file=sys.stderr)
         return 130
     except Exception as error:
-        if not _is_refusal(error):
+        reason = _refusal(error)
+        if reason is None:
             raise
         print(
-            f"error: The system refuses what the program needs to load ({printable(reason_of(error))}); end other "
-            "programs, or allow more (ulimit -a).",
+            f"error: The system refuses what the program needs to load ({reason}); end other programs, or allow "
+            "more (ulimit -a).",
             file=sys.stderr,
         )
         return OutOfMemoryError.exit_code
@@ -56,14 +57,15 @@ def _command() -> int:
     return code
 
 
-def _is_refusal(error: BaseException) -> bool:
-    """Whether the system has refused memory, threads or open files while libraries were loaded."""
-    words = str(error).lower()
+def _refusal(error: BaseException) -> str | None:
+    """Say how the system has refused memory, threads or open files while libraries were loaded, if it has."""
     cause = error.__cause__ or error.__context__
-    refused = isinstance(error, MemoryError) or (
-        isinstance(error, (ImportError, OSError, RuntimeError)) and any(each in words for each in _REFUSALS)
+    deeper = None if cause is None else _refusal(cause)
+    reason = printable(reason_of(error))
+    is_one = isinstance(error, (ImportError, OSError, RuntimeError)) and any(
+        each in reason.lower() for each in _REFUSALS
     )
-    return refused or (cause is not None and _is_refusal(cause))
+    return deeper or (reason if is_one or isinstance(error, MemoryError) else None)
 
 
 def _print_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:

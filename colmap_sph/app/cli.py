@@ -17,8 +17,8 @@ from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, in_full
-from colmap_sph.app.terminal import Terminal, print_result, warnings_shown
-from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError, reason_of
+from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
+from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError, reason_of
 from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.workers import is_memory_error
@@ -89,18 +89,23 @@ def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
 def _parsed(arguments: Sequence[str]) -> Command:
     if arguments[:1] == ["run"]:
         arguments = ["run", *in_full(arguments[1:])]
-    command: Command = tyro.extras.subcommand_cli_from_dict(
-        # `run` alone has flags without a value, among its own options.
-        {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
-        prog="colmap_sph",
-        description="Dense reconstruction for COLMAP without a GPU.",
-        args=arguments,
-        config=(tyro.conf.AvoidSubcommands,),
-    )
+    with standard_output():
+        command: Command = tyro.extras.subcommand_cli_from_dict(
+            # `run` alone has flags without a value, among its own options.
+            {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
+            prog="colmap_sph",
+            description="Dense reconstruction for COLMAP without a GPU.",
+            args=arguments,
+            config=(tyro.conf.AvoidSubcommands,),
+        )
     return command
 
 
 def _do(command: Command, terminal: Terminal) -> int:
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise InputError(f"The current folder cannot be used ({reason_of(error)}); change to another.") from error
     if isinstance(command, RunCommand):
         return run_command(command, terminal)
     if isinstance(command, DemoCommand):

@@ -1,5 +1,6 @@
 """`colmap_sph run`: its options, its help, the plan of a dry run, and the closing summary."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -72,10 +73,9 @@ def header(command: object) -> str:
 
 def help_text(*, everything: bool) -> str:
     """The everyday options of `run` for one screen, or all of them."""
-    console = Console()
-    with console.capture() as captured:
-        _print_help(console, everything=everything)
-    return captured.get().rstrip()
+    text = io.StringIO()
+    _print_help(Console(file=text), everything=everything)
+    return text.getvalue().rstrip()
 
 
 def _print_help(console: Console, *, everything: bool) -> None:

@@ -11,8 +11,11 @@ import sys
 from contextlib import suppress
 from typing import Any
 
-# Files that a run with a few threads has open side by side, and its libraries.
+# What the program needs to load, and for a few threads: files open at a time, and bytes for it and for each core,
+# for which linear algebra's libraries start threads of their own. Without it they crash.
 _OPEN_FILES = 64
+_ADDRESS_SPACE = (1 << 30, 64 << 20)
+_DATA = (512 << 20, 16 << 20)
 _WANTED_OPEN_FILES = 4096
 
 
@@ -25,13 +28,15 @@ def prepare_process() -> str | None:
         Why the program cannot work: a sentence.
     """
     _open_what_is_closed()
+    _be_in_utf8()
     raw = _Unfailing(2, "w", closefd=False)
     buffer = io.BufferedWriter(raw)
     encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
     sys.stderr = io.TextIOWrapper(buffer, encoding, errors="backslashreplace", line_buffering=True)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    return _raise_limit_of_files()
+    _raise_limit_of_files()
+    return _missing()
 
 
 class _Unfailing(io.FileIO):
@@ -71,13 +76,35 @@ def _open_what_is_closed() -> None:
         sys.stdout = io.TextIOWrapper(io.FileIO(1, "w", closefd=False), "utf-8", write_through=True)
 
 
-def _raise_limit_of_files() -> str | None:
+def _be_in_utf8() -> None:
+    """Start anew where names of files are taken for another encoding than that of COLMAP's models."""
+    if sys.getfilesystemencoding() != "utf-8" and os.environ.get("PYTHONUTF8") != "1":
+        os.environ["PYTHONUTF8"] = "1"
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
+
+
+def _raise_limit_of_files() -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = _WANTED_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _WANTED_OPEN_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         with suppress(OSError, ValueError):
             resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-            soft = wanted
+
+
+def _missing() -> str | None:
+    """A sentence about a limit of the process that is too low to load the program."""
+    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < _OPEN_FILES:
-        return f"Only {soft} files may be open at a time (ulimit -n); at least {_OPEN_FILES} are needed."
+        return f"Only {soft} files may be open at a time, and {_OPEN_FILES} are needed; allow more (ulimit -n)."
+    for kind, option, (base, each) in (
+        (resource.RLIMIT_AS, "-v", _ADDRESS_SPACE),
+        (resource.RLIMIT_DATA, "-d", _DATA),
+    ):
+        soft, _ = resource.getrlimit(kind)
+        needed = base + each * len(os.sched_getaffinity(0))
+        if soft != resource.RLIM_INFINITY and soft < needed:
+            return (
+                f"The process may use only {soft >> 20} MiB of memory, and {needed >> 20} MiB are needed; "
+                f"allow more (ulimit {option})."
+            )
     return None

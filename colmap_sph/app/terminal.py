@@ -18,6 +18,9 @@ from rich.text import Text
 
 from colmap_sph.errors import OutputError, printable, reason_of
 
+# Columns that bars and tables need; a narrower terminal, or one that hides its width, gets plain lines.
+_LEAST_WIDTH = 40
+
 
 class Terminal:
     """The standard error stream, a terminal or not."""
@@ -26,11 +29,13 @@ class Terminal:
         self._stream = sys.stderr
         self._console = Console(file=self._stream, highlight=False)
         self._bars: rich.progress.Progress | None = None
+        self._has_drawn = False
 
     @property
     def is_interactive(self) -> bool:
-        """Whether somebody looks at it now, and lines can be drawn again."""
-        return self._stream.isatty() and not self._console.is_dumb_terminal
+        """Whether somebody looks at it now, and there is room for lines that are drawn again."""
+        has_room = self._console.width >= _LEAST_WIDTH
+        return self._stream.isatty() and has_room and not self._console.is_dumb_terminal
 
     def say(self, text: object, *, label: str = "", style: str = "") -> None:
         """Say something in one line, behind a label of that style."""
@@ -82,6 +87,7 @@ class Terminal:
     def start_bars(self, bars: rich.progress.Progress) -> None:
         """Draw progress bars until `settle`."""
         self._bars = bars
+        self._has_drawn = True
         bars.start()
 
     def new_bars(self, *columns: rich.progress.ProgressColumn) -> rich.progress.Progress:
@@ -96,13 +102,13 @@ class Terminal:
             self._bars = None
 
     def after_interruption(self) -> None:
-        """Begin a line of its own where the terminal shows ^C."""
-        if self._bars is not None:
-            self.settle()
-        elif self.is_interactive:
-            self._write("")
+        """Begin a line of its own where the terminal shows ^C, which bars draw over."""
+        had_bars = self._has_drawn
+        self.settle()
         if self.is_interactive:
             self._console.show_cursor()
+            if not had_bars:
+                self._write("")
 
     def _write(self, line: str) -> None:
         self._stream.write(f"{line}\n")
@@ -120,7 +126,14 @@ def _cell(text: object) -> Text:
 
 
 def print_result(text: str) -> None:
-    """Print on the standard output what was asked for.
+    """Print on the standard output what was asked for; see `standard_output`."""
+    with standard_output():
+        print("\n".join(map(printable, text.split("\n"))), flush=True)
+
+
+@contextmanager
+def standard_output() -> Iterator[None]:
+    """Print on the standard output, and nothing else, meanwhile.
 
     Raises
     ------
@@ -128,7 +141,7 @@ def print_result(text: str) -> None:
         It cannot be written. `BrokenPipeError` where its reader has seen enough.
     """
     try:
-        print("\n".join(map(printable, text.split("\n"))), flush=True)
+        yield
     except BrokenPipeError:
         raise
     except OSError as error:

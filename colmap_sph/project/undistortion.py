@@ -285,9 +285,12 @@ def _load_written_model(workspace: Workspace) -> pycolmap.Reconstruction:
     """Read a model that COLMAP has just written, without noticing whether the disk took it."""
     try:
         return load_model(workspace.sparse_dir)
-    except InputError:
+    except InputError as error:
         _raise_if_disk_is_full(workspace.root)
-        raise
+        raise OutputError(
+            f"The model written to {workspace.sparse_dir} is not whole; check the space, the quotas and the limit "
+            "on the size of files (ulimit -f) there, or choose another --output."
+        ) from error
 
 
 def _raise_if_disk_is_full(folder: Path) -> None:
