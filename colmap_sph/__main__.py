@@ -7,7 +7,14 @@ from colmap_sph.app.standard_streams import prepare_process, silence
 from colmap_sph.errors import OutOfMemoryError, OutputError, printable, reason_of
 
 # What loaders and libraries say where the system refuses memory, threads or open files.
-_REFUSALS = ("memory", "map segment", "start new thread", "too many open files", "temporarily unavailable")
+_REFUSALS = (
+    "allocate memory",
+    "out of memory",
+    "map segment",
+    "start new thread",
+    "too many open files",
+    "temporarily unavailable",
+)
 
 
 def main() -> int:

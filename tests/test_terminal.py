@@ -357,6 +357,22 @@ def test_a_library_that_cannot_be_loaded() -> None:
     assert re.fullmatch(r"error: .*libx\.so: failed to map segment.*ulimit -a\)\.\n", done.stderr)
 
 
+def test_a_traceback_does_not_steer_the_terminal() -> None:
+    code = textwrap.dedent("""
+        import sys
+        from colmap_sph.app import cli
+        def fail():
+            raise ValueError("\\x1b]0;title\\x07\\nmore \\u202e")
+        cli.main = fail
+        from colmap_sph.__main__ import main
+        sys.exit(main())
+    """)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1
+    assert done.stderr.startswith("Traceback")
+    assert done.stderr.endswith("ValueError: \\x1b]0;title\\x07\nmore \\u202e\n")
+
+
 def test_the_current_folder_is_gone(tmp_path: Path) -> None:
     gone = tmp_path / "gone"
     gone.mkdir()
