@@ -175,6 +175,11 @@ def test_a_short_stage_says_little(monkeypatch: pytest.MonkeyPatch, capsys: pyte
     ]
 
 
+def test_wide_letters_keep_the_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    Terminal().facts([("東京.jpg", "1"), ("Ko\u0308ln.jpg", "2"), ("ab", "3")])
+    assert capsys.readouterr().err.splitlines() == ["東京.jpg  1", "Ko\u0308ln.jpg  2", "ab        3"]
+
+
 @pytest.mark.parametrize("variable", ["FORCE_COLOR", "CLICOLOR_FORCE", "TTY_COMPATIBLE"])
 def test_files_get_no_bars_boxes_or_colours(
     variable: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -12,6 +12,7 @@ from contextlib import contextmanager, nullcontext
 from datetime import datetime
 
 import rich.progress
+from rich.cells import cell_len, set_cell_size
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -116,9 +117,9 @@ class Terminal:
 
     def _write_columns(self, rows: Sequence[Sequence[str]]) -> None:
         cells = [[printable(cell) for cell in row] for row in rows]
-        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        widths = [max(map(cell_len, column)) for column in zip(*cells, strict=True)]
         for row in cells:
-            self._write("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip())
+            self._write("  ".join(map(set_cell_size, row, widths)).rstrip())
 
 
 def _cell(text: object) -> Text:
