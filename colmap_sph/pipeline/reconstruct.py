@@ -28,7 +28,7 @@ from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.pipeline.workers import one_opencv_thread
-from colmap_sph.project.claim import claimed
+from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
@@ -144,6 +144,7 @@ def check_input(project: Project, options: RunOptions) -> None:
     """Raise `ColmapSphError` for what is wrong before anything is touched."""
     options.check()
     project.check()
+    check_links(Workspace(project.root), is_given=project.workspace is not None)
     if project.model is None and options.undistortion != UndistortionOptions():
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
 
