@@ -11,7 +11,7 @@ import pycolmap
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import refuse_panoramas
-from colmap_sph.project.images import image_problem
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, image_names, load_model, model_files

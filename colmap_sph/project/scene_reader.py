@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import is_pinhole
-from colmap_sph.project.images import image_problem
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.map_coordinates import is_plausible, local_origin
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace

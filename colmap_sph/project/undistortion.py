@@ -17,7 +17,7 @@ from colmap_sph.errors import InputError, OptionError, OutputError, reason_of
 from colmap_sph.project.cameras import make_pinhole, replace_ideal_fisheyes, undistort_cameras
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import free_space, make_dir
-from colmap_sph.project.images import image_problem
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.originals import Originals, read_originals
 from colmap_sph.project.pair_lists import write_fusion_cfg, write_patch_match_cfg

@@ -3,10 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
-
 from colmap_sph.errors import InputError
-from colmap_sph.project.images import read_undistorted
+from colmap_sph.project.images.reading import read_colours
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
@@ -47,7 +45,7 @@ def read_view_maps(sources: MapSources) -> ViewMaps:
     view = sources.view
     depth = read_depth_map(sources.depth)
     normals = read_normal_planes(sources.normals)
-    image = read_undistorted(sources.image, cv2.IMREAD_COLOR)
+    image = read_colours(sources.image)
     shape = (view.height, view.width)
     if depth.shape != shape or normals.shape[1:] != shape or image.shape[:2] != shape:
         raise InputError(
