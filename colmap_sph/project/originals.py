@@ -15,7 +15,7 @@ from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, image_names, load_model, model_files
-from colmap_sph.project.workspace import checked_name
+from colmap_sph.project.workspace import checked_name, mask_path
 
 logger = logging.getLogger(__name__)
 
@@ -49,7 +49,13 @@ class Originals:
     def fingerprint(self) -> dict[str, str | None]:
         """Hash of the model's content, and of names, sizes and times of images and masks."""
         names = image_names(self.model)
-        masks = None if self.mask_dir is None else _hash_times(self.mask_dir, [f"{name}.png" for name in names])
+        masks = (
+            None
+            if self.mask_dir is None
+            else _hash_times(
+                self.mask_dir, [str(mask_path(self.mask_dir, name).relative_to(self.mask_dir)) for name in names]
+            )
+        )
         return {"model": _hash_model(self.model_dir), "images": _hash_times(self.image_dir, names), "masks": masks}
 
     def usable(self) -> Usable:
@@ -73,7 +79,9 @@ class Originals:
             raise InputError(
                 f"None of the model's {len(cameras)} images in {self.image_dir} is usable; check --images."
             )
-        return Usable(list(good), [] if self.mask_dir is None else check_masks(self.mask_dir, good))
+        return Usable(
+            list(good), [] if self.mask_dir is None else check_masks(self.mask_dir, good, self.image_dir, cameras)
+        )
 
 
 def read_originals(project: Project) -> Originals:
@@ -135,6 +143,10 @@ def _hash_model(model_dir: Path) -> str:
         with path.open("rb") as file:
             digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
     return digest.hexdigest()
+
+
+def _mask_names(folder: Path, names: list[str]) -> list[str]:
+    return [str(mask_path(folder, name).relative_to(folder)) for name in names]
 
 
 def _hash_times(folder: Path, names: list[str]) -> str:

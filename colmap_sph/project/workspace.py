@@ -172,8 +172,13 @@ class Workspace:
 
 
 def mask_path(folder: Path, name: str) -> Path:
-    """Where COLMAP looks for the mask of image `name` in a folder of masks."""
-    return folder / f"{checked_name(name)}.png"
+    """Where COLMAP finds the mask of image `name` in a folder of masks: ``a.jpg.png``, or else ``a.png``.
+
+    Where there is none, the first of them.
+    """
+    usual = folder / f"{checked_name(name)}.png"
+    other = folder / PurePosixPath(name).with_suffix(".png")
+    return other if PurePosixPath(name).suffix and other.exists() and not usual.exists() else usual
 
 
 def checked_name(name: str) -> str:

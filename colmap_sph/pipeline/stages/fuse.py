@@ -29,6 +29,7 @@ from colmap_sph.project.cloud_files import (
     write_part,
 )
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
+from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.project.pair_lists import write_fusion_cfg
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.staging import scratch_folder
@@ -195,6 +196,7 @@ class FuseStage(Stage[str, FuseTask]):
             return
         check_places(self.context.workspace)
         forget(self.context.workspace.cloud_record_path)
+        _warn_of_masks(self.context)
         with scratch_folder(self._scratch):
             yield
 
@@ -234,6 +236,14 @@ class FuseStage(Stage[str, FuseTask]):
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
         """One cloud."""
         return int(not self._is_there), int(self._is_there)
+
+
+def _warn_of_masks(context: "Context") -> None:
+    """Report masks that fusion will not use."""
+    folder = context.options.fusion.mask_path
+    if folder is not None:
+        names = [view.name for view in context.scene.views]
+        warn_of_unused_masks(folder, names, context.workspace.images_dir)
 
 
 def _partners_in_fusion(
@@ -288,6 +298,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         if self._known is None:
             check_places(self.context.workspace)
             forget(self.context.workspace.cloud_record_path)
+            _warn_of_masks(self.context)
             self._warn_of_memory()
         yield
 
