@@ -17,7 +17,10 @@ from colmap_sph.errors import InputError, OptionError, OutputError, reason_of
 from colmap_sph.project.cameras import make_pinhole, replace_ideal_fisheyes, undistort_cameras
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import free_space, make_dir
+from colmap_sph.project.images.depth import common_ranges, describe_ranges, sample_values
+from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.images.reading import image_problem
+from colmap_sph.project.images.undistorting import undistort_deep
 from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.originals import Originals, read_originals
 from colmap_sph.project.pair_lists import write_fusion_cfg, write_patch_match_cfg
@@ -222,7 +225,26 @@ def _undistort(originals: Originals, names: list[str], scratch: Path, options: U
     except (RuntimeError, ValueError, OSError) as error:
         _raise_if_disk_is_full(scratch)
         raise InputError(f"COLMAP cannot undistort the images of {model_dir}: {reason_of(error)}") from error
+    _mend_images(originals, names, Workspace(scratch), options)
     return _mend_workspace(Workspace(scratch), names)
+
+
+def _mend_images(
+    originals: Originals, names: list[str], workspace: Workspace, options: UndistortionOptions
+) -> None:
+    """Make images of more than 8 bits anew at their depth, and take the orientation from all others."""
+    cameras = cameras_of_images(originals.model)
+    samples = {name: sample_values(originals.image_dir / name) for name in names}
+    ranges = common_ranges(samples.values())
+    for sentence in describe_ranges(ranges):
+        logger.info(sentence)
+    for name, sample in samples.items():
+        source = originals.image_dir / name
+        target = workspace.image_path(name)
+        if sample is not None:
+            undistort_deep(source, cameras[name], options.for_colmap(), target, ranges[sample.kind])
+        elif target.is_file():
+            copy_without_orientation(target, target)
 
 
 def _undistort_masks(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> None:
