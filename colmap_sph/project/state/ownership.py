@@ -60,7 +60,7 @@ def fusion_cfg_place(workspace: Workspace) -> Place:
 
 def undistorted_place(workspace: Workspace, name: str) -> Place:
     """An undistorted image, and its mask where it has one."""
-    files = (workspace.image_path(name), workspace.mask_path(name))
+    files = (workspace.image_path(name), workspace.made_mask_path(name))
     return Place(workspace.records_dir / f"{name}{_UNDISTORTED}", files)
 
 
