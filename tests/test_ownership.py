@@ -331,7 +331,7 @@ def test_the_command_has_verify(finished: Finished, capsys: pytest.CaptureFixtur
     assert "Damaged, and made again" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("flaw", ["long", "short", "nan", "inf", "huge", "depth inf", "depth nan"])
+@pytest.mark.parametrize("flaw", ["long", "short", "nan", "inf", "huge", "tiny", "depth inf", "depth nan"])
 def test_maps_that_no_run_makes_are_not_fused(flaw: str, finished: Finished) -> None:
     """In a workspace from a stranger, whose records vouch for them."""
     name = NAMES[1]
@@ -348,9 +348,9 @@ def test_maps_that_no_run_makes_are_not_fused(flaw: str, finished: Finished) -> 
     if flaw.startswith("depth"):
         depth[row, col] = 12345.0
     else:
-        normals[row, col] = {"long": 1.1, "short": 0.5, "nan": 7.0, "inf": 7.0, "huge": 1e30}[flaw] * normals[
-            row, col
-        ]
+        normals[row, col] = {"long": 1.1, "short": 0.5, "nan": 7.0, "inf": 7.0, "huge": 1e30, "tiny": 1e-25}[
+            flaw
+        ] * normals[row, col]
     maps.write(normals, depth, key)
     value = np.float32({"nan": np.nan, "inf": np.inf, "depth inf": np.inf, "depth nan": np.nan}.get(flaw, 0))
     if value != 0:  # which the writer would not let through

@@ -197,10 +197,8 @@ def numbers_with(changes: dict[int, float]) -> list[float]:
 def written(path: Path, *, kind: str = "pair", codes: np.ndarray | None = None, **changes: Any) -> None:
     """Write a file with checksums that hold, whatever it says."""
     pair = make_pair(np.zeros((HEIGHT, WIDTH)))
-    content: dict[str, Any] = {
-        "texts": [pair.left, pair.right, pair.geometry.surface],
-        "numbers": numbers_with({}),
-    }
+    texts = [pair.left, pair.right, pair.geometry.surface]
+    content: dict[str, Any] = {"texts": texts, "numbers": numbers_with({})}
     codes = np.zeros((HEIGHT, WIDTH), np.uint16) if codes is None else codes
     write_arrays(path, kind, "key", [codes], **(content | changes))
 
