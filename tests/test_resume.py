@@ -250,7 +250,7 @@ def test_a_changed_mask_redoes_the_cloud(finished: Finished) -> None:
     masks = finished.project / "masks"
     masks.mkdir()
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
-    options = {"fusion": FusionOptions(mask_path=masks)}
+    options: dict[str, Any] = {"fusion": FusionOptions(mask_path=masks)}
     cv2.imwrite(str(masks / f"{NAMES[0]}.png"), mask)
     first = finished.rerun(**options)
     mask[:, : WIDTH // 2] = 0
@@ -306,7 +306,7 @@ DAMAGED = {
 @pytest.mark.parametrize("damage", [cut, empty, remove, garble])
 @pytest.mark.parametrize("what", DAMAGED)
 def test_what_is_damaged_is_made_again(what: str, damage: Callable[[Path], None], finished: Finished) -> None:
-    """Maps and clouds not as they were written might be the user's, and so might those of a lost record."""
+    """Maps and clouds that are not as they were written may be the user's, and so may those of a lost record."""
     pattern, made = DAMAGED[what]
     before = results(finished.dense)
     path = min(finished.dense.glob(pattern))
@@ -360,7 +360,7 @@ def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Fin
     ids = finished.ids
     path = finished.dense / f"colmap_sph/pairs/{ids[NAMES[0]]:06d}-{ids[NAMES[1]]:06d}.sph"
     spoil_disparities(path)
-    changed = {"vote": VoteOptions(tolerance=2.5), "threads": threads}
+    changed: dict[str, Any] = {"vote": VoteOptions(tolerance=2.5), "threads": threads}
     report = finished.rerun(**changed)
     # Whichever of the two read it first removed it; the other finds it missing.
     assert sorted(report.skipped_images) == NAMES[:2]

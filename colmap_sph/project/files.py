@@ -21,7 +21,7 @@ _TEMPORARY_NAME = ".{process}-{thread}.tmp"
 _TEMPORARY = re.compile(r"\.\d+-\d+\.tmp")
 # What a file system answers that cannot sync at all: there is nothing to wait for then.
 _NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
-_READ_BYTES = 1 << 20
+_READ_BYTES = 1 << 17
 
 
 def make_dir(folder: Path) -> None:
