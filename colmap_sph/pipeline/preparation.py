@@ -104,6 +104,9 @@ class Preparation:
         self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
         self.names = tuple(image_names(self._originals.model))
+        originals = self._originals
+        if originals.mask_dir is not None:
+            check_masks(originals.mask_dir, cameras_of_images(originals.model), originals.image_dir)
         self._context = Context(
             self.workspace,
             NO_SCENE,
@@ -132,11 +135,7 @@ class Preparation:
         sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
         where = f"{originals.image_dir} is usable; check --images."
         stage = CheckStage(self._context, sizes, originals.image_path, "originals", where, verify=self._verify)
-        images = executor(stage)
-        if originals.mask_dir is not None:
-            good = {name: cameras[name] for name in images}
-            check_masks(originals.mask_dir, good, originals.image_dir, cameras)
-        return images
+        return executor(stage)
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""
