@@ -58,7 +58,7 @@ def run_command(command: RunCommand, console: Console) -> int:
     with workspace_log(workspace, header(command)), Display(console) as display:
         report = run_project(project, options, progress=display, overwrite=command.overwrite)
     print_summary(report, workspace, console)
-    return PARTIAL_EXIT_CODE if report.skipped_images else 0
+    return PARTIAL_EXIT_CODE if report.skipped_images or report.incomplete else 0
 
 
 def header(command: object) -> str:
@@ -145,6 +145,17 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
 
 
+def _share(value: float | None) -> str:
+    return "" if value is None else f"{value:.1%}"
+
+
+def _agreement(report: RunReport) -> str:
+    """How far the depth maps agree with the sparse points."""
+    if report.overall_agreement is None:
+        return "no sparse points to check against"
+    return f"{report.overall_agreement:.1%} of the sparse points agree with the depth maps"
+
+
 def print_summary(report: RunReport, workspace: Workspace, console: Console) -> None:
     """Print the closing summary of a run.
 
@@ -156,15 +167,16 @@ def print_summary(report: RunReport, workspace: Workspace, console: Console) -> 
     console : Console
     """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
-    table = Table("image", "coverage", title="Depth maps", title_justify="left")
+    table = Table("image", "coverage", "agreement", title="Depth maps", title_justify="left")
     for name, share in sorted(listed[:_MAX_LISTED_IMAGES]):
-        table.add_row(escaped(name), f"{share:.1%}")
+        table.add_row(escaped(name), f"{share:.1%}", _share(report.agreement.get(name)))
     if len(listed) > _MAX_LISTED_IMAGES:
         table.caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images"
     console.print(table)
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
     facts = Table.grid(padding=(0, 2))
     facts.add_row("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")
+    facts.add_row("agreement", _agreement(report))
     facts.add_row("pairs", f"{report.pairs} matched ({report.pair_source})")
     facts.add_row("cloud", f"{report.points:,} points in {escaped(workspace.fused_path)}")
     if any(report.reused.values()):
@@ -177,5 +189,9 @@ def print_summary(report: RunReport, workspace: Workspace, console: Console) -> 
     for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
         for name, reason in skipped.items():
             console.print(f"[yellow]{what} skipped:[/] {escaped(name)}: {escaped(reason)}", soft_wrap=True)
+    for name, reason in report.incomplete.items():
+        console.print(f"[yellow]incomplete:[/] {escaped(name)}: {escaped(reason)}", soft_wrap=True)
+    if report.doubts:
+        console.print(f"[yellow]disagreement:[/] {escaped(report.doubts)}", soft_wrap=True)
     if report.advice:
         console.print(f"[yellow]few points:[/] {escaped(report.advice)}", soft_wrap=True)

@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.self_check import report_agreement
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS, read_estimate
 from colmap_sph.project.images import read_undistorted
+from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
+from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
@@ -56,10 +59,13 @@ class EstimateFile:
 
 @dataclass(frozen=True, eq=False)
 class ConfirmTask:
-    """A view and its partners, and where its geometric maps go."""
+    """A view and its partners, its sparse points and mask, and where its geometric maps go."""
 
     reference: EstimateFile
     partners: tuple[EstimateFile, ...]
+    stations: tuple[int, ...]
+    sights: SparseSights
+    mask: Path
     confirm_options: ConfirmOptions
     normal_options: NormalOptions
     refinement_options: RefinementOptions
@@ -71,12 +77,14 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     """Confirm a view's depth by its partners' and refine it on their images; writes its geometric maps."""
     view = task.reference.view
     others = ((partner.view, _estimate(partner)) for partner in task.partners)
-    confirmed = confirm_depth(view, _estimate(task.reference), others, task.confirm_options)
+    confirmed = confirm_depth(view, _estimate(task.reference), others, task.confirm_options, task.stations)
     planes = fit_normals(view, confirmed, task.normal_options)
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
         planes = refine_maps(view, _image(task.reference), confirmed, *planes, sources, task.refinement_options)
-    return task.maps.write(*planes, task.key)
+    mask = read_mask(task.mask, view.width, view.height)
+    normals, depth = planes
+    return task.maps.write(normals, depth, task.key, compare_with_sparse(view, depth, task.sights, mask))
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
@@ -101,12 +109,17 @@ class ConfirmStage(Stage[str, ConfirmTask]):
     def job(self, item: str) -> Job[ConfirmTask]:
         """See `Stage.job`."""
         options = self.context.options
-        partners = self._partners(item)
-        key = self.context.keys.geometric(self._vote_keys[item], [self._vote_keys[name] for name in partners])
+        partners, stations = self.context.stations.elsewhere(item, self._partners(item))
+        votes = [self._vote_keys[name] for name in partners]
+        sights = self.context.sparse_tracks.sights(item)
+        key = self.context.keys.geometric(self._vote_keys[item], votes, stations, sights)
         maps = self.context.map_files(item, "geometric")
         task = ConfirmTask(
             self._estimate_file(item),
             tuple(map(self._estimate_file, partners)),
+            tuple(stations),
+            sights,
+            self.context.workspace.mask_path(item),
             options.confirm,
             options.normals,
             options.refinement,
@@ -155,6 +168,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         report = self.context.report
         names = [view.name for view in self.context.scene.views]
         report.coverage = {name: results[name].facts.coverage if name in results else 0.0 for name in names}
+        report_agreement(report, {name: result.facts.agreement for name, result in results.items()})
         report.images = sum(share > 0 for share in report.coverage.values())
         failures = [report.skipped_images[name] for name in names if name in report.skipped_images]
         if failures and not report.images:
