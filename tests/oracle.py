@@ -356,7 +356,7 @@ def gate(world, normal, partner, options):
 def fuse_view(reference, partners, options, stations):
     """Points of a view by pixel (col, row): position, normal, colour, views; and the clearance of each pixel.
 
-    `reference` and `partners` are `fusion.ViewMaps`; `stations` numbers those of the partners, 0 is the view's own.
+    `reference` and `partners` are `fusion.ViewMaps`; `stations` numbers those of the partners, 0 is its own.
     The clearance is the least relative distance from any gate, from a pixel's border and between two areas.
     """
     view = reference.view

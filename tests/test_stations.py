@@ -57,6 +57,15 @@ def test_a_row_of_frames_is_no_single_station():
     assert max(numbers.count(number) for number in numbers) <= 3
 
 
+def test_cameras_of_a_rig_that_look_apart_are_different_stations():
+    scene = scene_at({"a": (0, 0), "b1": (1, 0), "b2": (1, 0)})
+    for degrees, expected in ((10, [1, 1]), (45, [1, 2])):
+        turned = np.radians(degrees)
+        R = np.array([[np.cos(turned), 0, np.sin(turned)], [0, 1, 0], [-np.sin(turned), 0, np.cos(turned)]])
+        rig = replace(scene.views[2], R=R, t=-R @ scene.views[2].center)
+        assert Stations(replace(scene, views=(*scene.views[:2], rig)), 1.0).numbers("a", ["b1", "b2"]) == expected
+
+
 def test_where_all_stand_together_each_counts():
     places = {"a": (0, 0), "b": (0.3 * DEGREE, 0), "c": (-0.3 * DEGREE, 0)}
     assert Stations(scene_at(places), 1.0).numbers("a", ["b", "c"]) == [1, 2]

@@ -15,6 +15,7 @@ from typing import Any, Protocol
 
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, timed_stage
+from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
@@ -197,9 +198,10 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     executor : callable
         What is done with each stage, see `Executor`.
     """
+    check_numbers(context, pairs)
     pair_keys = keys_of(executor(MatchStage(context, pairs)))
-    vote_keys = keys_of(executor(VoteStage(context, pair_keys)))
-    maps = executor(ConfirmStage(context, pair_keys, vote_keys))
+    votes = executor(VoteStage(context, pair_keys))
+    maps = executor(ConfirmStage(context, pair_keys, votes))
     executor(fuse_stage(context, pair_keys, maps))
 
 

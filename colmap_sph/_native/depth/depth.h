@@ -126,7 +126,7 @@ void vote_depth(const float *depths, const float *sigmas, const int32_t *station
 enum { SURFACE_RADIUS = 3 };
 
 typedef struct {
-    int min_consistent;      /* views that must agree, or all that have the point in view; one at least */
+    int min_consistent;      /* views that must agree, or all that see the point's place, one at least; 0: none */
     float max_contradiction; /* most that look through it, per agreeing view */
     float min_surface;       /* least share of the window that must be on the surface where one view agrees */
     float steepest;          /* largest relative change of depth per pixel there */

@@ -12,10 +12,11 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.options import changed_options
 from colmap_sph.pipeline.self_check import report_agreement
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
-from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS, read_estimate
 from colmap_sph.project.images import read_undistorted
 from colmap_sph.project.masks import read_mask
@@ -101,9 +102,10 @@ class ConfirmStage(Stage[str, ConfirmTask]):
     name = "confirm depth"
     make = staticmethod(make_geometric_maps)
 
-    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], vote_keys: Mapping[str, str]) -> None:
-        super().__init__(context, [view.name for view in context.scene.views if view.name in vote_keys])
-        self._vote_keys = vote_keys
+    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], votes: Mapping[str, Result]) -> None:
+        super().__init__(context, [view.name for view in context.scene.views if view.name in votes])
+        self._vote_keys = keys_of(votes)
+        self._voted = {name: result.facts.coverage for name, result in votes.items()}
         self._all_partners = partners_of(pair_keys)
 
     def job(self, item: str) -> Job[ConfirmTask]:
@@ -174,12 +176,29 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         if failures and not report.images:
             raise NoResultError(f"No image has a depth map ({failures[0]})")
         for name in (name for name, share in report.coverage.items() if share == 0):
-            paired = "no depth of it is confirmed by another image"
-            reason = paired if name in self._all_partners else "no pair of it could be matched"
-            report.skipped_images.setdefault(name, reason)
+            report.skipped_images.setdefault(name, self._why_empty(name))
         if not report.images:
-            masked = self.context.workspace.masks_dir.is_dir()
-            raise NoResultError(
-                "No depth was confirmed by a second image; are the model's poses right for these images"
-                + (", and is black in the masks what is to be ignored?" if masked else "?")
-            )
+            raise NoResultError(self._why_nothing())
+
+    def _why_empty(self, name: str) -> str:
+        """Why an image has no depth, as far as it is known."""
+        if name not in self._all_partners:
+            return "no pair of it could be matched"
+        if self._voted.get(name, 0.0) > 0:
+            return "no depth of it is confirmed by another image"
+        mask = self.context.workspace.mask_path(name)
+        return "its mask may leave nothing of it" if mask.is_file() else "no pair of it found any depth"
+
+    def _why_nothing(self) -> str:
+        """Why no image has a depth, and what to look at first."""
+        changed = changed_options(
+            self.context.options, ("rectification", "matching", "vote", "confirm", "normals")
+        )
+        found = any(share > 0 for share in self._voted.values())
+        what = "No depth was confirmed by a second image" if found else "No pair of images found any depth"
+        questions = ["are the model's poses right for these images?"]
+        if self.context.workspace.masks_dir.is_dir():
+            questions.append("is black in the masks what is to be ignored?")
+        if changed:
+            questions.insert(0, f"is it the same without {', '.join(changed)}?")
+        return f"{what}; {' '.join(questions)}"

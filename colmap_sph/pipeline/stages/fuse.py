@@ -226,10 +226,20 @@ class FuseStage(Stage[str, FuseTask]):
                 raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
             points = sum(result.facts.points for result in results.values())
             self._put_together([self._stem(name) for name in results], points)
-            self._known = facts_of_cloud(context, list(results), points)
+            self._known = facts_of_cloud(context, list(results), points, self._partners_among(results))
             if len(results) == len(self.items) and not self._report_unread(results):
                 vouch_for_cloud(context, self._key, self._known)
         report_cloud(context, self._known)
+
+    def _partners_among(self, results: Mapping[str, Result]) -> dict[str, tuple[list[str], list[int]]]:
+        """The partners of the images that were fused, less those that were not."""
+        among = {}
+        for name in results:
+            kept = [
+                (other, number) for other, number in zip(*self._partners[name], strict=True) if other in results
+            ]
+            among[name] = ([other for other, _ in kept], [number for _, number in kept])
+        return among
 
     def _report_unread(self, results: Mapping[str, Result]) -> bool:
         """Report images whose maps could not be read while others were fused; whether there are any."""

@@ -186,7 +186,7 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
     beside: list[Partner] = []
     worths: list[NDArray[np.float32]] = []
     most = max(_MAX_CANDIDATES, options.num_pairs)
-    stations = StationCounter(graph.seen_by(i), graph.centers[i], options.min_triangulation_angle)
+    stations = StationCounter(graph.seen_by(i), graph.scene.views[i], options.min_triangulation_angle)
     for j, weight in zip(*graph.candidates(i), strict=True):
         if len(near) == most or len(near) + len(wide) == 2 * most or len(beside) == _MAX_BESIDE * most:
             break
@@ -196,7 +196,7 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
         if angle < options.min_triangulation_angle:
             continue
         partner = Partner(graph.scene.views[j].name, int(weight), angle)
-        if not stations.is_new(graph.centers[j]):
+        if not stations.is_new(graph.scene.views[j]):
             beside.append(partner)
         elif angle > options.max_triangulation_angle:
             wide.append(partner)

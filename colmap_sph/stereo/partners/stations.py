@@ -3,7 +3,8 @@
 Two frames of a hovering drone see the same from the same place: they are matched with the same images, make the
 same mistakes, and confirm each other. To a third view they are one witness, not two. So views are of one *station*
 where their baseline subtends, at what that third view sees, less than the angle under which a pair is worth
-matching.
+matching, and where they look the same way: cameras of a rig that look apart have different pictures of what they
+share.
 """
 
 from collections.abc import Sequence
@@ -12,13 +13,15 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.scene import Scene
+from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.partners.frusta import points_in_view
 
 # Points that tell the angles of a view; so large a share of them must see two views as one (the angle of a pair is
 # the 75th percentile, too).
 _MAX_POINTS = 64
 _MOST = 0.75
+# Views look the same way where their axes are less than 30 degrees apart.
+_SAME_WAY = 0.866
 
 OWN_STATION = 0
 """Number of the station of the view that looks."""
@@ -31,38 +34,40 @@ class StationCounter:
     ----------
     points : (n, 3) float64 ndarray
         What the view sees, world frame.
-    center : (3,) float64 ndarray
-        Its projection centre; the first of station `OWN_STATION`.
+    view : View
+        The view itself: the first of station `OWN_STATION`.
     least_angle : float
         Degrees; views nearer to each other than this are of one station.
     """
 
-    def __init__(self, points: NDArray[np.float64], center: NDArray[np.float64], least_angle: float) -> None:
+    def __init__(self, points: NDArray[np.float64], view: View, least_angle: float) -> None:
         self._points = points[:: -(-len(points) // _MAX_POINTS) or 1]
         self._cosine = float(np.cos(np.radians(least_angle)))
-        self._firsts = self._rays(center)[None]
-        self.count = 1
+        self._firsts = self._rays(view)[None]
+        self._axes = [view.viewing_direction]
 
-    def number(self, center: NDArray[np.float64]) -> int:
+    def number(self, view: View) -> int:
         """Return the station of a view: the first one whose first view is near enough, or a new one."""
-        rays = self._rays(center)
-        cosines = np.einsum("kpi,pi->kp", self._firsts[: self.count], rays)
-        shared = np.count_nonzero(cosines > self._cosine, axis=1) >= max(_MOST * len(rays), 1)
-        if shared.any():
-            return int(np.argmax(shared))
-        if self.count == len(self._firsts):
+        rays = self._rays(view)
+        count = len(self._axes)
+        cosines = np.einsum("kpi,pi->kp", self._firsts[:count], rays)
+        is_near = np.count_nonzero(cosines > self._cosine, axis=1) >= max(_MOST * len(rays), 1)
+        is_one = is_near & (np.array(self._axes) @ view.viewing_direction > _SAME_WAY)
+        if is_one.any():
+            return int(np.argmax(is_one))
+        if count == len(self._firsts):
             self._firsts = np.concatenate([self._firsts, np.empty_like(self._firsts)])
-        self._firsts[self.count] = rays
-        self.count += 1
-        return self.count - 1
+        self._firsts[count] = rays
+        self._axes.append(view.viewing_direction)
+        return count
 
-    def is_new(self, center: NDArray[np.float64]) -> bool:
+    def is_new(self, view: View) -> bool:
         """Whether a view stands where none stood before; from then on one does."""
-        before = self.count
-        return self.number(center) == before
+        before = len(self._axes)
+        return self.number(view) == before
 
-    def _rays(self, center: NDArray[np.float64]) -> NDArray[np.float64]:
-        rays = self._points - center
+    def _rays(self, view: View) -> NDArray[np.float64]:
+        rays = self._points - view.center
         with np.errstate(invalid="ignore", divide="ignore"):  # a point at the centre is near to nothing
             return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
 
@@ -104,8 +109,8 @@ class Stations:
         """
         index = self._scene.index_of[name]
         points, observed = self._points_in_view
-        stations = StationCounter(points[observed[index]], self._scene.views[index].center, self._least_angle)
-        found = [stations.number(self._scene.view(other).center) for other in others]
+        stations = StationCounter(points[observed[index]], self._scene.views[index], self._least_angle)
+        found = [stations.number(self._scene.view(other)) for other in others]
         return found if any(found) else list(range(1, 1 + len(found)))
 
     def elsewhere(self, name: str, others: Sequence[str]) -> tuple[list[str], list[int]]:
