@@ -12,10 +12,10 @@ logger = logging.getLogger(__name__)
 # On sound input a third of the points agree at the very least (a fisheye rig among people), nearly all as a rule;
 # of images that are turned, mirrored or exchanged a twentieth. An image is doubted below this share, ...
 _DOUBTED_SHARE = 0.15
-# ... and all of them below this one; if not even so large a share of the points with a depth agrees: where
-# matching finds little, few points have one, but these are right.
+# ... and all of them below this one.
 _REFUSED_SHARE = 0.1
-_REFUSED_SHARE_OF_FOUND = 0.3
+# Where so large a share of the points with a depth agrees, it may also be that hardly any was matched.
+_RIGHT_SHARE_OF_FOUND = 0.5
 # Fewer points say nothing.
 _FEWEST_OF_IMAGE = 10
 _FEWEST = 30
@@ -39,7 +39,7 @@ def report_agreement(report: RunReport, agreements: Mapping[str, Agreement]) -> 
         return
     doubted = {name: found.share for name, found in agreements.items() if _is_doubted(found)}
     if _is_refused(total):
-        report.refusal = _refusal(total.share)
+        report.refusal = _refusal(total)
     elif doubted:
         report.doubts = _doubts(doubted)
         logger.warning("%s", report.doubts)
@@ -56,18 +56,19 @@ def _is_doubted(found: Agreement) -> bool:
 
 
 def _is_refused(total: Agreement) -> bool:
-    return (
-        total.tested >= _FEWEST
-        and total.agreeing < _REFUSED_SHARE * total.tested
-        and total.agreeing <= _REFUSED_SHARE_OF_FOUND * total.found
+    return total.tested >= _FEWEST and total.agreeing < _REFUSED_SHARE * total.tested
+
+
+def _refusal(total: Agreement) -> str:
+    causes = (
+        "these images do not belong to the poses and cameras of the model (exchanged, turned, mirrored, cropped, "
+        "or of another model)"
     )
-
-
-def _refusal(share: float) -> str:
+    if total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found > 0:
+        causes += ", or hardly anything of them could be matched with these options"
     return (
-        f"Only {share:.1%} of the sparse points agree with the depth maps of the images that observe them: these "
-        "images do not belong to the poses and cameras of the model (exchanged, turned, mirrored, cropped, or of "
-        "another model); check --images. What was made is left on disk, but means nothing."
+        f"Only {total.agreeing / total.tested:.1%} of the sparse points agree with the depth maps of the images "
+        f"that observe them: {causes}; check --images. What was made is left on disk."
     )
 
 

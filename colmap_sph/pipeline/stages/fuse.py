@@ -245,6 +245,8 @@ class FuseStage(Stage[str, FuseTask]):
         """Report images whose maps could not be read while others were fused; whether there are any."""
         unread = {name: reason for result in results.values() for name, reason in result.facts.unread.items()}
         for name, reason in sorted(unread.items()):
+            if name in self.context.report.skipped_images:  # reported where it was to be fused itself
+                continue
             self.context.leave_incomplete(name, f"the cloud lacks its agreement with other images: {reason}")
         return bool(unread)
 
