@@ -198,16 +198,18 @@ def depth_candidates(
 def vote_depth(
     depths: NDArray[np.float32],
     sigmas: NDArray[np.float32],
+    stations: NDArray[np.int32],
     tolerance: float,
     depth: NDArray[np.float32],
     sigma: NDArray[np.float32],
     support: NDArray[np.uint8],
     /,
 ) -> None:
-    """The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size.
+    """The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size in stations.
 
     depths : (PAIRS, H, W) float32
     sigmas : (PAIRS, H, W) float32
+    stations : (PAIRS) int32
     tolerance : float
     depth : (H, W) float32, written
     sigma : (H, W) float32, written
@@ -437,7 +439,8 @@ def count_points(
     covered: NDArray[np.uint8],
     agreeing: NDArray[np.uint64],
     colour: NDArray[np.uint16],
-    min_views: int,
+    min_stations: int,
+    stations: NDArray[np.uint64],
     first_row: int,
     end_row: int,
     /,
@@ -449,7 +452,8 @@ def count_points(
     covered : (H, W) uint8
     agreeing : (H, W) uint64
     colour : (H, W, 3) uint16
-    min_views : int
+    min_stations : int
+    stations : (2) uint64
     first_row : int
     end_row : int
     returned: points
@@ -462,7 +466,8 @@ def write_points(
     covered: NDArray[np.uint8],
     agreeing: NDArray[np.uint64],
     colour: NDArray[np.uint16],
-    min_views: int,
+    min_stations: int,
+    stations: NDArray[np.uint64],
     first_row: int,
     end_row: int,
     world_from_pixel: NDArray[np.floating[Any]],
@@ -481,7 +486,8 @@ def write_points(
     covered : (H, W) uint8
     agreeing : (H, W) uint64
     colour : (H, W, 3) uint16
-    min_views : int
+    min_stations : int
+    stations : (2) uint64
     first_row : int
     end_row : int
     world_from_pixel : (3, 3) float64

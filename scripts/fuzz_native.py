@@ -133,7 +133,13 @@ def vote_depth(rng: Random) -> Arguments:
     h, w = size(rng)
     pairs = int(rng.integers(0, 12))
     inputs = [filled(rng, (pairs, h, w), np.float32) for _ in range(2)]
-    return [*inputs, number(rng), *(np.zeros((h, w), kind) for kind in (np.float32, np.float32, np.uint8))]
+    stations = np.sort(filled(rng, (pairs,), np.int32))
+    return [
+        *inputs,
+        stations,
+        number(rng),
+        *(np.zeros((h, w), kind) for kind in (np.float32, np.float32, np.uint8)),
+    ]
 
 
 def compare_depths(rng: Random) -> Arguments:
@@ -174,7 +180,8 @@ def find_gates(rng: Random) -> Arguments:
 def count_points(rng: Random) -> Arguments:
     maps = fused_maps(rng)
     first, end = sorted(int(row) for row in rng.integers(0, maps[0].shape[0] + 1, 2))
-    return [*maps, *verdicts(rng, maps[0].shape), int(rng.integers(0, 5)), first, end]
+    least, stations = int(rng.integers(0, 5)), filled(rng, (2,), np.uint64)
+    return [*maps, *verdicts(rng, maps[0].shape), least, stations, first, end]
 
 
 def write_points(rng: Random) -> Arguments:

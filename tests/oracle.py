@@ -205,8 +205,12 @@ def transfer_disparity(left, max_step, right_width):
     return right
 
 
-def vote_depth(depths, sigmas, tolerance):
-    """Depth, sigma, support, and the least distance of any pair of candidates from the gate, per pixel."""
+def vote_depth(depths, sigmas, tolerance, stations):
+    """Depth, sigma, support, and the least distance of any pair of candidates from the gate, per pixel.
+
+    Candidates of one station count as one, with the mean of their weights and weighted depths.
+    """
+    stations = np.asarray(stations)
     shape = depths.shape[1:]
     depth, sigma = np.zeros(shape), np.zeros(shape)
     support, clearance = np.zeros(shape, dtype=int), np.full(shape, np.inf)
@@ -220,12 +224,15 @@ def vote_depth(depths, sigmas, tolerance):
         difference = np.abs(z[:, None] - z)
         clearance[pixel] = np.abs(difference / gate - 1).min()
         agree = difference <= gate
+        at = stations[found]
         # Most friends first, then the smallest variance, then the first.
-        centre = min(range(len(z)), key=lambda k: (-agree[k].sum(), variance[k], k))
-        weight = 1 / variance[agree[centre]]
-        depth[pixel] = (z[agree[centre]] * weight).sum() / weight.sum()
-        sigma[pixel] = weight.sum() ** -0.5
-        support[pixel] = agree[centre].sum()
+        centre = min(range(len(z)), key=lambda k: (-len(set(at[agree[k]])), variance[k], k))
+        members = [agree[centre] & (at == station) for station in sorted(set(at[agree[centre]]))]
+        weights = [np.mean(1 / variance[own]) for own in members]
+        weighted = [np.mean(z[own] / variance[own]) for own in members]
+        depth[pixel] = sum(weighted) / sum(weights)
+        sigma[pixel] = sum(weights) ** -0.5
+        support[pixel] = len(members)
     return depth, sigma, support, clearance
 
 
@@ -346,11 +353,11 @@ def gate(world, normal, partner, options):
     return 1 + same_depth * (1 + agrees), distance, clearance
 
 
-def fuse_view(reference, partners, options):
+def fuse_view(reference, partners, options, stations):
     """Points of a view by pixel (col, row): position, normal, colour, views; and the clearance of each pixel.
 
-    `reference` and `partners` are `fusion.ViewMaps`. The clearance is the least relative distance from any gate,
-    from a pixel's border and between two areas.
+    `reference` and `partners` are `fusion.ViewMaps`; `stations` numbers those of the partners, 0 is its own.
+    The clearance is the least relative distance from any gate, from a pixel's border and between two areas.
     """
     view = reference.view
     points = {}
@@ -361,9 +368,10 @@ def fuse_view(reference, partners, options):
         world = view.R.T @ (np.linalg.solve(view.K, [col, row, 1.0]) * z - view.t)
         area = pixel_area(view, (col, row), z, own)
         views = [reference.index]
+        seen_from = {0}
         colours = [reference.image[row, col].astype(int)]
         covered = False
-        for partner in partners:
+        for partner, station in zip(partners, stations, strict=True):
             pixel, distance, agrees, margin = _agreement(world, view.R.T @ own, partner, options)
             clearance[row, col] = min(clearance[row, col], margin)
             if not agrees:
@@ -374,8 +382,9 @@ def fuse_view(reference, partners, options):
             clearance[row, col] = min(clearance[row, col], margin)
             covered |= distance <= options.max_reproj_error and other < area
             views.append(partner.index)
+            seen_from.add(station)
             colours.append(partner.image[y, x].astype(int))
-        if not covered and len(views) >= options.min_num_pixels:
+        if not covered and len(seen_from) >= options.min_num_pixels:
             rgb = np.floor(np.mean(colours, axis=0) + 0.5)[::-1]
             points[col, row] = (world, view.R.T @ own, rgb, tuple(views))
     return points, clearance

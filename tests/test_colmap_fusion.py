@@ -185,12 +185,12 @@ def test_the_gate_that_takes_the_points_is_named(workspace, spoil, options, gate
     if spoil:
         spoil(workspace, workspace.fusion_cfg_path.read_text().split())
     losses = explain_losses(stored_maps(workspace), read_scene(workspace.sparse_dir), options)
-    shares = {name: getattr(losses, name) for name in ("unseen", "depth", "reprojection", "normal", "kept")}
+    shares = {name: getattr(losses, name) for name in ("unseen", "few", "depth", "reprojection", "normal", "kept")}
     assert sum(shares.values()) == pytest.approx(1)
     assert max(shares, key=shares.__getitem__) == gate
     assert shares[gate] > 0.5
     option = {"normal": "max-normal-error", "depth": "max-depth-error", "reprojection": "max-reproj-error"}
-    assert gate not in option or f"loosen --fusion.{option[gate]} or" in losses.sentence()
+    assert gate not in option or f"loosen --fusion.{option[gate]} or" in losses.sentence(options)
     # COLMAP's own fusion loses (or keeps) the points indeed.
     count = fuse_by_colmap(workspace, options.for_colmap(), threads=1)
     assert (count > WIDTH * HEIGHT / 5) == (gate == "kept")

@@ -245,11 +245,12 @@ def test_transfer_agrees_with_exact_geometry(name):
 # ---- the vote ----------------------------------------------------------------------------------------------
 
 
-def vote(depths, sigmas, tolerance):
+def vote(depths, sigmas, tolerance, stations=None):
     shape = depths.shape[1:]
     depth, sigma = np.full(shape, 9, np.float32), np.full(shape, 9, np.float32)
     support = np.full(shape, 9, np.uint8)
-    _native.vote_depth(depths, sigmas, tolerance, depth, sigma, support)
+    numbers = np.arange(len(depths)) if stations is None else np.array(stations)
+    _native.vote_depth(depths, sigmas, numbers.astype(np.int32), tolerance, depth, sigma, support)
     return depth, sigma, support
 
 
@@ -259,9 +260,10 @@ def vote(depths, sigmas, tolerance):
     surfaces=st.integers(1, 4),
     holes=st.sampled_from([0.0, 0.4, 1.0]),
     tolerance=st.sampled_from([0.5, 3.0]),
+    twins=st.booleans(),
     seed=st.integers(0, 2**32 - 1),
 )
-def test_vote_is_the_oracles(count, surfaces, holes, tolerance, seed):
+def test_vote_is_the_oracles(count, surfaces, holes, tolerance, twins, seed):
     rng = np.random.default_rng(seed)
     shape = (count, 3, 17)
     places = rng.uniform(5, 20, (surfaces, *shape[1:]))
@@ -270,8 +272,11 @@ def test_vote_is_the_oracles(count, surfaces, holes, tolerance, seed):
     depths = (chosen + sigmas * rng.standard_normal(shape)).astype(np.float32)
     none = rng.random(shape) < holes
     depths[none] = rng.choice([0, -1, np.nan], none.sum())
-    depth, sigma, support = vote(depths, sigmas, tolerance)
-    expected_depth, expected_sigma, expected_support, clearance = oracle.vote_depth(depths, sigmas, tolerance)
+    stations = np.sort(rng.integers(0, 1 + count // 2, count)) if twins else np.arange(count)
+    depth, sigma, support = vote(depths, sigmas, tolerance, stations)
+    expected_depth, expected_sigma, expected_support, clearance = oracle.vote_depth(
+        depths, sigmas, tolerance, stations
+    )
     clear = clearance > 1e-4
     assert clear.mean() > 0.9
     np.testing.assert_array_equal(support[clear], expected_support[clear])
@@ -287,6 +292,17 @@ def test_the_larger_cluster_wins_and_is_averaged():
     assert support[0, 0] == 3
     assert depth[0, 0] == pytest.approx((depths[1:4, 0, 0] * weights).sum() / weights.sum(), rel=1e-6)
     assert sigma[0, 0] == pytest.approx(weights.sum() ** -0.5, rel=1e-6)
+
+
+def test_candidates_of_one_station_have_one_vote():
+    """Four frames from one place say 7, two from different places 10."""
+    depths = np.array([7.0, 7.0, 7.0, 7.0, 10.0, 10.2], dtype=np.float32).reshape(6, 1, 1)
+    sigmas = np.full_like(depths, 0.1)
+    depth, sigma, support = vote(depths, sigmas, 3.0, [1, 1, 1, 1, 2, 3])
+    assert (depth[0, 0], support[0, 0]) == (pytest.approx(10.1), 2)
+    assert sigma[0, 0] == pytest.approx(0.1 / 2**0.5)
+    depth, sigma, support = vote(depths[:4], sigmas[:4], 3.0, [1, 1, 1, 1])
+    assert (depth[0, 0], support[0, 0], sigma[0, 0]) == (7, 1, pytest.approx(0.1))
 
 
 def test_more_than_255_candidates_do_not_overflow():

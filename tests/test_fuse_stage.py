@@ -13,7 +13,7 @@ import pytest
 from clouds import read_fused, read_points, read_visibility
 from exact_maps import GSD, HEIGHT, NAMES, NORMAL, WIDTH, make_workspace, write_maps
 
-from colmap_sph.errors import NoResultError, OptionError, OutputError
+from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import Mesh, read_geometry
 from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.context import Context
@@ -384,6 +384,31 @@ def test_an_image_that_fails_is_left_out_and_done_again(workspace):
     assert cloud_bytes(workspace) == whole
 
 
+def test_a_partner_that_cannot_be_read_for_a_moment_is_made_up_for(workspace, monkeypatch):
+    """One read of c.png fails while a.png is fused: the cloud lacks something, and nothing vouches for it."""
+    fuse(workspace)
+    whole = cloud_bytes(workspace)
+    original = fuse_module.read_view_maps
+    failed = []
+
+    def fails_once(sources):
+        if sources.view.name == "c.png" and not failed:
+            failed.append(sources.view.name)
+            raise InputError("c.png cannot be read (Input/output error); run again.")
+        return original(sources)
+
+    shutil.rmtree(workspace.state_dir)
+    monkeypatch.setattr(fuse_module, "read_view_maps", fails_once)
+    report = fuse(workspace)
+    assert failed and cloud_bytes(workspace) != whole
+    assert list(report.incomplete) == ["c.png"]
+    assert "Input/output error" in report.incomplete["c.png"]
+    again = fuse(workspace)
+    assert again.made["fuse"] == 1 and again.incomplete == {}
+    assert cloud_bytes(workspace) == whole
+    assert fuse(workspace).made["fuse"] == 0
+
+
 def test_all_images_fail(workspace):
     for name in NAMES:
         workspace.normal_map_path(name, "geometric").unlink()
@@ -398,7 +423,39 @@ def test_no_point(workspace):
     report = fuse(workspace, fusion=FusionOptions(min_num_pixels=7))
     assert report.points == len(read_fused(workspace.fused_path)) == 0
     assert read_visibility(workspace.root / "fused.ply.vis") == []
-    assert report.advice
+    assert "lower --fusion.min-num-pixels, which is 7" in report.advice
+
+
+@pytest.mark.parametrize(
+    ("cause", "options", "advice"),
+    [
+        ("depth", {}, "loosen --fusion.max-depth-error"),
+        ("depth", {"max_depth_error": 1e-9}, "loosen --fusion.max-depth-error"),
+        ("normal", {"max_normal_error": 1e-3}, "loosen --fusion.max-normal-error"),
+        ("apart", {}, "check the poses, or try --fusion.input photometric"),
+        ("apart, with poses that fit", {}, "; try --fusion.input photometric"),
+        ("mask", {}, "--fusion.mask-path leaves out 100%"),
+    ],
+)
+def test_the_advice_names_the_cause(workspace, tmp_path, cause, options, advice):
+    for factor, name in enumerate(NAMES):
+        if cause == "depth" and not options:
+            depth = read_depth_map(workspace.depth_map_path(name, "geometric"))
+            write_maps(workspace, name, depth=depth * (1 + 0.05 * factor))
+        if cause == "normal":
+            turned = np.roll(np.array([0.01 * factor, 0, -1]), 0) * np.ones((HEIGHT, WIDTH, 1))
+            write_maps(workspace, name, normals=turned / np.linalg.norm(turned, axis=2, keepdims=True))
+        if cause.startswith("apart") and name != NAMES[0]:
+            write_maps(workspace, name, depth=np.zeros((HEIGHT, WIDTH)))
+        if cause == "mask":
+            cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+            options = {"mask_path": tmp_path}
+    context = context_of(workspace, fusion=FusionOptions(**options))
+    context.report.overall_agreement = 0.95 if "poses that fit" in cause else None
+    execute(stage_of(context))
+    assert context.report.points == 0
+    assert advice in context.report.advice
+    assert ("poses" in context.report.advice) == (cause == "apart")
 
 
 def test_thin_clouds_of_many_images_are_no_reason_for_advice(workspace, monkeypatch):

@@ -334,16 +334,17 @@ def noisy_maps(seed):
     ],
     ids=["default", "narrow", "wide"],
 )
-@pytest.mark.parametrize("seed", [0, 1])
-def test_fusion_is_the_oracles(seed, options):
+@pytest.mark.parametrize(("seed", "stations"), [(0, None), (1, None), (1, [0, 1, 1]), (1, [1, 1, 2])])
+def test_fusion_is_the_oracles(seed, stations, options):
     maps = noisy_maps(seed)
     num_found = 0
     for one in maps:
         others = [other for other in maps if other is not one]
-        expected, clearance = oracle.fuse_view(one, others, options)
+        numbers = list(range(1, 1 + len(others))) if stations is None else stations
+        expected, clearance = oracle.fuse_view(one, others, options, numbers)
         clear = clearance > 1e-4
         assert clear.mean() > 0.98
-        (points, words), *more = fuse_view(one, others, options)
+        (points, words), *more = fuse_view(one, others, options, stations=stations)
         assert not more
         found = {}
         position = 0

@@ -97,6 +97,7 @@ def arguments(function):
         "vote_depth": {
             "depths": np.zeros((3, H, W), f32),
             "sigmas": np.zeros((3, H, W), f32),
+            "stations": np.array([1, 1, 2], np.int32),
             "tolerance": 3.0,
             "out depth": np.zeros((H, W), f32),
             "out sigma": np.zeros((H, W), f32),
@@ -151,11 +152,19 @@ def arguments(function):
             "out gate": np.zeros(3, u8),
             "out distance": np.zeros(3, f32),
         },
-        "count_points": {**fused_maps(), **verdicts(), "min_views": 1, "first_row": 0, "end_row": H},
+        "count_points": {
+            **fused_maps(),
+            **verdicts(),
+            "min_stations": 1,
+            "stations": every_station(),
+            "first_row": 0,
+            "end_row": H,
+        },
         "write_points": {
             **fused_maps(),
             **verdicts(),
-            "min_views": 1,
+            "min_stations": 1,
+            "stations": every_station(),
             "first_row": 1,
             "end_row": H,
             "world_from_pixel": np.eye(3),
@@ -217,6 +226,11 @@ def arguments(function):
 
 def fused_maps():
     return {"depth": np.ones((H, W), np.float32), "normals": np.ones((3, H, W), np.float32)}
+
+
+def every_station():
+    """Each partner stands alone, and elsewhere than the view."""
+    return np.full(2, 2**64 - 1, np.uint64)
 
 
 def verdicts():
@@ -556,11 +570,32 @@ def test_rows_outside_the_map_are_refused(function, rows):
 
 @pytest.mark.parametrize("least", [-(2**31), 0, 1, 2, 65, 2**31 - 1])
 def test_points_are_counted_for_any_number_of_views(least):
-    values = {**arguments("count_points"), "min_views": least}
+    values = {**arguments("count_points"), "min_stations": least}
     values["agreeing"][0, 0] = 2**64 - 1
     values["covered"][1] = 1
     expected = {1: ((H - 1) * W, 2 * (H - 1) * W + 64), 2: (1, 66), 66: (0, 0)}
     assert call("count_points", values) == expected[min(max(least, 1), 2) if least <= 65 else 66]
+
+
+def test_agreeing_partners_of_one_station_count_as_one():
+    """Bits 0 and 1 stand where the view does, 2 to 4 side by side, 5 and all others each alone."""
+    values = arguments("count_points")
+    values["stations"][:] = (~np.uint64(0b11), ~np.uint64(0b001101))
+    agreeing = [0b000000, 0b000011, 0b000100, 0b011000, 0b011111, 0b100000, 0b111100, 2**63 | 0b100001]
+    stations = [1, 1, 2, 2, 2, 2, 3, 3]
+    for bits, expected in zip(agreeing, stations, strict=True):
+        values["agreeing"][:] = bits
+        for least in range(1, 5):
+            words = H * W * (2 + bits.bit_count())
+            seen = call("count_points", {**values, "min_stations": least})
+            assert seen == ((H * W, words) if least <= expected else (0, 0)), (bits, least)
+
+
+def test_stations_that_do_not_ascend_are_refused():
+    values = arguments("vote_depth")
+    values["stations"][:] = [2, 1, 3]
+    with pytest.raises(ValueError, match="stations must ascend"):
+        call("vote_depth", values)
 
 
 @pytest.mark.parametrize("radius", [-1, 0, 17, 2**31 - 1])
@@ -710,7 +745,9 @@ def test_empty_maps_are_no_work(shape):
     assert not depth.any()
     _native.depth_candidates("scalar", partner, *geometry, empty, empty.copy())
     _native.vote_depth(
-        np.ones((3, *shape), np.float32), np.ones((3, *shape), np.float32), 3.0, empty, empty.copy(), bytes_
+        np.ones((3, *shape), np.float32),
+        np.ones((3, *shape), np.float32),
+        *(np.arange(3, dtype=np.int32), 3.0, empty, empty.copy(), bytes_),
     )
     for reference, other in ((empty, partner), (partner, empty)):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
@@ -739,7 +776,7 @@ def fuse_empty(reference, other, matrix):
     image = np.ones((*other.shape, 3), np.uint8)
     _native.fuse_partner(*maps[0], *maps[1], image, matrix, np.eye(3), 0.5, 0.01, 0.9, True, 63, *verdict)
     assert not any(array.any() for array in verdict)
-    rows = (*maps[0][:2], *verdict, 2, 0, shape[0])
+    rows = (*maps[0][:2], *verdict, 2, every_station(), 0, shape[0])
     assert _native.count_points(*rows) == (0, 0)
     none = np.zeros((0, 27), np.uint8), np.zeros(0, np.uint32)
     _native.write_points(*rows, np.eye(3), np.eye(3), np.zeros(3), np.zeros(65, np.uint32), *none)
@@ -752,7 +789,7 @@ def test_vote_of_no_pairs_is_no_depth():
         np.ones((2, 3), np.uint8),
     )
     none = np.zeros((0, 2, 3), np.float32)
-    _native.vote_depth(none, none, 3.0, depth, sigma, support)
+    _native.vote_depth(none, none, np.zeros(0, np.int32), 3.0, depth, sigma, support)
     assert not depth.any() and not sigma.any() and not support.any()
 
 
@@ -772,7 +809,7 @@ def test_numbers_out_of_this_world_do_not_crash(odd):
             if function == "depth_candidates":
                 values["scales"], values["origins"] = (odd, 100.0), (odd, 0.0)
             if function == "write_points":
-                count = _native.count_points(*list(values.values())[:8])
+                count = _native.count_points(*list(values.values())[:9])
                 values["out points"] = np.zeros((count[0], 27), np.uint8)
                 values["out visibility"] = np.zeros(count[1], np.uint32)
             call(function, values)

@@ -601,8 +601,7 @@ def test_plan_where_no_depth_was_confirmed(method: Any, finished: Finished) -> N
     """There are maps, all of them empty, and there is no cloud."""
     options = replace(
         OPTIONS,
-        vote=VoteOptions(min_support=200),
-        confirm=ConfirmOptions(min_consistent=200),
+        confirm=ConfirmOptions(tolerance=1e-9),
         fusion=FusionOptions(method=method),
     )
     with pytest.raises(NoResultError):

@@ -65,7 +65,7 @@ def run_command(command: RunCommand, terminal: Terminal) -> int:
             project, options, progress=display, overwrite=command.overwrite, verify=command.verify
         )
     print_summary(report, workspace, terminal)
-    return PARTIAL_EXIT_CODE if report.skipped_images else 0
+    return PARTIAL_EXIT_CODE if report.skipped_images or report.incomplete else 0
 
 
 def header(command: object) -> str:
@@ -141,6 +141,17 @@ def print_plan(plan: Plan, workspace: Workspace, terminal: Terminal) -> None:
     )
 
 
+def _share(value: float | None) -> str:
+    return "" if value is None else f"{value:.1%}"
+
+
+def _agreement(report: RunReport) -> str:
+    """How far the depth maps agree with the sparse points."""
+    if report.overall_agreement is None:
+        return "no sparse points to check against"
+    return f"{report.overall_agreement:.1%} of the sparse points agree with the depth maps"
+
+
 def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
     """Print the closing summary of a run.
 
@@ -152,11 +163,15 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     terminal : Terminal
     """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
-    rows = [(name, f"{share:.1%}") for name, share in sorted(listed[:_MAX_LISTED_IMAGES])]
+    rows = [
+        (name, f"{share:.1%}", _share(report.agreement.get(name)))
+        for name, share in sorted(listed[:_MAX_LISTED_IMAGES])
+    ]
     caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images" if len(listed) > len(rows) else ""
-    terminal.table("Depth maps", ["image", "coverage"], rows, caption)
+    terminal.table("Depth maps", ["image", "coverage", "agreement"], rows, caption)
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
     facts = [("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")]
+    facts.append(("agreement", _agreement(report)))
     facts.append(("pairs", f"{report.pairs} matched ({report.pair_source})"))
     facts.append(("cloud", f"{report.points:,} points in {workspace.fused_path}"))
     if any(report.reused.values()):
@@ -169,5 +184,9 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
         for name, reason in skipped.items():
             terminal.say(f"{name}: {reason}", label=f"{what} skipped:", style="yellow")
+    for name, reason in report.incomplete.items():
+        terminal.say(f"{name}: {reason}", label="incomplete:", style="yellow")
+    if report.doubts:
+        terminal.say(report.doubts, label="disagreement:", style="yellow")
     if report.advice:
         terminal.say(report.advice, label="few points:", style="yellow")

@@ -5,6 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import get_args
 
@@ -16,6 +17,8 @@ from colmap_sph.project.state.array_file import SUFFIX
 from colmap_sph.project.state.ownership import Place, cloud_place, map_place
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Scene
+from colmap_sph.stereo.agreement import SparseTracks
+from colmap_sph.stereo.partners.stations import Stations
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +44,16 @@ class Context:
     keys: Keys
     progress: Progress = field(default_factory=Silent)
     report: RunReport = field(default_factory=RunReport)
+
+    @cached_property
+    def stations(self) -> Stations:
+        """Which images stand side by side: what is too near to be matched."""
+        return Stations(self.scene, self.options.pairs.min_triangulation_angle)
+
+    @cached_property
+    def sparse_tracks(self) -> SparseTracks:
+        """Which images observe each sparse point."""
+        return SparseTracks(self.scene)
 
     def pair_path(self, a: str, b: str) -> Path:
         """Disparity map of a pair: named by COLMAP's image ids, since names may hold anything."""
@@ -72,6 +85,11 @@ class Context:
     def stage(self, name: str, total: int) -> AbstractContextManager[None]:
         """Announce a stage of `total` steps, and report its wall time."""
         return timed_stage(name, total, self.progress, self.report)
+
+    def leave_incomplete(self, name: str, reason: str) -> None:
+        """Report that a view's results, or the cloud, had to do without something; the next run tries again."""
+        self.report.incomplete[name] = reason
+        logger.warning("%s incomplete: %s", name, reason)
 
     def skip_view(self, name: str, reason: str) -> None:
         """Report that a view could not be done."""

@@ -10,6 +10,7 @@ from colmap_sph.pipeline.program import program_digest
 from colmap_sph.project.sparse_model import model_files
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.agreement import SparseSights
 from colmap_sph.stereo.rectified_pair import RectifiedPair
 
 # The modules whose code makes each kind of result.
@@ -104,22 +105,27 @@ class Keys:
         cameras = [_camera(view) for view in (left, right)]
         return self._key("pair", images, masks, cameras, geometry, self._options.matching)
 
-    def vote(self, view: View, pair_keys: Sequence[str]) -> str:
-        """Of a photometric estimate, from the keys of its pairs in the order in which they vote."""
+    def vote(self, view: View, pair_keys: Sequence[str], stations: Sequence[int]) -> str:
+        """Of a photometric estimate, from the keys of its pairs and their stations, as they vote."""
         mask = self._mask(view.name)
-        return self._key("vote", _camera(view), mask, pair_keys, self._options.vote)
+        return self._key("vote", _camera(view), mask, pair_keys, stations, self._options.vote)
 
     def photometric(self, vote: str) -> str:
         """Of the photometric maps of the view with this vote."""
         return self._key("photometric", vote, self._options.normals)
 
-    def geometric(self, vote: str, partner_votes: Sequence[str]) -> str:
-        """Of the geometric maps of a view, from its own vote and those of its partners, in their order."""
+    def geometric(
+        self, vote: str, partner_votes: Sequence[str], stations: Sequence[int], sights: SparseSights
+    ) -> str:
+        """Of the geometric maps of a view, from its own vote, and those of its partners with their stations.
+
+        The sparse points have a part in what is known of the maps.
+        """
         # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
         options = (self._options.confirm, self._options.normals, self._options.refinement)
-        return self._key("geometric", vote, partner_votes, *options)
+        return self._key("geometric", vote, partner_votes, stations, sights, *options)
 
-    def cloud(self, maps: Mapping[str, str], partners: Mapping[str, Sequence[str]], scene: Scene) -> str:
+    def cloud(self, maps: Mapping[str, str], partners: Mapping[str, Sequence[object]], scene: Scene) -> str:
         """Of the cloud, from the keys of the geometric maps of the images to fuse.
 
         The photometric maps need none of their own: the key of the geometric ones stands for them, too.
@@ -128,8 +134,8 @@ class Keys:
         ----------
         maps : mapping of str to str
             Key of the maps of each image.
-        partners : mapping of str to sequence of str
-            For each image those in which it is looked up.
+        partners : mapping of str to sequence
+            For each image those in which it is looked up, and their stations.
         scene : Scene
             Where it lies, and how the model numbers its images.
         """

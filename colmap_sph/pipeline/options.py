@@ -1,7 +1,8 @@
 """Options of all stages in one record: what the command line, the Python API and the pipeline share."""
 
 import os
-from dataclasses import dataclass, field, fields, is_dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.control_groups import processors
@@ -66,3 +67,14 @@ class RunOptions:
     def memory_budget(self) -> int:
         """Bytes of memory the run may use."""
         return budget(parse_memory(self.memory))
+
+
+def changed_options(options: RunOptions, stages: Sequence[str]) -> list[str]:
+    """Options of some stages that are not at their defaults, as they are typed: "--vote.tolerance 1.0"."""
+    changed = []
+    for stage in stages:
+        chosen, usual = (asdict(getattr(each, stage)) for each in (options, RunOptions()))
+        changed += [
+            f"--{stage}.{name} {value}".replace("_", "-") for name, value in chosen.items() if value != usual[name]
+        ]
+    return changed

@@ -16,11 +16,13 @@ from typing import Any, Protocol
 
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, timed_stage
+from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.self_check import refuse_disagreement
 from colmap_sph.pipeline.stages.check_images import CheckStage
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
@@ -200,6 +202,7 @@ def reconstruct(
             _verify(context)
         go_through_stages(context, selection.unique_pairs(), execute)
     _write_report(context)
+    refuse_disagreement(report)
     if not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
@@ -237,9 +240,10 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     executor : callable
         What is done with each stage, see `Executor`.
     """
+    check_numbers(context, pairs)
     pair_keys = keys_of(executor(MatchStage(context, pairs)))
-    vote_keys = keys_of(executor(VoteStage(context, pair_keys)))
-    maps = executor(ConfirmStage(context, pair_keys, vote_keys))
+    votes = executor(VoteStage(context, pair_keys))
+    maps = executor(ConfirmStage(context, pair_keys, votes))
     executor(fuse_stage(context, pair_keys, maps))
 
 

@@ -34,6 +34,9 @@ class RunReport:
         Images with depth maps.
     skipped_images : dict
         Image name → why it has no depth map, or is not in the cloud.
+    incomplete : dict
+        Image name → what its results, or the cloud, had to do without for a reason that may pass, such as a file
+        that could not be read. The next run makes them again.
     pair_source : str
         Where the pairs come from.
     pairs : int
@@ -42,6 +45,15 @@ class RunReport:
         "left - right" → why the pair was not matched.
     coverage : dict
         Image name → share of its pixels with a geometric depth.
+    agreement : dict
+        Image name → share of the sparse points it observes that agree with its geometric depth map; None where
+        there are none that tell.
+    overall_agreement : float or None
+        The same of all images together.
+    doubts : str
+        Which images agree with few sparse points, and what that means.
+    refusal : str
+        Where hardly any point agrees over all: why the results mean nothing.
     points : int
         Points of the fused cloud.
     advice : str
@@ -56,10 +68,15 @@ class RunReport:
 
     images: int = 0
     skipped_images: dict[str, str] = field(default_factory=dict)
+    incomplete: dict[str, str] = field(default_factory=dict)
     pair_source: str = ""
     pairs: int = 0
     skipped_pairs: dict[str, str] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)
+    agreement: dict[str, float | None] = field(default_factory=dict)
+    overall_agreement: float | None = None
+    doubts: str = ""
+    refusal: str = ""
     points: int = 0
     advice: str = ""
     made: dict[str, int] = field(default_factory=dict)

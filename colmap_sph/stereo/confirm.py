@@ -3,10 +3,14 @@
 What enough partners confirm and few see through is the *geometric* depth, averaged with theirs.
 """
 
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
@@ -24,8 +28,9 @@ class ConfirmOptions:
     tolerance: float = 4.5
     """Two views' depths agree when they also differ by less than this many standard deviations."""
     min_consistent: int = 2
-    """Views, of those that share a pair with the image, that must confirm a geometric depth; one is enough for a
-    point that no other has in view."""
+    """Views, of those that share a pair with the image, that must confirm a geometric depth; those that stand side
+    by side count as one. One is enough for a point that no other has in view. 0: none need, but none may look
+    through it."""
     max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
     min_contradicting_support: int = 2
@@ -60,6 +65,7 @@ def confirm_depth(
     estimate: DepthEstimate,
     partners: Iterable[tuple[View, DepthEstimate]],
     options: ConfirmOptions,
+    stations: Sequence[int] | None = None,
 ) -> DepthEstimate:
     """Geometric depth of a view: what the depth maps of its partners confirm, averaged with theirs.
 
@@ -71,35 +77,25 @@ def confirm_depth(
     partners : iterable of (View, DepthEstimate)
         Neighbouring views and their photometric depths.
     options : ConfirmOptions
+    stations : sequence of int, optional
+        Number of the station of each partner, equal ones side by side (see `Stations`): partners of one station
+        count as one. Without it each is a station of its own.
 
     Returns
     -------
     DepthEstimate
-        `support` is the number of confirming partners.
+        `support` is the number of confirming stations.
     """
-    shape = estimate.depth.shape
-    observing, agreeing, contradicting = (np.zeros(shape, np.uint8) for _ in range(3))
-    weighted = np.zeros(shape, np.float32)
-    weight = np.zeros(shape, np.float32)
-    for partner, partner_estimate in partners:
-        _native.compare_depths(
-            backend(),
-            estimate.depth,
-            estimate.sigma,
-            partner_estimate.depth,
-            partner_estimate.sigma,
-            partner_estimate.support,
-            pixel_transfer(view, partner),
-            pixel_transfer(partner, view),
-            options.max_reprojection_error,
-            options.tolerance,
-            options.min_contradicting_support,
-            observing,
-            agreeing,
-            contradicting,
-            weighted,
-            weight,
-        )
+    sums = _Sums.empty(estimate.depth.shape)
+    sizes = Counter(stations)
+    numbered = enumerate(partners) if stations is None else zip(stations, partners, strict=True)
+    for number, members in groupby(numbered, key=lambda member: member[0]):
+        has_others = sizes[number] > 1
+        station = _Sums.empty(estimate.depth.shape) if has_others else sums
+        for _, (partner, partner_estimate) in members:
+            _compare(view, estimate, partner, partner_estimate, options, station)
+        if has_others:
+            _add_as_one(station, sums)
     _native.confirm_depth(
         estimate.depth,
         estimate.sigma,
@@ -107,10 +103,62 @@ def confirm_depth(
         options.max_contradiction,
         options.min_surface,
         _STEEPEST / view.K[0, 0],
-        observing,
-        agreeing,
-        contradicting,
-        weighted,
-        weight,
+        *sums,
     )
-    return DepthEstimate(weighted, weight, agreeing)
+    return DepthEstimate(sums.weighted, sums.weight, sums.agreeing)
+
+
+class _Sums(NamedTuple):
+    """Verdicts on every pixel, as `_native.compare_depths` adds them up."""
+
+    observing: NDArray[np.uint8]
+    agreeing: NDArray[np.uint8]
+    contradicting: NDArray[np.uint8]
+    weighted: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+    @classmethod
+    def empty(cls, shape: tuple[int, ...]) -> "_Sums":
+        observing, agreeing, contradicting = (np.zeros(shape, np.uint8) for _ in range(3))
+        weighted, weight = (np.zeros(shape, np.float32) for _ in range(2))
+        return cls(observing, agreeing, contradicting, weighted, weight)
+
+
+def _compare(
+    view: View,
+    estimate: DepthEstimate,
+    partner: View,
+    partner_estimate: DepthEstimate,
+    options: ConfirmOptions,
+    sums: _Sums,
+) -> None:
+    """Add what a partner says of every pixel."""
+    _native.compare_depths(
+        backend(),
+        estimate.depth,
+        estimate.sigma,
+        partner_estimate.depth,
+        partner_estimate.sigma,
+        partner_estimate.support,
+        pixel_transfer(view, partner),
+        pixel_transfer(partner, view),
+        options.max_reprojection_error,
+        options.tolerance,
+        options.min_contradicting_support,
+        *sums,
+    )
+
+
+def _add_as_one(station: _Sums, sums: _Sums) -> None:
+    """Add what the views of one station say as if it were one: what most of them say, with their mean weight."""
+    agrees = 2 * station.agreeing.astype(np.int16) > station.observing
+    contradicts = station.contradicting > station.agreeing
+    for verdict, counts in (
+        (station.observing > 0, sums.observing),
+        (agrees, sums.agreeing),
+        (contradicts, sums.contradicting),
+    ):
+        np.add(counts, 1, out=counts, where=verdict & (counts < np.iinfo(counts.dtype).max))
+    for depths, total in ((station.weighted, sums.weighted), (station.weight, sums.weight)):
+        np.divide(depths, station.agreeing, out=depths, where=agrees)
+        np.add(total, depths, out=total, where=agrees)

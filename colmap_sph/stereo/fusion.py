@@ -6,9 +6,9 @@ its finest image everywhere, and an image is fused from the maps alone: images m
 number of threads, with the maps of few images in memory, and the cloud is the same to the byte.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
 from colmap_sph.scene import POINT, View, pixel_transfer
+from colmap_sph.stereo.partners.stations import OWN_STATION
 
 # A bit for each of them.
 MAX_PARTNERS = 64
@@ -34,7 +35,8 @@ class FusionOptions:
     input: Literal["geometric", "photometric"] = "geometric"
     """Maps to fuse: those that other views confirm, or the unchecked ones, fuller and with more outliers."""
     min_num_pixels: int = 2
-    """Pixels, of different images, that must agree on a point (COLMAP: 5)."""
+    """Pixels, of different images, that must agree on a point (COLMAP: 5). In our own fusion images that stand
+    side by side count as one."""
     max_reproj_error: float = 0.5
     """A pixel makes no point of its own where it projects within this many pixels of the centre of a finer image's
     pixel that agrees. COLMAP's fusion merges pixels this near (COLMAP: 2)."""
@@ -116,9 +118,10 @@ class ViewMaps:
 
 def fuse_view(
     reference: ViewMaps,
-    partners: Iterable[ViewMaps],
+    partners: Iterable[ViewMaps | None],
     options: FusionOptions,
     offset: NDArray[np.float64] | float = 0.0,
+    stations: Sequence[int] | None = None,
 ) -> Iterator[tuple[NDArray[np.void], NDArray[np.uint32]]]:
     """Make the points of a cloud which one view sees better than any other.
 
@@ -131,11 +134,14 @@ def fuse_view(
     Parameters
     ----------
     reference : ViewMaps
-    partners : iterable of ViewMaps
-        At most 64 are looked at, one after the other.
+    partners : iterable of ViewMaps or None
+        At most 64 are looked at, one after the other. None for one that has nothing to say.
     options : FusionOptions
     offset : (3,) float64 ndarray or 0
         Added to the points before they become 32-bit floats.
+    stations : sequence of int, optional
+        Number of the station of each partner, ascending (see `Stations`): partners of one station count as one,
+        and those of the reference's own, 0, not at all. Without it each is a station of its own.
 
     Yields
     ------
@@ -151,6 +157,8 @@ def fuse_view(
     indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
     indices[0] = reference.index
     for bit, partner in enumerate(islice(partners, MAX_PARTNERS)):
+        if partner is None:
+            continue
         indices[1 + bit] = partner.index
         _native.fuse_partner(
             reference.depth,
@@ -173,7 +181,8 @@ def fuse_view(
         )
     view = reference.view
     step = max(_BAND_PIXELS // shape[1], 1)
-    pixels = (reference.depth, reference.normals, covered, agreeing, colour, options.min_num_pixels)
+    gates = (options.min_num_pixels, _station_bits(stations))
+    pixels = (reference.depth, reference.normals, covered, agreeing, colour, *gates)
     world_from_pixel = view.R.T @ np.linalg.inv(view.K)
     world_from_camera = view.R.T
     frame = (np.ascontiguousarray(world_from_pixel), np.ascontiguousarray(world_from_camera), view.center + offset)
@@ -184,3 +193,17 @@ def fuse_view(
         visibility = np.empty(num_words, np.uint32)
         _native.write_points(*pixels, *rows, *frame, indices, points, visibility)
         yield points.view(POINT)[:, 0], visibility
+
+
+def _station_bits(stations: Sequence[int] | None) -> NDArray[np.uint64]:
+    """Bits of partners at other stations than the view's own; last bits of stations, and bits of no partner."""
+    elsewhere = (1 << MAX_PARTNERS) - 1
+    last = elsewhere
+    numbers = [] if stations is None else list(stations)[:MAX_PARTNERS]
+    for bit, (number, following) in enumerate(pairwise(numbers)):
+        if number == following:
+            last &= ~(1 << bit)
+    for bit, number in enumerate(numbers):
+        if number == OWN_STATION:
+            elsewhere &= ~(1 << bit)
+    return np.array([elsewhere, last], dtype=np.uint64)

@@ -1,6 +1,6 @@
 """Which of fusion's gates stops the pixels that do not become points: what to advise where the cloud is thin."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -11,6 +11,7 @@ from colmap_sph import _native
 from colmap_sph.scene import Scene, View, pixel_transfer
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.partners.pairs import overlapping_views
+from colmap_sph.stereo.partners.stations import OWN_STATION
 
 DepthAndNormals = tuple[NDArray[np.float32], NDArray[np.float32]]
 
@@ -26,6 +27,8 @@ class GateLosses:
     ----------
     unseen : float
         No other image has the point in view with a depth there.
+    few : float
+        Some have, but not so many as must agree.
     depth, reprojection, normal : float
         The gate that most often stopped the agreement of a pixel which finds too few others.
     kept : float
@@ -33,27 +36,44 @@ class GateLosses:
     """
 
     unseen: float
+    few: float
     depth: float
     reprojection: float
     normal: float
     kept: float
 
-    def sentence(self) -> str:
-        """What a user should know of it."""
+    def sentence(self, options: FusionOptions, *, poses_fit: bool = False) -> str:
+        """What a user should know of it.
+
+        Parameters
+        ----------
+        options : FusionOptions
+            Those of the fusion.
+        poses_fit : bool
+            Whether the depth maps are known to agree with the sparse points, so that the poses are none to blame.
+        """
+        return (
+            f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
+            f"by no other depth map, {self.few:.0%} by fewer than must agree, and the rest fail the gates of "
+            f"depth ({self.depth:.0%}), reprojection ({self.reprojection:.0%}) and normal ({self.normal:.0%}); "
+            f"{self._remedy(options, poses_fit)}."
+        )
+
+    def _remedy(self, options: FusionOptions, poses_fit: bool) -> str:
         gates = {
             "--fusion.max-depth-error": self.depth,
             "--fusion.max-reproj-error": self.reprojection,
             "--fusion.max-normal-error": self.normal,
         }
-        worst = max(gates, key=lambda name: gates[name])
-        remedy = f"loosen {worst} or --fusion.min-num-pixels first"
-        if self.unseen > sum(gates.values()):
-            remedy = "check the poses, or try --fusion.input photometric, whose maps cover more"
-        return (
-            f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
-            f"by no other depth map, and the rest fail the gates of depth ({self.depth:.0%}), reprojection "
-            f"({self.reprojection:.0%}) and normal ({self.normal:.0%}); {remedy}."
-        )
+        if self.few >= max(self.unseen, sum(gates.values())):
+            return f"lower --fusion.min-num-pixels, which is {options.min_num_pixels}"
+        if self.unseen <= sum(gates.values()):
+            worst = max(gates, key=lambda name: gates[name])
+            return f"loosen {worst} or --fusion.min-num-pixels first"
+        remedies = [] if poses_fit else ["check the poses"]
+        if options.input == "geometric":
+            remedies.append("try --fusion.input photometric, whose maps cover more")
+        return ", or ".join(remedies) or "add images that see the same, or give --fusion.min-num-pixels 1"
 
 
 def explain_losses(
@@ -61,6 +81,7 @@ def explain_losses(
     scene: Scene,
     options: FusionOptions,
     *,
+    partners: Mapping[str, tuple[Sequence[str], Sequence[int]]] | None = None,
     samples: int = 2000,
     max_views: int = 10,
 ) -> GateLosses:
@@ -77,6 +98,9 @@ def explain_losses(
     scene : Scene
         Views with maps.
     options : FusionOptions
+    partners : mapping, optional
+        For each view those that it was fused with, and the numbers of their stations (see `Stations`). Without it
+        those that share most points with it, each a station of its own.
     samples : int
         Pixels per view.
     max_views : int
@@ -86,18 +110,18 @@ def explain_losses(
     -------
     GateLosses
     """
-    overlapping = overlapping_views(scene, min(options.check_num_images, _EXPLAINED_PARTNERS))
+    most = min(options.check_num_images, max(_EXPLAINED_PARTNERS, 2 * options.min_num_pixels))
+    if partners is None:
+        partners = {name: (o, range(1, 1 + len(o))) for name, o in overlapping_views(scene, most).items()}
     counts = np.zeros(len(_Loss))
     for view in scene.views[:: -(-len(scene.views) // max_views)]:
         pixels = _sample_pixels(maps_of(view.name)[0], samples)
-        losses = np.zeros((len(pixels[0]), len(_Loss)), dtype=int)
-        for name in overlapping[view.name]:
-            found = _losses_in(view, maps_of(view.name), scene.view(name), maps_of(name), pixels, options)
-            losses += np.eye(len(_Loss), dtype=int)[found]
-        enough = 1 + losses[:, _Loss.NONE] >= options.min_num_pixels
-        gates = losses[:, _Loss.DEPTH : _Loss.NONE]
-        failed = np.where(gates.any(axis=1), gates.argmax(axis=1) + _Loss.DEPTH, _Loss.UNSEEN)
-        counts += np.bincount(np.where(enough, _Loss.NONE, failed), minlength=len(_Loss))
+        names, stations = partners[view.name]
+        names = names[:most]
+        found = np.full((len(names), len(pixels[0])), _Loss.UNSEEN)
+        for k, name in enumerate(names):
+            found[k] = _losses_in(view, maps_of(view.name), scene.view(name), maps_of(name), pixels, options)
+        counts += np.bincount(_final_losses(found, stations[:most], options), minlength=len(_Loss))
     return GateLosses(*(counts / max(counts.sum(), 1)))
 
 
@@ -105,10 +129,26 @@ class _Loss(IntEnum):
     """What keeps a partner from agreeing with a pixel, in the order of `GateLosses`."""
 
     UNSEEN = 0
-    DEPTH = 1
-    REPROJECTION = 2
-    NORMAL = 3
-    NONE = 4
+    FEW = 1
+    DEPTH = 2
+    REPROJECTION = 3
+    NORMAL = 4
+    NONE = 5
+
+
+def _final_losses(found: NDArray[np.int64], stations: Sequence[int], options: FusionOptions) -> NDArray[np.int64]:
+    """(n,): what keeps each pixel from becoming a point, from what each partner says of it, (partners, n)."""
+    agreeing = np.zeros(found.shape[1], dtype=int)
+    seen = np.zeros_like(agreeing)
+    for station in sorted(set(stations) - {OWN_STATION}):
+        verdicts = found[np.array(stations) == station]
+        agreeing += (verdicts == _Loss.NONE).any(axis=0)
+        seen += (verdicts != _Loss.UNSEEN).any(axis=0)
+    gates = np.array([(found == gate).sum(axis=0) for gate in (_Loss.DEPTH, _Loss.REPROJECTION, _Loss.NORMAL)])
+    failed = np.where(seen > 0, _Loss.FEW, _Loss.UNSEEN)
+    by_gate = (1 + seen >= options.min_num_pixels) & gates.any(axis=0)
+    failed = np.where(by_gate, gates.argmax(axis=0) + _Loss.DEPTH, failed)
+    return np.where(1 + agreeing >= options.min_num_pixels, _Loss.NONE, failed)
 
 
 # Of the codes that the kernel gives.

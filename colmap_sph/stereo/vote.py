@@ -5,7 +5,7 @@ standard deviation from its geometry. The candidates vote: the largest mutually 
 weighted mean is the *photometric* depth.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,7 +34,7 @@ class VoteOptions:
     tolerance: float = 3.0
     """Two candidates agree when they differ by less than this many standard deviations."""
     min_support: int = 1
-    """Pairs that must agree on a photometric depth."""
+    """Pairs that must agree on a photometric depth; those with partners that stand side by side count as one."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
@@ -104,7 +104,9 @@ def depth_candidates(
     return depth, sigma
 
 
-def vote_depth(view: View, pairs: Iterable[PairDisparity], options: VoteOptions) -> DepthEstimate:
+def vote_depth(
+    view: View, pairs: Iterable[PairDisparity], options: VoteOptions, stations: Sequence[int] | None = None
+) -> DepthEstimate:
     """Photometric depth of a view: the vote of all its pairs.
 
     Parameters
@@ -113,6 +115,9 @@ def vote_depth(view: View, pairs: Iterable[PairDisparity], options: VoteOptions)
     pairs : iterable of PairDisparity
         Pairs in which the view is the left or the right image.
     options : VoteOptions
+    stations : sequence of int, optional
+        Number of the station of each pair's partner, ascending (see `Stations`): partners of one station have one
+        vote. Without it each is a station of its own.
 
     Returns
     -------
@@ -142,6 +147,7 @@ def vote_depth(view: View, pairs: Iterable[PairDisparity], options: VoteOptions)
             sources.append((right_disparity(pair, options.max_disparity_step), pair.geometry, "right"))
     shape = (view.height, view.width)
     voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
+    numbers = np.arange(len(sources)) if stations is None else np.asarray(stations)
     step = max(_BAND_BYTES // (8 * view.width * max(len(sources), 1)), 1)
     for first in range(0, view.height if sources else 0, step):
         rows = slice(first, first + step)
@@ -149,6 +155,7 @@ def vote_depth(view: View, pairs: Iterable[PairDisparity], options: VoteOptions)
         _native.vote_depth(
             np.stack([depth for depth, _ in candidates]),
             np.stack([sigma for _, sigma in candidates]),
+            numbers.astype(np.int32),
             options.tolerance,
             voted.depth[rows],
             voted.sigma[rows],

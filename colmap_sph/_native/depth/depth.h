@@ -118,14 +118,15 @@ add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add
 void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
                         float max_step, float *right);
 
-/* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. */
-void vote_depth(const float *depths, const float *sigmas, ptrdiff_t count, ptrdiff_t pixels, float tolerance,
-                float *depth, float *sigma, uint8_t *support);
+/* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. Candidates of
+ * one station count as one; `stations` has the number of each candidate's, ascending. */
+void vote_depth(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t count,
+                ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support);
 
 enum { SURFACE_RADIUS = 3 };
 
 typedef struct {
-    int min_consistent;      /* views that must agree, or all that have the point in view; one at least */
+    int min_consistent;      /* views that must agree, or all that see the point's place, one at least; 0: none */
     float max_contradiction; /* most that look through it, per agreeing view */
     float min_surface;       /* least share of the window that must be on the surface where one view agrees */
     float steepest;          /* largest relative change of depth per pixel there */

@@ -64,21 +64,31 @@ FUNCTION(depth_candidates, DEPTH_CANDIDATES, any,
 #define VOTE_DEPTH(X) \
     X(IN, float32, depths, PAIRS, H, W) \
     X(IN, float32, sigmas, PAIRS, H, W) \
+    X(IN, int32, stations, PAIRS) \
     X(VALUE, float, tolerance) \
     X(OUT, float32, depth, H, W) \
     X(OUT, float32, sigma, H, W) \
     X(OUT, uint8, support, H, W)
 ARGUMENTS(vote_depth, VOTE_DEPTH);
 
+static int check_vote_depth(const void *arguments) {
+    const vote_depth_arguments *a = arguments;
+    int ascending = 1;
+    for (ptrdiff_t k = 1; k < a->size.PAIRS; k++) {
+        ascending &= a->stations[k - 1] <= a->stations[k];
+    }
+    return check(ascending, "the stations must ascend");
+}
+
 static int run_vote_depth(void *arguments) {
     const vote_depth_arguments *a = arguments;
-    vote_depth(a->depths, a->sigmas, a->size.PAIRS, a->size.H * a->size.W, a->tolerance, a->depth, a->sigma,
-               a->support);
+    vote_depth(a->depths, a->sigmas, a->stations, a->size.PAIRS, a->size.H * a->size.W, a->tolerance, a->depth,
+               a->sigma, a->support);
     return 0;
 }
 
-FUNCTION(vote_depth, VOTE_DEPTH, any,
-         "The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size.");
+FUNCTION(vote_depth, VOTE_DEPTH, check_vote_depth,
+         "The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size in stations.");
 
 #define COMPARE_DEPTHS(X) \
     X(VALUE, backend, backend) \

@@ -106,7 +106,8 @@ FUNCTION(
     X(IN, uint8, covered, H, W) \
     X(IN, uint64, agreeing, H, W) \
     X(IN, uint16, colour, H, W, 3) \
-    X(VALUE, int, min_views) \
+    X(VALUE, int, min_stations) \
+    X(IN, uint64, stations, 2) \
     X(VALUE, ptrdiff, first_row) \
     X(VALUE, ptrdiff, end_row)
 
@@ -134,7 +135,7 @@ static int check_rows(ptrdiff_t first_row, ptrdiff_t end_row, ptrdiff_t height) 
 #define FUSED_ROWS_OF(a) \
     {&(view_maps){(a)->depth, (a)->normals, (a)->size.H, (a)->size.W, {0}}, \
      &(fusion_verdict){(uint8_t *)(a)->covered, (uint64_t *)(a)->agreeing, (uint16_t *)(a)->colour}, \
-     (a)->first_row, (a)->end_row, (a)->min_views}
+     (a)->first_row, (a)->end_row, (a)->min_stations, (a)->stations[0], (a)->stations[1]}
 
 static int check_count_points(const void *arguments) {
     const count_points_arguments *a = arguments;

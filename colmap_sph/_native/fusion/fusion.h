@@ -49,13 +49,15 @@ void find_gates(const view_maps *reference, const view_maps *partner, const fusi
 void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
                   const fusion_transfer *transfer, fusion_gates gates, int bit, const fusion_verdict *verdict);
 
-/* Rows of a view's pixels that are to become points: not covered, and seen by this many views, itself among them.
- */
+/* Rows of a view's pixels that are to become points: not covered, and seen from this many stations, its own among
+ * them. Partners of one station have bits beside each other. */
 typedef struct {
     const view_maps *maps;
     const fusion_verdict *verdict; /* which is only read */
     ptrdiff_t first_row, end_row;
-    int min_views;
+    int min_stations;
+    uint64_t elsewhere; /* bits of the partners that are not of the view's own station */
+    uint64_t last;      /* the last bit of each station, and all bits without a partner */
 } fused_rows;
 
 enum { POINT_BYTES = 6 * 4 + 3 };

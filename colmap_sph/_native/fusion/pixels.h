@@ -14,11 +14,19 @@ static inline direction normal_at(const view_maps *maps, ptrdiff_t pixel) {
     return (direction){n[0], n[plane], n[2 * plane]};
 }
 
+/* Number of stations, other than the view's own, with an agreeing partner. Where any bit of a station is set below its
+ * last, adding ones at all bits below carries into the last. */
+static inline int other_stations(const fused_rows *rows, uint64_t agreeing) {
+    const uint64_t bits = agreeing & rows->elsewhere, last = rows->last;
+    return __builtin_popcountll((((bits & ~last) + ~last) | bits) & last);
+}
+
 /* Number of views that see this pixel's point; 0: it does not become one. */
 static inline int views_of_point(const fused_rows *rows, ptrdiff_t pixel) {
-    const int views = 1 + __builtin_popcountll(rows->verdict->agreeing[pixel]);
+    const uint64_t agreeing = rows->verdict->agreeing[pixel];
     const int is_point = rows->maps->depth[pixel] > 0 && !rows->verdict->covered[pixel];
-    return is_point && views >= rows->min_views ? views : 0;
+    const int is_seen = 1 + other_stations(rows, agreeing) >= rows->min_stations;
+    return is_point && is_seen ? 1 + __builtin_popcountll(agreeing) : 0;
 }
 
 #endif

@@ -1,7 +1,7 @@
 """What is known of a cloud: its record, its number of points, and advice where these are few."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,10 +12,12 @@ from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.project.files import read_small, sync_file, sync_folder, whole_digest
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
+from colmap_sph.project.masks import read_mask
 from colmap_sph.project.pair_lists import fusion_cfg, write_fusion_cfg
 from colmap_sph.project.sparse_model import image_names, load_model
 from colmap_sph.project.state.ownership import fusion_cfg_place
 from colmap_sph.project.state.records import begin, claim, vouch, vouched_facts
+from colmap_sph.project.workspace import mask_path
 from colmap_sph.stereo.fusion_losses import DepthAndNormals, explain_losses
 
 if TYPE_CHECKING:
@@ -27,6 +29,10 @@ logger = logging.getLogger(__name__)
 _FEW_POINTS = 0.02
 # Most of them can be confirmed, and the cloud is thin all the same, where many images see each piece of surface.
 _MOSTLY = 0.5
+# So large a share of pixels under the user's masks explains it; poses whose depth maps agree with so large a share
+# of the sparse points do not.
+_MOSTLY_MASKED = 0.9
+_FITTING = 0.5
 # Bytes of maps in memory meanwhile.
 _CACHE_BYTES = 1 << 30
 _MAX_LIST_BYTES = 1 << 26
@@ -113,7 +119,12 @@ def report_cloud(context: "Context", facts: CloudFacts) -> None:
         logger.warning("Only %d points survived fusion. %s", facts.points, facts.advice)
 
 
-def facts_of_cloud(context: "Context", names: Sequence[str], points: int) -> CloudFacts:
+def facts_of_cloud(
+    context: "Context",
+    names: Sequence[str],
+    points: int,
+    partners: Mapping[str, tuple[Sequence[str], Sequence[int]]] | None = None,
+) -> CloudFacts:
     """Find out what is to be known of a cloud: where few pixels became points, which gate to loosen.
 
     Parameters
@@ -124,6 +135,8 @@ def facts_of_cloud(context: "Context", names: Sequence[str], points: int) -> Clo
         Images that were fused.
     points : int
         Points of the cloud.
+    partners : mapping, optional
+        See `explain_losses`.
 
     Returns
     -------
@@ -137,11 +150,31 @@ def facts_of_cloud(context: "Context", names: Sequence[str], points: int) -> Clo
         return CloudFacts(points, "")
     maps: LoadCache[DepthAndNormals] = LoadCache(lambda pair: pair[0].nbytes + pair[1].nbytes)
 
+    with_depth, masked = 0, 0
+
     def read(name: str) -> DepthAndNormals:
+        nonlocal with_depth, masked
         files = context.map_files(name, options.input)
-        return read_depth_map(files.depth), read_normal_planes(files.normals)
+        depth = read_depth_map(files.depth)
+        found = int((depth > 0).sum())
+        if options.mask_path is not None:
+            view = context.scene.view(name)
+            mask = read_mask(mask_path(options.mask_path, name), view.width, view.height)
+            if mask is not None:
+                depth[mask == 0] = 0
+        with_depth += found
+        masked += found - int((depth > 0).sum())
+        return depth, read_normal_planes(files.normals)
 
     with maps.holding(_CACHE_BYTES):
-        losses = explain_losses(lambda name: maps.get(name, lambda: read(name)), scene, options)
+        losses = explain_losses(lambda name: maps.get(name, lambda: read(name)), scene, options, partners=partners)
+    if masked > _MOSTLY_MASKED * with_depth:
+        share = masked / with_depth
+        return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {share:.0%}.")
     many = points > 0 and losses.kept > _MOSTLY
-    return CloudFacts(points, "" if many else losses.sentence())
+    return CloudFacts(points, "" if many else losses.sentence(options, poses_fit=_poses_fit(context)))
+
+
+def _poses_fit(context: "Context") -> bool:
+    agreement = context.report.overall_agreement
+    return agreement is not None and agreement > _FITTING

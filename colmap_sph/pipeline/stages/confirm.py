@@ -11,13 +11,17 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.options import changed_options
+from colmap_sph.pipeline.self_check import report_agreement
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate
-from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import read_whole_grey
+from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
+from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
@@ -56,10 +60,13 @@ class EstimateFile:
 
 @dataclass(frozen=True, eq=False)
 class ConfirmTask:
-    """A view and its partners, and where its geometric maps go."""
+    """A view and its partners, its sparse points and mask, and where its geometric maps go."""
 
     reference: EstimateFile
     partners: tuple[EstimateFile, ...]
+    stations: tuple[int, ...]
+    sights: SparseSights
+    mask: Path
     confirm_options: ConfirmOptions
     normal_options: NormalOptions
     refinement_options: RefinementOptions
@@ -71,12 +78,14 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     """Confirm a view's depth by its partners' and refine it on their images; writes its geometric maps."""
     view = task.reference.view
     others = ((partner.view, _estimate(partner)) for partner in task.partners)
-    confirmed = confirm_depth(view, _estimate(task.reference), others, task.confirm_options)
+    confirmed = confirm_depth(view, _estimate(task.reference), others, task.confirm_options, task.stations)
     planes = fit_normals(view, confirmed, task.normal_options)
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
         planes = refine_maps(view, _image(task.reference), confirmed, *planes, sources, task.refinement_options)
-    return task.maps.write(*planes, task.key)
+    mask = read_mask(task.mask, view.width, view.height)
+    normals, depth = planes
+    return task.maps.write(normals, depth, task.key, compare_with_sparse(view, depth, task.sights, mask))
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
@@ -93,20 +102,26 @@ class ConfirmStage(Stage[str, ConfirmTask]):
     name = "confirm depth"
     make = staticmethod(make_geometric_maps)
 
-    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], vote_keys: Mapping[str, str]) -> None:
-        super().__init__(context, [view.name for view in context.scene.views if view.name in vote_keys])
-        self._vote_keys = vote_keys
+    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], votes: Mapping[str, Result]) -> None:
+        super().__init__(context, [view.name for view in context.scene.views if view.name in votes])
+        self._vote_keys = keys_of(votes)
+        self._voted = {name: result.facts.coverage for name, result in votes.items()}
         self._all_partners = partners_of(pair_keys)
 
     def job(self, item: str) -> Job[ConfirmTask]:
         """See `Stage.job`."""
         options = self.context.options
-        partners = self._partners(item)
-        key = self.context.keys.geometric(self._vote_keys[item], [self._vote_keys[name] for name in partners])
+        partners, stations = self.context.stations.elsewhere(item, self._partners(item))
+        votes = [self._vote_keys[name] for name in partners]
+        sights = self.context.sparse_tracks.sights(item)
+        key = self.context.keys.geometric(self._vote_keys[item], votes, stations, sights)
         maps = self.context.map_files(item, "geometric")
         task = ConfirmTask(
             self._estimate_file(item),
             tuple(map(self._estimate_file, partners)),
+            tuple(stations),
+            sights,
+            self.context.workspace.mask_path(item),
             options.confirm,
             options.normals,
             options.refinement,
@@ -155,17 +170,35 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         report = self.context.report
         names = [view.name for view in self.context.scene.views]
         report.coverage = {name: results[name].facts.coverage if name in results else 0.0 for name in names}
+        report_agreement(report, {name: result.facts.agreement for name, result in results.items()})
         report.images = sum(share > 0 for share in report.coverage.values())
         failures = [report.skipped_images[name] for name in names if name in report.skipped_images]
         if failures and not report.images:
             raise NoResultError(f"No image has a depth map ({failures[0]})")
         for name in (name for name, share in report.coverage.items() if share == 0):
-            paired = "no depth of it is confirmed by another image"
-            reason = paired if name in self._all_partners else "no pair of it could be matched"
-            report.skipped_images.setdefault(name, reason)
+            report.skipped_images.setdefault(name, self._why_empty(name))
         if not report.images:
-            masked = self.context.workspace.masks_dir.is_dir()
-            raise NoResultError(
-                "No depth was confirmed by a second image; are the model's poses right for these images"
-                + (", and is black in the masks what is to be ignored?" if masked else "?")
-            )
+            raise NoResultError(self._why_nothing())
+
+    def _why_empty(self, name: str) -> str:
+        """Why an image has no depth, as far as it is known."""
+        if name not in self._all_partners:
+            return "no pair of it could be matched"
+        if self._voted.get(name, 0.0) > 0:
+            return "no depth of it is confirmed by another image"
+        mask = self.context.workspace.mask_path(name)
+        return "its mask may leave nothing of it" if mask.is_file() else "no pair of it found any depth"
+
+    def _why_nothing(self) -> str:
+        """Why no image has a depth, and what to look at first."""
+        changed = changed_options(
+            self.context.options, ("rectification", "matching", "vote", "confirm", "normals")
+        )
+        found = any(share > 0 for share in self._voted.values())
+        what = "No depth was confirmed by a second image" if found else "No pair of images found any depth"
+        questions = ["are the model's poses right for these images?"]
+        if self.context.workspace.masks_dir.is_dir():
+            questions.append("is black in the masks what is to be ignored?")
+        if changed:
+            questions.insert(0, f"is it the same without {', '.join(changed)}?")
+        return f"{what}; {' '.join(questions)}"

@@ -5,7 +5,7 @@ Every image is fused into a part of the cloud, and the parts are joined; or COLM
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,7 @@ from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.partners.pairing import Pair, partners_of
 from colmap_sph.stereo.partners.pairs import overlapping_views
+from colmap_sph.stereo.partners.stations import OWN_STATION, Stations, by_station
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -62,6 +63,9 @@ _FUSE_BYTES = 60.0
 _COLMAP_BYTES = 80.0
 _COLMAP_MASK_BYTES = 0.1
 
+# Images that share most points are looked at for those of different stations, as often as images to fuse.
+_CANDIDATES = 4
+
 _maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 
 
@@ -71,6 +75,7 @@ class FuseTask:
 
     reference: MapSources
     partners: tuple[MapSources, ...]
+    stations: tuple[int, ...]
     options: FusionOptions
     offset: NDArray[np.float64]
     stem: Path
@@ -78,8 +83,11 @@ class FuseTask:
 
 def make_cloud_part(task: FuseTask) -> Facts:
     """Fuse a view; writes the points of the cloud which it sees better than any other."""
-    bands = fuse_view(_view_maps(task.reference), _partner_maps(task.partners), task.options, task.offset)
-    return Facts(points=write_part(task.stem, bands))
+    reference = _view_maps(task.reference)
+    unread: dict[str, str] = {}
+    partners = _partner_maps(task.partners, unread)
+    bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
+    return Facts(points=write_part(task.stem, bands), unread=unread)
 
 
 def _view_maps(sources: MapSources) -> ViewMaps:
@@ -88,10 +96,15 @@ def _view_maps(sources: MapSources) -> ViewMaps:
     return _maps.get(f"{sources.index} {stamps}", lambda: read_view_maps(sources))
 
 
-def _partner_maps(partners: Sequence[MapSources]) -> Iterator[ViewMaps]:
+def _partner_maps(partners: Sequence[MapSources], unread: dict[str, str]) -> Iterator[ViewMaps | None]:
+    """Maps of the partners; None for one whose maps cannot be read, and the reason in `unread`."""
     for sources in partners:
-        with suppress(InputError):  # reported where it is the reference
-            yield _view_maps(sources)
+        try:
+            maps = _view_maps(sources)
+        except InputError as error:
+            unread[sources.view.name] = str(error)
+            maps = None
+        yield maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,12 +171,13 @@ class FuseStage(Stage[str, FuseTask]):
         scene = self.context.scene
         view = scene.view(item)
         pixels = view.num_pixels
-        partners = self._partners[item]
+        partners, stations = self._partners[item]
         seconds = _SECONDS + _PARTNER_SECONDS * len(partners)
         cost = Cost(seconds * pixels / 1e6, _FUSE_BYTES * pixels, _CLOUD_BYTES * pixels)
         task = FuseTask(
             self._sources(item),
             tuple(map(self._sources, partners)),
+            tuple(stations),
             self.context.options.fusion,
             scene.anchor,
             self._stem(item),
@@ -213,10 +227,29 @@ class FuseStage(Stage[str, FuseTask]):
                 raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
             points = sum(result.facts.points for result in results.values())
             self._put_together([self._stem(name) for name in results], points)
-            self._known = facts_of_cloud(context, list(results), points)
-            if len(results) == len(self.items):
+            self._known = facts_of_cloud(context, list(results), points, self._partners_among(results))
+            if len(results) == len(self.items) and not self._report_unread(results):
                 vouch_for_cloud(context, self._key, self._known)
         report_cloud(context, self._known)
+
+    def _partners_among(self, results: Mapping[str, Result]) -> dict[str, tuple[list[str], list[int]]]:
+        """The partners of the images that were fused, less those that were not."""
+        among = {}
+        for name in results:
+            kept = [
+                (other, number) for other, number in zip(*self._partners[name], strict=True) if other in results
+            ]
+            among[name] = ([other for other, _ in kept], [number for _, number in kept])
+        return among
+
+    def _report_unread(self, results: Mapping[str, Result]) -> bool:
+        """Report images whose maps could not be read while others were fused; whether there are any."""
+        unread = {name: reason for result in results.values() for name, reason in result.facts.unread.items()}
+        for name, reason in sorted(unread.items()):
+            if name in self.context.report.skipped_images:  # reported where it was to be fused itself
+                continue
+            self.context.leave_incomplete(name, f"the cloud lacks its agreement with other images: {reason}")
+        return bool(unread)
 
     def _put_together(self, stems: list[Path], points: int) -> None:
         """Make the cloud of its parts, and move it to its place."""
@@ -262,16 +295,30 @@ def _warn_of_masks(context: "Context") -> None:
 
 def _partners_in_fusion(
     context: "Context", pair_keys: Mapping[Pair, str], names: Sequence[str]
-) -> dict[str, list[str]]:
-    """For each image to fuse the others that may see the same: those that share most points, and its pairs'."""
+) -> dict[str, tuple[list[str], list[int]]]:
+    """For each image to fuse the others that may see the same: those that share most points, and its pairs'.
+
+    With them come the numbers of their stations, which ascend.
+    """
     most = min(context.options.fusion.check_num_images, MAX_PARTNERS)
-    overlapping = overlapping_views(context.scene, most)
+    overlapping = overlapping_views(context.scene, _CANDIDATES * most)
     matched = partners_of(pair_keys)  # a pair that the user asked for may share no point
     fused = set(names)
-    return {
-        name: [o for o in dict.fromkeys([*overlapping[name], *matched.get(name, [])]) if o in fused][:most]
-        for name in names
-    }
+    partners = {}
+    for name in names:
+        others = [o for o in dict.fromkeys([*overlapping[name], *matched.get(name, [])]) if o in fused]
+        partners[name] = _some_of_each_station(context.stations, name, others, most)
+    return partners
+
+
+def _some_of_each_station(
+    stations: Stations, name: str, others: list[str], most: int
+) -> tuple[list[str], list[int]]:
+    """At most so many images, the first of each station before the rest, in the order of their stations."""
+    numbers = stations.numbers(name, others)
+    firsts = {number: k for k, number in reversed(list(enumerate(numbers))) if number != OWN_STATION}
+    chosen = list(dict.fromkeys([*sorted(firsts.values()), *range(len(others))]))[:most]
+    return by_station([others[k] for k in sorted(chosen)], [numbers[k] for k in sorted(chosen)])
 
 
 class ColmapFuseStage(Stage[str, ColmapFuseTask]):

@@ -1,6 +1,6 @@
 """A view's depth and normal map on disk, vouched for by a record."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.state.records import begin, vouch, vouched_facts, whole_digests
+from colmap_sph.stereo.agreement import Agreement
 
 MAP_BYTES = 16.0
 """Bytes on disk per pixel, of a depth and a normal map."""
@@ -18,9 +19,16 @@ MAP_BYTES = 16.0
 
 @dataclass(frozen=True)
 class MapFacts:
-    """What the record of maps says of them: the share of pixels with a depth."""
+    """What the record of maps says of them: the share of pixels with a depth, and the `Agreement`."""
 
     coverage: Annotated[float, Meta(ge=0, le=1)]
+    tested: Annotated[int, Meta(ge=0)]
+    found: Annotated[int, Meta(ge=0)]
+    agreeing: Annotated[int, Meta(ge=0)]
+
+    def as_facts(self) -> Facts:
+        """The same as facts of a stage."""
+        return Facts(self.coverage, Agreement(self.tested, self.found, self.agreeing))
 
 
 @dataclass(frozen=True)
@@ -31,7 +39,13 @@ class MapFiles:
     normals: Path
     record: Path
 
-    def write(self, normals: NDArray[np.float32], depth: NDArray[np.float32], key: str) -> Facts:
+    def write(
+        self,
+        normals: NDArray[np.float32],
+        depth: NDArray[np.float32],
+        key: str,
+        agreement: Agreement | None = None,
+    ) -> Facts:
         """Write both maps.
 
         Parameters
@@ -40,23 +54,25 @@ class MapFiles:
             See `write_normal_map` and `write_depth_map`.
         key : str
             Under which they are vouched for.
+        agreement : Agreement, optional
+            Of the depth map with the sparse points.
 
         Returns
         -------
         Facts
-            With the share of pixels with a depth.
+            With the share of pixels with a depth, and the agreement.
         """
         begin(self.record, [self.depth, self.normals])
         digests = {self.depth: write_depth_map(self.depth, depth)}
         digests[self.normals] = write_normal_map(self.normals, normals)
-        facts = MapFacts(float((depth > 0).mean()))
+        facts = MapFacts(float((depth > 0).mean()), **asdict(agreement or Agreement()))
         vouch(self.record, key, digests, facts)
-        return Facts(coverage=facts.coverage)
+        return facts.as_facts()
 
     def facts(self, key: str) -> Facts | None:
         """What is known of the maps, or None where they must be made."""
         known = vouched_facts(self.record, key, [self.depth, self.normals], MapFacts)
-        return None if known is None else Facts(coverage=known.coverage)
+        return None if known is None else known.as_facts()
 
     def digests(self) -> tuple[str, ...] | None:
         """Of the whole depth map and the whole normal map, as they were written; None of maps of others."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import NoResultError
+from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import is_pair_there, write_pair
@@ -111,12 +111,13 @@ class MatchStage(Stage[Pair, MatchTask]):
     def __init__(self, context: "Context", pairs: Sequence[Pair]) -> None:
         super().__init__(context, pairs)
         self._scratch_bytes = _SCRATCH_BYTES
+        self._unfit: set[Pair] = set()
 
     def job(self, item: Pair) -> Job[MatchTask]:
         """See `Stage.job`; `RectificationError` for a pair that cannot be rectified."""
         context = self.context
         left, right = (context.scene.view(name) for name in item)
-        geometry = rectify_pair(context.scene, left, right, context.options.rectification)
+        geometry = self._geometry(left, right)
         key = context.keys.pair(left, right, geometry)
         target = context.pair_path(*item)
         left_pixels = geometry.height * geometry.left_width
@@ -139,6 +140,13 @@ class MatchStage(Stage[Pair, MatchTask]):
         is_there = is_pair_there(target, key, left.name, right.name, geometry)
         return Job(key, Facts() if is_there else None, cost, task)
 
+    def _geometry(self, left: View, right: View) -> RectifiedPair:
+        try:
+            return rectify_pair(self.context.scene, left, right, self.context.options.rectification)
+        except RectificationError:
+            self._unfit.add((left.name, right.name))
+            raise
+
     def _photo(self, view: View) -> PhotoFile:
         workspace = self.context.workspace
         return PhotoFile(view.without_points(), workspace.image_path(view.name), workspace.mask_path(view.name))
@@ -151,6 +159,9 @@ class MatchStage(Stage[Pair, MatchTask]):
         """See `Stage.skip`."""
         self.context.report.skipped_pairs[" - ".join(item)] = reason
         logger.warning("%s - %s skipped: %s", *item, reason)
+        if item not in self._unfit:  # for a reason that may pass
+            for name in item:
+                self.context.leave_incomplete(name, f"a pair of it was not matched: {reason}")
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """Scratch memory and caches take of what the largest pair leaves, but never starve."""

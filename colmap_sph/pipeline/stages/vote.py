@@ -21,7 +21,7 @@ from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
-from colmap_sph.stereo.partners.pairing import Pair, pairs_by_image
+from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ class VoteTask:
     mask: Path
     estimate: Path
     is_voted: bool
+    stations: tuple[int, ...]
     vote_options: VoteOptions
     normal_options: NormalOptions
     maps: MapFiles
@@ -61,7 +62,8 @@ def make_photometric_maps(task: VoteTask) -> Facts:
 
 
 def _vote(task: VoteTask) -> DepthEstimate:
-    estimate = vote_depth(task.view, (read_pair(file) for file in task.pairs), task.vote_options)
+    pairs = (read_pair(file) for file in task.pairs)
+    estimate = vote_depth(task.view, pairs, task.vote_options, task.stations)
     mask = read_mask(task.mask, task.view.width, task.view.height)
     if mask is not None:
         # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
@@ -79,15 +81,16 @@ class VoteStage(Stage[str, VoteTask]):
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str]) -> None:
         super().__init__(context, [view.name for view in context.scene.views])
         self._pair_keys = pair_keys
-        self._pairs = pairs_by_image(pair_keys)
+        self._partners = partners_of(pair_keys)
 
     def job(self, item: str) -> Job[VoteTask]:
         """See `Stage.job`."""
         context = self.context
         view = context.scene.view(item)
-        pairs = self._pairs.get(item, [])
-        files = tuple(context.pair_path(*pair) for pair in pairs)
-        key = context.keys.vote(view, [self._pair_keys[pair] for pair in pairs])
+        partners, stations = context.stations.elsewhere(item, self._partners.get(item, []))
+        files = tuple(context.pair_path(item, partner) for partner in partners)
+        pair_keys = [self._pair_keys[as_pair(item, partner)] for partner in partners]
+        key = context.keys.vote(view, pair_keys, stations)
         maps_key = context.keys.photometric(key)
         estimate = context.estimate_path(item)
         maps = context.map_files(item, "photometric")
@@ -98,6 +101,7 @@ class VoteStage(Stage[str, VoteTask]):
             context.workspace.mask_path(item),
             estimate,
             is_voted,
+            tuple(stations),
             context.options.vote,
             context.options.normals,
             maps,

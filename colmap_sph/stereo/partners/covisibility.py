@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_sph.scene import Scene
-from colmap_sph.stereo.partners.frusta import observe_frusta, observe_points
+from colmap_sph.stereo.partners.frusta import points_in_view
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles, worth_of
 
 logger = logging.getLogger(__name__)
@@ -79,6 +79,10 @@ class Covisibility:
             self._angles[key] = self._compute_angle(*key)
         return self._angles[key]
 
+    def seen_by(self, i: int) -> NDArray[np.float64]:
+        """Return the (n, 3) points that view `i` observes or has in view."""
+        return self._points[self._observed[i]]
+
     def worth(self, i: int, j: int) -> NDArray[np.float32]:
         """Return how well view `j` would serve the points of view `i`, or an even part of them."""
         rows = self._observed[i]
@@ -125,20 +129,10 @@ def find_covisibility(
     -------
     Covisibility
     """
-    finite = np.asarray(np.isfinite(scene.points).all(axis=1))
-    posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
-    observed = [
-        view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
-        for view, good in zip(scene.views, posed, strict=True)
-    ]
-    if any(len(indices) for indices in observed):
-        weights = _shared_points(observed, len(scene.points), min_shared_points)
-        return Covisibility(scene, "tracks", weights, scene.points, observed)
-    points = scene.points[finite]
-    if len(points):
-        observed = observe_points(scene, points)
-    else:
-        points, observed = observe_frusta(scene)
+    points, observed, has_tracks = points_in_view(scene)
+    if has_tracks:
+        weights = _shared_points(observed, len(points), min_shared_points)
+        return Covisibility(scene, "tracks", weights, points, observed)
     if matches is not None:
         weights = _match_counts(scene, matches, min_shared_points)
         if weights.nnz:

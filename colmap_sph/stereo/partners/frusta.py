@@ -25,6 +25,36 @@ _NUM_TESTED = 256
 _MAX_POINTS = 20_000
 
 
+def points_in_view(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.int64]], bool]:
+    """Find what each view sees: the points that it observes, or where none observes any, what its frustum holds.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    Returns
+    -------
+    points : (N, 3) float64 ndarray
+        World frame: the scene's, or samples of the frusta.
+    observed : list of (n,) int64 ndarray
+        For every view the ascending rows of `points` that it observes or has in view.
+    has_tracks : bool
+        Whether the views observe them.
+    """
+    finite = np.asarray(np.isfinite(scene.points).all(axis=1))
+    posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
+    observed = [
+        view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
+        for view, good in zip(scene.views, posed, strict=True)
+    ]
+    if any(len(indices) for indices in observed):
+        return scene.points, observed, True
+    points = scene.points[finite]
+    if len(points):
+        return points, observe_points(scene, points), False
+    return *observe_frusta(scene), False
+
+
 def observe_points(scene: Scene, points: NDArray[np.float64]) -> list[NDArray[np.int64]]:
     """Return for every view the rows of (N, 3) `points` which project into it.
 

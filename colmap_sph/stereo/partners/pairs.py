@@ -18,12 +18,15 @@ from colmap_sph.scene import Scene, SourceImages
 from colmap_sph.stereo.partners.covisibility import Covisibility, CovisibilitySource, find_covisibility
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.partner_choice import choose
+from colmap_sph.stereo.partners.stations import StationCounter
 
 logger = logging.getLogger(__name__)
 
 PairSource = CovisibilitySource | Literal["patch-match.cfg"]
 # Candidates that a view chooses from, unless it is to have more.
 _MAX_CANDIDATES = 100
+# So many times as many may stand beside these.
+_MAX_BESIDE = 10
 
 
 @dataclass(frozen=True)
@@ -173,13 +176,19 @@ def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
 
 
 def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[Partner, ...]:
-    """Return the best partners of view `i`: those that together see most of it, then those under a wide angle."""
+    """Return the best partners of view `i`.
+
+    These are the ones that together see most of it, then those under a wide angle, and last those that stand
+    beside one of these.
+    """
     near: list[Partner] = []
     wide: list[Partner] = []
+    beside: list[Partner] = []
     worths: list[NDArray[np.float32]] = []
     most = max(_MAX_CANDIDATES, options.num_pairs)
+    stations = StationCounter(graph.seen_by(i), graph.scene.views[i], options.min_triangulation_angle)
     for j, weight in zip(*graph.candidates(i), strict=True):
-        if len(near) == most or len(near) + len(wide) == 2 * most:
+        if len(near) == most or len(near) + len(wide) == 2 * most or len(beside) == _MAX_BESIDE * most:
             break
         angle = graph.angle(i, int(j))
         if np.isnan(angle) and np.array_equal(graph.centers[i], graph.centers[j]):
@@ -187,13 +196,15 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
         if angle < options.min_triangulation_angle:
             continue
         partner = Partner(graph.scene.views[j].name, int(weight), angle)
-        if angle > options.max_triangulation_angle:
+        if not stations.is_new(graph.scene.views[j]):
+            beside.append(partner)
+        elif angle > options.max_triangulation_angle:
             wide.append(partner)
         else:
             near.append(partner)
             worths.append(graph.worth(i, int(j)))
     chosen = [near[k] for k in choose(worths, options.num_pairs)]
-    return tuple((chosen + wide)[: options.num_pairs])
+    return tuple((chosen + wide + beside)[: options.num_pairs])
 
 
 def _explicit_selection(

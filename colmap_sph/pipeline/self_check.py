@@ -1,0 +1,83 @@
+"""Agreement of depth maps with the sparse points → what to tell of it, and whether results make no sense."""
+
+import logging
+from collections.abc import Mapping
+
+from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.report import RunReport
+from colmap_sph.stereo.agreement import Agreement
+
+logger = logging.getLogger(__name__)
+
+# On sound input a third of the points agree at the very least (a fisheye rig among people), nearly all as a rule;
+# of images that are turned, mirrored or exchanged a twentieth. An image is doubted below this share, ...
+_DOUBTED_SHARE = 0.15
+# ... and all of them below this one.
+_REFUSED_SHARE = 0.1
+# Where so large a share of the points with a depth agrees, it may also be that hardly any was matched.
+_RIGHT_SHARE_OF_FOUND = 0.5
+# Fewer points say nothing.
+_FEWEST_OF_IMAGE = 10
+_FEWEST = 30
+_MAX_NAMED = 10
+
+
+def report_agreement(report: RunReport, agreements: Mapping[str, Agreement]) -> None:
+    """Put the agreement of every image, and of all, into the report; warn where it is low.
+
+    Parameters
+    ----------
+    report : RunReport
+    agreements : mapping of str to Agreement
+        Of each image with geometric maps.
+    """
+    total = sum(agreements.values(), Agreement())
+    report.agreement = {name: found.share for name, found in agreements.items()}
+    report.overall_agreement = total.share
+    if total.share is None:
+        logger.info("There are no sparse points to check the depth maps against")
+        return
+    doubted = {name: found.share for name, found in agreements.items() if _is_doubted(found)}
+    if _is_refused(total):
+        report.refusal = _refusal(total)
+    elif doubted:
+        report.doubts = _doubts(doubted)
+        logger.warning("%s", report.doubts)
+
+
+def refuse_disagreement(report: RunReport) -> None:
+    """Raise `NoResultError` where hardly any sparse point agrees with the depth maps."""
+    if report.refusal:
+        raise NoResultError(report.refusal)
+
+
+def _is_doubted(found: Agreement) -> bool:
+    return found.tested >= _FEWEST_OF_IMAGE and found.agreeing < _DOUBTED_SHARE * found.tested
+
+
+def _is_refused(total: Agreement) -> bool:
+    return total.tested >= _FEWEST and total.agreeing < _REFUSED_SHARE * total.tested
+
+
+def _refusal(total: Agreement) -> str:
+    causes = (
+        "these images do not belong to the poses and cameras of the model (exchanged, turned, mirrored, cropped, "
+        "or of another model)"
+    )
+    if total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found > 0:
+        causes += ", or hardly anything of them could be matched with these options"
+    return (
+        f"Only {total.agreeing / total.tested:.1%} of the sparse points agree with the depth maps of the images "
+        f"that observe them: {causes}; check --images. What was made is left on disk."
+    )
+
+
+def _doubts(doubted: Mapping[str, float | None]) -> str:
+    shares = sorted((share or 0.0, name) for name, share in doubted.items())
+    named = ", ".join(f"{name} ({share:.0%})" for share, name in shares[:_MAX_NAMED])
+    if len(shares) > _MAX_NAMED:
+        named += f" and {len(shares) - _MAX_NAMED} more"
+    return (
+        f"Few of the sparse points that these images observe agree with their depth maps: {named}. Their poses, "
+        "cameras or pixels may not be those of the model, or they could hardly be matched."
+    )

@@ -1,0 +1,171 @@
+"""Sparse points → do the depth maps of the images that observe them agree? A run's check of itself.
+
+The sparse points come from the same poses as the depth maps, but from other measurements. Where images do not
+belong to their poses, or are turned, next to no point agrees with the maps; where all fits, nearly all do.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
+
+from colmap_sph.scene import Scene, View
+
+# Sparse points of a view to look at, an even part of them.
+_MAX_POINTS = 1000
+# A map agrees with a point where in no image that observes it the two lie farther apart than this: a few times the
+# noise of structure from motion, of a pixel or less. ...
+_MAX_DISTANCE = 4.0
+# ... A point tells something where it would not agree at this many times its distance.
+_TELLING = 1.25
+
+
+@dataclass(frozen=True, eq=False)
+class SparseSights:
+    """Some of the sparse points that a view observes, and the other views that observe them.
+
+    Attributes
+    ----------
+    pixels : (n, 2) float64 ndarray
+        Where the view sees them, in image coordinates.
+    depth : (n,) float64 ndarray
+        z-depth in the view.
+    point : (m,) int64 ndarray
+        For every sight from another view the row of the point, ascending.
+    at_center, at_point : (m, 3) float64 ndarray
+        In homogeneous pixels of that other view: the centre of this view, and the point.
+    """
+
+    pixels: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    point: NDArray[np.int64]
+    at_center: NDArray[np.float64]
+    at_point: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far a view's depth map agrees with its sparse points.
+
+    Attributes
+    ----------
+    tested : int
+        Sparse points in the view's sight, and seen by others under enough parallax to tell their depth.
+    found : int
+        Those of them with a depth in the map.
+    agreeing : int
+        Those of them whose depth agrees.
+    """
+
+    tested: int = 0
+    found: int = 0
+    agreeing: int = 0
+
+    def __add__(self, other: "Agreement") -> "Agreement":
+        return Agreement(self.tested + other.tested, self.found + other.found, self.agreeing + other.agreeing)
+
+    @property
+    def share(self) -> float | None:
+        """Agreeing points of those tested; None where there is none. A point without a depth does not agree."""
+        return self.agreeing / self.tested if self.tested else None
+
+
+class SparseTracks:
+    """Which views observe each sparse point of a scene; may be used by several threads.
+
+    Parameters
+    ----------
+    scene : Scene
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        observed = [view.point_indices for view in scene.views]
+        indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in observed])])
+        indices = np.concatenate([*observed, np.empty(0, np.int64)])
+        shape = (len(observed), len(scene.points))
+        seen = sparse.csr_array((np.ones(len(indices), np.int8), indices, indptr), shape=shape).T.tocsr()
+        seen.sort_indices()
+        self._first, self._views = seen.indptr.astype(np.int64), seen.indices
+        self._cameras = np.array([view.K @ view.cam_from_world for view in scene.views])
+
+    def sights(self, name: str) -> SparseSights:
+        """Return the sparse points of a view, an even part of them where there are many."""
+        index = self._scene.index_of[name]
+        view = self._scene.views[index]
+        rows = view.point_indices
+        rows = rows[:: -(-len(rows) // _MAX_POINTS) or 1]
+        points = self._scene.points[rows]
+        pixels, depth = view.project(points)
+        counts = self._first[rows + 1] - self._first[rows]
+        point = np.repeat(np.arange(len(rows)), counts)
+        places = np.arange(len(point)) - np.repeat(np.cumsum(counts) - counts, counts)
+        others = self._views[self._first[rows][point] + places]
+        point, others = point[others != index], others[others != index]
+        cameras = self._cameras[others]
+        at_center = cameras[:, :, :3] @ view.center + cameras[:, :, 3]
+        at_point = np.einsum("mij,mj->mi", cameras[:, :, :3], points[point]) + cameras[:, :, 3]
+        return SparseSights(pixels, depth, point, at_center, at_point)
+
+
+def compare_with_sparse(
+    view: View, depth: NDArray[np.float32], sights: SparseSights, mask: NDArray[np.uint8] | None = None
+) -> Agreement:
+    """Compare a view's depth map with its sparse points.
+
+    Parameters
+    ----------
+    view : View
+    depth : (H, W) float32 ndarray
+        z-depth along the ray ``K⁻¹ (col, row, 1)``; 0 = none.
+    sights : SparseSights
+    mask : (H, W) uint8 ndarray, optional
+        0 where the image is ignored: points there are not asked.
+
+    Returns
+    -------
+    Agreement
+    """
+    inside = (sights.pixels >= 0) & (sights.pixels < [view.width, view.height])
+    asked = inside.all(axis=1) & (sights.depth > 0)
+    # The map's place (col, row) is the image coordinates (col, row), see `pixel origin` in docs/algorithm.md.
+    places = np.where(asked[:, None], np.rint(sights.pixels), 0).astype(np.int64)
+    columns, rows = np.minimum(places, [view.width - 1, view.height - 1]).T
+    if mask is not None:
+        asked &= mask[rows, columns] > 0
+    asked &= _distances(sights, np.full(len(asked), _TELLING)) > _MAX_DISTANCE
+    nearest = _nearest_depth(depth, rows, columns, sights.depth)
+    found = asked & (nearest > 0)
+    ratio = np.divide(nearest, sights.depth, out=np.ones(len(asked)), where=found)
+    agreeing = found & (_distances(sights, ratio) <= _MAX_DISTANCE)
+    return Agreement(*(int(np.count_nonzero(which)) for which in (asked, found, agreeing)))
+
+
+def _distances(sights: SparseSights, ratio: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) pixels: how far points move in the view where they move most, their distance times `ratio`."""
+    moved = sights.at_center + ratio[sights.point][:, None] * (sights.at_point - sights.at_center)
+    in_front = (moved[:, 2] > 0) & (sights.at_point[:, 2] > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        shift = moved[:, :2] / moved[:, 2:] - sights.at_point[:, :2] / sights.at_point[:, 2:]
+    shift = np.where(in_front, np.hypot(*shift.T), np.inf)
+    farthest = np.zeros(len(ratio))
+    np.maximum.at(farthest, sights.point, shift)
+    return farthest
+
+
+def _nearest_depth(
+    depth: NDArray[np.float32],
+    rows: NDArray[np.int64],
+    columns: NDArray[np.int64],
+    expected: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(n,): of the 3 x 3 depths around pixels the one nearest to what is expected; 0 = none."""
+    height, width = depth.shape
+    best = np.zeros(len(rows))
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            found = depth[np.clip(rows + down, 0, height - 1), np.clip(columns + right, 0, width - 1)]
+            is_better = (found > 0) & (~(best > 0) | (np.abs(found - expected) < np.abs(best - expected)))
+            best[is_better] = found[is_better]
+    return best

@@ -1,0 +1,208 @@
+"""A run's check of itself: depth maps against the sparse points, on sound input and on garbage."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from exact_maps import HEIGHT, NAMES, WIDTH, make_workspace
+from projects import FOUR_NAMES, read_picture, render_four_images
+from rich.console import Console
+
+import colmap_sph
+from colmap_sph.app.run_command import print_summary
+from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.report import RunReport
+from colmap_sph.pipeline.self_check import refuse_disagreement, report_agreement
+from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene
+from colmap_sph.stereo.agreement import Agreement, SparseTracks, compare_with_sparse
+
+OPTIONS = RunOptions(threads=2)
+
+
+# ---- one depth map -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def exact(tmp_path_factory):
+    """A scene of six views of a plane, and their exact depth maps."""
+    workspace = make_workspace(tmp_path_factory.mktemp("exact") / "dense")
+    maps = {name: read_depth_map(workspace.depth_map_path(name, "geometric")) for name in NAMES}
+    return read_scene(workspace.sparse_dir), maps
+
+
+def agreement_of(scene, name, depth, mask=None):
+    return compare_with_sparse(scene.view(name), depth, SparseTracks(scene).sights(name), mask)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_exact_maps_agree_with_every_point(exact, name):
+    scene, maps = exact
+    found = agreement_of(scene, name, maps[name])
+    assert found.tested > 0.95 * len(scene.view(name).point_indices) > 50
+    assert found == Agreement(found.tested, found.tested, found.tested)
+
+
+def test_what_has_no_depth_does_not_agree(exact):
+    scene, maps = exact
+    found = agreement_of(scene, "a.png", np.zeros_like(maps["a.png"]))
+    assert found == Agreement(agreement_of(scene, "a.png", maps["a.png"]).tested, 0, 0)
+    assert found.share == 0
+    assert Agreement().share is None
+
+
+def test_points_under_a_mask_are_not_asked(exact):
+    scene, maps = exact
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 2] = 0
+    pixels, _ = scene.view("a.png").project(scene.points[scene.view("a.png").point_indices])
+    right = np.count_nonzero(np.rint(pixels[:, 0]) >= WIDTH // 2)
+    assert 0 < right < len(pixels)
+    assert agreement_of(scene, "a.png", maps["a.png"], mask) == Agreement(right, right, right)
+
+
+def parallax(scene, view, point, ratio, row):
+    """How far a point moves in the view that tells most, where its distance from another changes."""
+    moved = view.center + (point - view.center) * ratio
+    others = [other for other in scene.views if other.name != view.name and row in other.point_indices]
+    return max(np.linalg.norm(np.subtract(*other.project(np.array([point, moved]))[0])) for other in others)
+
+
+def test_a_depth_agrees_up_to_four_pixels_in_the_view_that_tells_most(exact):
+    """The points are moved along their rays, one by one, and projected as anybody would."""
+    scene, maps = exact
+    view = scene.view("b.png")
+    # Without those that are seen under too little parallax.
+    rows = np.array([k for k in view.point_indices if parallax(scene, view, scene.points[k], 1.25, k) > 4])
+    pixels, depth = view.project(scene.points[rows])
+    places = np.rint(pixels).astype(int)
+    for factor in (1.01, 1.02, 1.05, 1.1, 0.95, 0.9):
+        wrong = (maps["b.png"] * factor).astype(np.float32)
+        expected = 0
+        for k, point in enumerate(scene.points[rows]):
+            shown = wrong[
+                np.ix_(
+                    np.clip(places[k, 1] + np.arange(-1, 2), 0, HEIGHT - 1),
+                    np.clip(places[k, 0] + np.arange(-1, 2), 0, WIDTH - 1),
+                )
+            ]
+            nearest = shown.flat[np.abs(shown - depth[k]).argmin()]
+            expected += parallax(scene, view, point, nearest / depth[k], rows[k]) <= 4
+        assert agreement_of(scene, "b.png", wrong) == Agreement(len(rows), len(rows), expected)
+
+
+def test_points_without_parallax_tell_nothing(exact):
+    scene, maps = exact
+    first = scene.view("a.png")
+    twin = replace(first, name="b.png", t=first.t - first.R @ np.array([0.001, 0, 0]))
+    pair = Scene((first, twin), scene.points)
+    assert agreement_of(pair, "a.png", maps["a.png"]) == Agreement()
+
+
+# ---- what is told of it ------------------------------------------------------------------------------------
+
+
+def reported(agreements):
+    report = RunReport()
+    report_agreement(report, agreements)
+    return report
+
+
+def test_an_image_that_hardly_agrees_is_named():
+    sound = {f"{k}.jpg": Agreement(100, 95, 90) for k in range(5)}
+    report = reported({**sound, "odd.jpg": Agreement(100, 40, 3), "few.jpg": Agreement(5, 0, 0)})
+    assert "odd.jpg (3%)" in report.doubts and "few.jpg" not in report.doubts and "0.jpg" not in report.doubts
+    assert report.agreement["0.jpg"] == 0.9
+    assert report.overall_agreement == pytest.approx(453 / 605)
+    refuse_disagreement(report)
+    assert reported(sound).doubts == ""
+
+
+def test_hardly_any_agreement_is_no_result():
+    report = reported({"a.jpg": Agreement(100, 30, 4), "b.jpg": Agreement(100, 30, 5)})
+    with pytest.raises(NoResultError, match=r"Only 4\.5% of the sparse points agree"):
+        refuse_disagreement(report)
+    assert "could be matched" not in report.refusal
+    # Where little is matched few points have a depth, but these agree.
+    assert "could be matched" in reported({"a.jpg": Agreement(100, 6, 5)}).refusal
+    # Too few to tell.
+    refuse_disagreement(reported({"a.jpg": Agreement(10, 5, 0)}))
+
+
+def test_without_sparse_points_there_is_nothing_to_check(tmp_path):
+    report = reported({"a.jpg": Agreement(), "b.jpg": Agreement()})
+    assert (report.overall_agreement, report.doubts, report.refusal) == (None, "", "")
+    assert report.agreement == {"a.jpg": None, "b.jpg": None}
+    console = Console(width=200)
+    with console.capture() as captured:
+        print_summary(report, Workspace(tmp_path), console)
+    assert "no sparse points to check against" in captured.get()
+
+
+# ---- whole runs --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def four(tmp_path_factory):
+    root = tmp_path_factory.mktemp("four")
+    render_four_images(root)
+    return root
+
+
+@pytest.fixture
+def project(four, tmp_path):
+    shutil.copytree(four / "images", tmp_path / "images")
+    shutil.copytree(four / "sparse", tmp_path / "sparse")
+    return tmp_path
+
+
+def test_sound_input_agrees_and_a_rerun_knows_it(project):
+    report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    assert report.overall_agreement > 0.95
+    assert sorted(report.agreement) == FOUR_NAMES and min(report.agreement.values()) > 0.9
+    assert report.doubts == report.refusal == ""
+    stored = json.loads((project / "dense/colmap_sph/report.json").read_text())
+    assert (stored["agreement"], stored["overall_agreement"]) == (report.agreement, report.overall_agreement)
+    again = colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    assert again.made["confirm depth"] == 0
+    assert (again.agreement, again.overall_agreement) == (report.agreement, report.overall_agreement)
+
+
+@pytest.mark.parametrize("garbage", ["turned", "mirrored"])
+def test_nothing_is_confirmed_of_small_garbage(garbage, project):
+    for name in FOUR_NAMES:
+        picture = read_picture(project / "images" / name)
+        cv2.imwrite(str(project / "images" / name), cv2.flip(picture, -1 if garbage == "turned" else 1))
+    with pytest.raises(
+        NoResultError, match="No depth was confirmed by a second image; are the model's poses right"
+    ):
+        colmap_sph.run(project / "sparse/0", options=OPTIONS)
+
+
+def test_garbage_is_refused_and_stays_on_disk(project):
+    """Every image is another's. Two neighbours in a strip still fit each other, as if they were one place on."""
+    pictures = [read_picture(project / "images" / name) for name in FOUR_NAMES]
+    for name, k in zip(FOUR_NAMES, [1, 2, 3, 0], strict=True):
+        cv2.imwrite(str(project / "images" / name), pictures[k])
+    with pytest.raises(NoResultError) as caught:
+        colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    stored = json.loads((project / "dense/colmap_sph/report.json").read_text())
+    assert stored["overall_agreement"] < 0.1
+    assert "images do not belong to the poses" in str(caught.value)
+    assert caught.value.exit_code == 4
+    assert (project / "dense/fused.ply").exists()
+
+
+def test_one_wrong_image_is_named(project):
+    wrong = FOUR_NAMES[2]
+    picture = read_picture(project / "images" / FOUR_NAMES[3])
+    cv2.imwrite(str(project / "images" / wrong), cv2.flip(picture, -1))
+    report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    assert wrong in report.doubts
+    assert not any(name in report.doubts for name in FOUR_NAMES if name != wrong)
