@@ -1,8 +1,10 @@
 """Folders and files made and removed for the user: errors are sentences, and no file is ever half-written."""
 
+import errno
 import os
 import re
 import shutil
+import stat
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -30,6 +32,23 @@ def make_dir(folder: Path) -> None:
 def free_space(path: Path) -> int:
     """Free bytes on the disk where a file or folder is, or would be."""
     return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free
+
+
+def open_regular(path: Path) -> BinaryIO:
+    """Open a regular file, or a link to one, for reading its bytes.
+
+    Raises
+    ------
+    OSError
+        It cannot be opened, or is something else: a pipe would keep the reader waiting for ever, a device may
+        never end. For the caller to put into a sentence.
+    """
+    # Without waiting for somebody to write into a pipe.
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    if stat.S_ISREG(os.fstat(descriptor).st_mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    raise OSError(errno.EINVAL, "it is not a regular file", str(path))
 
 
 @contextmanager
