@@ -26,6 +26,7 @@ from colmap_sph.project.scene_reader import scene_of_model
 from colmap_sph.project.sparse_model import (
     cameras_of_images,
     image_names,
+    is_text,
     load_model,
     model_files,
     submodel,
@@ -205,7 +206,8 @@ def _marker(originals: Originals, options: UndistortionOptions) -> dict[str, Any
 def _undistort(originals: Originals, names: list[str], scratch: Path, options: UndistortionOptions) -> list[str]:
     """Let COLMAP undistort images `names` into `scratch`; return the names that came out well."""
     model_dir = originals.model_dir
-    if replace_ideal_fisheyes(originals.model):
+    # What is read here may be more than COLMAP itself would read of a text model.
+    if replace_ideal_fisheyes(originals.model) or is_text(model_files(model_dir)):
         model_dir = scratch / "model"
         make_dir(model_dir)
         originals.model.write_binary(model_dir)
