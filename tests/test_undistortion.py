@@ -11,8 +11,8 @@ from projects import prepare
 
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.project import staging
+from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.images import image_problem, read_grey
-from colmap_sph.project.originals import find_images
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
 from colmap_sph.project.undistortion import UndistortionOptions, foresee_workspace, prepare_workspace

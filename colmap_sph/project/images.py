@@ -29,6 +29,20 @@ class _DamagedError(ValueError):
     """The header makes no sense or the file ends too early."""
 
 
+class WrongSize(str):
+    """What is wrong with an image of another size (width, height) than its camera, as the end of a sentence."""
+
+    found: tuple[int, int]
+    wanted: tuple[int, int]
+
+    def __new__(cls, found: tuple[int, int], wanted: tuple[int, int]) -> "WrongSize":
+        words = f"has {found[0]} x {found[1]} pixels, but its camera {wanted[0]} x {wanted[1]}"
+        problem = super().__new__(cls, words)
+        problem.found = found
+        problem.wanted = wanted
+        return problem
+
+
 def image_problem(path: Path, width: int, height: int) -> str | None:
     """Say what is wrong with an image, as the end of a sentence, or return None.
 
@@ -53,7 +67,7 @@ def image_problem(path: Path, width: int, height: int) -> str | None:
     except (_DamagedError, struct.error, IndexError):
         return "is damaged or cut off"
     if found != (width, height):
-        return f"has {found[0]} x {found[1]} pixels, but its camera {width} x {height}"
+        return WrongSize(found, (width, height))
     return None
 
 

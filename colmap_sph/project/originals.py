@@ -1,8 +1,6 @@
 """What is to be undistorted: a sparse model, its images and their masks, found and checked."""
 
 import hashlib
-import logging
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,13 +9,12 @@ import pycolmap
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import refuse_panoramas
+from colmap_sph.project.given.image_places import find_images, tell_problems
 from colmap_sph.project.images import image_problem
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, image_names, load_model, model_files
 from colmap_sph.project.workspace import checked_name
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -61,18 +58,13 @@ class Originals:
             No image is usable, or a mask does not fit its image.
         """
         cameras = cameras_of_images(self.model)
-        good = {}
-        for name, camera in sorted(cameras.items()):
-            path = self.image_dir / checked_name(name)
-            problem = image_problem(path, camera.width, camera.height)
-            if problem is None:
-                good[name] = camera
-            else:
-                logger.warning("%s %s; left out", path, problem)
-        if not good:
-            raise InputError(
-                f"None of the model's {len(cameras)} images in {self.image_dir} is usable; check --images."
-            )
+        found = {
+            name: image_problem(self.image_dir / checked_name(name), camera.width, camera.height)
+            for name, camera in sorted(cameras.items())
+        }
+        problems = {name: problem for name, problem in found.items() if problem is not None}
+        tell_problems(self.model_dir, self.image_dir, problems, len(cameras), undistorted=False)
+        good = {name: camera for name, camera in sorted(cameras.items()) if name not in problems}
         return Usable(list(good), [] if self.mask_dir is None else check_masks(self.mask_dir, good))
 
 
@@ -105,28 +97,6 @@ def read_originals(project: Project) -> Originals:
             f"The image folder {images} {'is a file' if is_file else 'does not exist'}; check --images."
         )
     return Originals(project.model, images, project.masks, model)
-
-
-def find_images(model_dir: Path, names: Sequence[str]) -> Path:
-    """Find the image folder of a model by COLMAP's usual layouts.
-
-    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
-    folder that holds most of the model's images is taken, the first among equals.
-
-    Raises
-    ------
-    InputError
-        None of the folders holds any image of the model; the message lists them.
-    """
-    # Of a link to a model both where it is and where it leads to.
-    places = (Path.cwd() / model_dir, model_dir.resolve())
-    parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
-    folders = list(dict.fromkeys(parent / "images" for parent in parents))
-    found = [sum((folder / name).is_file() for name in names) for folder in folders]
-    if max(found) == 0:
-        tried = ", ".join(str(folder) for folder in folders)
-        raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
-    return folders[found.index(max(found))]
 
 
 def _hash_model(model_dir: Path) -> str:

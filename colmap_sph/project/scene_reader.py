@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import is_pinhole
+from colmap_sph.project.given.image_places import tell_problems
 from colmap_sph.project.images import image_problem
 from colmap_sph.project.map_coordinates import is_plausible, local_origin
 from colmap_sph.project.sparse_model import load_model
@@ -127,13 +128,9 @@ def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
     InputError
         No view is left.
     """
-    good = []
-    for view in scene.views:
-        problem = image_problem(workspace.image_path(view.name), view.width, view.height)
-        if problem is None:
-            good.append(view)
-        else:
-            logger.warning("%s %s; left out", workspace.image_path(view.name), problem)
-    if not good:
-        raise InputError(f"None of the {len(scene.views)} images in {workspace.images_dir} is usable.")
-    return replace(scene, views=tuple(good))
+    found = {
+        view.name: image_problem(workspace.image_path(view.name), view.width, view.height) for view in scene.views
+    }
+    problems = {name: problem for name, problem in found.items() if problem is not None}
+    tell_problems(workspace.sparse_dir, workspace.images_dir, problems, len(scene.views), undistorted=True)
+    return replace(scene, views=tuple(view for view in scene.views if view.name not in problems))
