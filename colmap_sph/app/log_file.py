@@ -57,6 +57,8 @@ class _WorkspaceLog(logging.Handler):
 
     def _open(self) -> logging.FileHandler:
         path = self._workspace.log_path
+        if path.exists() and not path.is_file():
+            raise OutputError(f"{path} cannot be written: it is not a regular file; remove it.")
         try:
             file = _LogFile(path, encoding="utf-8")
         except OSError as error:

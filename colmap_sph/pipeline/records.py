@@ -12,7 +12,7 @@ from typing import Any
 
 from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.pipeline.digests import digest, new_digest
-from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.files import atomic_file, make_dir, open_regular
 
 _STAMP_BLOCKS = 16
 _BLOCK_BYTES = 4096
@@ -53,7 +53,8 @@ def vouched_facts(record: Path, key: str, files: Sequence[Path]) -> dict[str, An
     dict or None
     """
     try:
-        content = json.loads(record.read_bytes())
+        with open_regular(record) as file:
+            content = json.loads(file.read())
         check = content.pop("check")
         facts = content["facts"]
         known = content["key"] == key and check == digest(content)
@@ -77,7 +78,7 @@ def _stamp(path: Path) -> str:
     """Size, and digest of evenly spread blocks: reading all of the maps again would take minutes."""
     state = new_digest()
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             size = path.stat().st_size
             last = max(0, size - _BLOCK_BYTES)
             for index in range(_STAMP_BLOCKS):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.files import atomic_file
+from colmap_sph.project.files import atomic_file, open_regular
 
 _MAX_HEADER = 30
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
@@ -91,7 +91,7 @@ def check_map(path: Path, shape: tuple[int, ...]) -> None:
     error that does not name it.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(_MAX_HEADER)
             size = path.stat().st_size
     except OSError as error:
@@ -121,7 +121,7 @@ def _parse_header(path: Path, start: bytes, size: int, channels: int) -> tuple[t
 def _read_planes(path: Path, *, channels: int) -> NDArray[np.float32]:
     """Read a map file as a (channels, H, W) array."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(_MAX_HEADER)
             size = path.stat().st_size
             (height, width), header = _parse_header(path, start, size, channels)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, get_args
 
 from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.project.files import atomic_file, make_dir, remove
+from colmap_sph.project.files import atomic_file, make_dir, open_regular, remove
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
 from colmap_sph.project.workspace import MapKind, Workspace
 
@@ -185,7 +185,8 @@ def _scratch_marker(workspace: Workspace) -> Path:
 def _read_marker(path: Path) -> dict[str, Any] | None:
     """Return what a marker says, or None where there is no readable one."""
     try:
-        marker = json.loads(path.read_text())
+        with open_regular(path) as file:
+            marker = json.loads(file.read())
     except (OSError, ValueError):
         return None
     return marker if isinstance(marker, dict) else None

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.files import atomic_file
+from colmap_sph.project.files import atomic_file, open_regular
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
 
 _FINEST_STEP = 1 / 64
@@ -91,7 +91,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     """
     try:
         # Opened here, as NumPy leaves a damaged file open.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as data:
             return {name: data[name] for name in names}
     except _DAMAGED as error:
         damaged = _is_damaged(path)
@@ -106,7 +106,7 @@ def read_arrays(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
 def stored_key(path: Path) -> str | None:
     """The key under which a file was written, or None where it is missing or damaged, or has none."""
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+        with open_regular(path) as file, np.load(file, allow_pickle=False) as data:
             return str(data["key"])
     except _DAMAGED:
         return None
