@@ -24,11 +24,11 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import with_good_images
+from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
-from colmap_sph.project.undistortion.originals import find_images
 from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.workspace import Workspace
 
@@ -165,7 +165,7 @@ def test_no_usable_image(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     for name in NAMES:
         damage(tmp_path / "images" / name, "size")
-    with pytest.raises(InputError, match="None of the 4 images"):
+    with pytest.raises(InputError, match="None of the model's 4 images"):
         prepare(sparse, tmp_path / "dense")
     assert not (tmp_path / "dense").exists()
 

@@ -9,13 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 import tyro
-from numpy.typing import NDArray
 
 from colmap_sph.app.terminal import Terminal, print_result
-from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError, reason_of
+from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import (
     CloudScores,
     DepthMapScores,
@@ -33,6 +31,7 @@ from colmap_sph.evaluation import (
     truth_normals_at_pixel_origin,
     write_json,
 )
+from colmap_sph.evaluation.depth_files import DEPTH_ENDINGS, read_exact_depth
 from colmap_sph.project.cameras import is_pinhole
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.sparse_model import load_model
@@ -40,7 +39,6 @@ from colmap_sph.project.workspace import MapKind, Workspace
 
 logger = logging.getLogger(__name__)
 
-_DEPTH_FORMATS = (".png", ".tif", ".tiff", ".npy")
 _SAME_CAMERA = 1e-6
 """Largest relative difference of the calibrations of one camera in two files."""
 
@@ -89,9 +87,12 @@ class EvaluateCommand:
             )
         for cloud in self.clouds:
             if not cloud.is_file():
-                raise InputError(f"The cloud {cloud} does not exist or is not a file; check its path.")
+                lack = "is not a regular file" if cloud.exists() else "does not exist"
+                raise InputError(f"The cloud {cloud} {lack}; check its path.")
         if self.json is not None and not self.json.absolute().parent.is_dir():
             raise OutputError(f"{self.json} cannot be written: its folder does not exist; create it first.")
+        if self.json is not None and self.json.exists() and not self.json.is_file():
+            raise OutputError(f"{self.json} cannot be written: it is not a regular file; name another.")
 
 
 def evaluate_command(command: EvaluateCommand, terminal: Terminal) -> int:
@@ -221,70 +222,10 @@ def exact_depth_views(folder: Path, model_dir: Path, depth_scale: float | None =
     return views
 
 
-def read_exact_depth(
-    path: Path, *, shape: tuple[int, int], depth_scale: float | None = None
-) -> NDArray[np.float32]:
-    """Read an exact depth map: a one-channel image of 16 bits or more, or a NumPy file.
-
-    Parameters
-    ----------
-    path : Path
-        PNG, TIFF or ``.npy``; 0, negative or not finite = none.
-    shape : (int, int)
-        Rows and columns it must have.
-    depth_scale : float, optional
-        Model units per unit of the file; None: 1, and an error for integers, whose unit nothing tells.
-
-    Returns
-    -------
-    (H, W) float32 ndarray
-        z-depth at pixel centres in model units, 0 = none.
-
-    Raises
-    ------
-    InputError
-        A file that cannot be read, is no depth map, or has another size.
-    OptionError
-        Integers without a scale.
-    """
-    stored = _read_array(path)
-    if stored.ndim != 2 or stored.dtype == np.uint8 or stored.dtype.kind not in "uif":
-        channels = 1 if stored.ndim == 2 else stored.shape[-1]
-        raise InputError(
-            f"{path} is not a depth map: it has {channels} channel(s) of {stored.dtype}; one channel of 16-bit "
-            "integers or floating-point numbers is needed."
-        )
-    if stored.shape != shape:
-        raise InputError(
-            f"{path} has {stored.shape[1]} x {stored.shape[0]} pixels and its camera {shape[1]} x {shape[0]}; "
-            "give the model of the images that the depth maps were made for."
-        )
-    if depth_scale is None and stored.dtype.kind != "f":
-        raise OptionError(
-            f"{path} holds integers: give --depth-scale, the metres of one unit (such as 0.001 for millimetres)."
-        )
-    depth = stored.astype(np.float32) * np.float32(depth_scale or 1.0)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-
-def _read_array(path: Path) -> NDArray[np.generic]:
-    if path.suffix == ".npy":
-        try:
-            return np.asarray(np.load(path, allow_pickle=False))
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(
-                f"{path} cannot be read as a NumPy array ({reason_of(error)}); write it again."
-            ) from error
-    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise InputError(f"{path} cannot be read as an image, it may be damaged; write it again.")
-    return np.asarray(image)
-
-
 def _depth_file(folder: Path, name: str) -> Path | None:
     """The depth map of image `name`: its ending replaced or followed by that of a depth format."""
     stems = (Path(name).with_suffix(""), Path(name))
-    candidates = (folder / f"{stem}{ending}" for stem in stems for ending in _DEPTH_FORMATS)
+    candidates = (folder / f"{stem}{ending}" for stem in stems for ending in DEPTH_ENDINGS)
     return next((path for path in candidates if path.is_file()), None)
 
 

@@ -87,6 +87,8 @@ class _WorkspaceLog(logging.Handler):
 
     def _open(self) -> logging.FileHandler:
         path = self._workspace.log_path
+        if path.exists() and not path.is_file():
+            raise OutputError(f"{path} cannot be written: it is not a regular file; remove it.")
         try:
             file = _LogFile(path)
         except OSError as error:

@@ -4,25 +4,26 @@ from __future__ import annotations
 
 import importlib
 import logging
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from colmap_sph.errors import InputError, reason_of
+from colmap_sph.evaluation.las_files import read_las
 from colmap_sph.evaluation.neighbours import Points
+from colmap_sph.evaluation.obj_files import read_obj
+from colmap_sph.evaluation.ply_files import read_ply
 
 logger = logging.getLogger(__name__)
 
-_LAS_CHUNK = 2_000_000
-_WKT_PROJECTED = ("PROJCS", "PROJCRS", "PROJECTEDCRS")
-_WKT_GEOGRAPHIC = ("GEOGCS", "GEOGCRS", "GEODCRS", "GEOGRAPHICCRS")
-_GEOTIFF_MODEL_TYPE = 1024
-_GEOTIFF_PROJECTED = 1
-_GEOTIFF_GEOGRAPHIC = 2
-_GEOTIFF_PROJECTED_CODE = 3072
+_Content = TypeVar("_Content")
+_LARGEST = 1e12
+"""Coordinates beyond are no place in any unit; their squares are still numbers."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,12 @@ class Mesh:
         _check_points(self.name, self.vertices)
         if not len(self.faces):
             raise InputError(f"{self.name} has no faces")
+        outside = ((self.faces < 0) | (self.faces >= len(self.vertices))).any(axis=1)
+        if outside.any():
+            raise InputError(
+                f"{self.name}: {np.count_nonzero(outside)} of {len(self.faces)} triangles have corners that are "
+                "not among its vertices: it may be damaged, write it again"
+            )
 
 
 def read_geometry(path: Path) -> PointCloud | Mesh:
@@ -64,19 +71,35 @@ def read_geometry(path: Path) -> PointCloud | Mesh:
     Raises
     ------
     InputError
-        A file that is missing, damaged, empty, of another format, or with coordinates that are not finite.
+        A file that is missing, damaged, empty, of another format, or with impossible coordinates or faces.
     """
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"{path} does not exist or is not a file: give the path of a cloud or mesh")
+        lack = "is not a regular file" if path.exists() else "does not exist"
+        raise InputError(f"{path} {lack}: give the path of a cloud or mesh")
     kind = path.suffix.lower()
     if kind in (".las", ".laz"):
-        return _read_las(path)
-    if kind in (".ply", ".obj"):
-        return _read_ply_or_obj(path)
-    raise InputError(
-        f"{path} has the unknown format {kind or '(no ending)'!r}: convert it to PLY, OBJ, LAS or LAZ"
-    )
+        points, crs = _read(path, "LAS/LAZ", partial(read_las, laspy=require("laspy")))
+        return PointCloud(str(path), points, crs, z_is_up=True)
+    if kind not in (".ply", ".obj"):
+        raise InputError(
+            f"{path} has the unknown format {kind or '(no ending)'!r}: convert it to PLY, OBJ, LAS or LAZ"
+        )
+    vertices, faces = _read(path, kind[1:].upper(), read_ply if kind == ".ply" else read_obj)
+    geometry = Mesh(str(path), vertices, faces) if len(faces) else PointCloud(str(path), vertices)
+    _warn_of_lost_digits(path, vertices)
+    return geometry
+
+
+def _read(path: Path, kind: str, reader: Callable[[Path], _Content]) -> _Content:
+    """What a reader makes of a file; whatever it and its libraries raise at it becomes a sentence."""
+    try:
+        return reader(path)
+    except (MemoryError, KeyboardInterrupt, SystemExit):
+        raise
+    # The decompressor's own panic is no `Exception`.
+    except BaseException as error:
+        raise InputError(f"{path} cannot be read as {kind}, it may be damaged: {reason_of(error)}") from error
 
 
 def require(module: str) -> Any:
@@ -92,37 +115,18 @@ def _check_points(name: str, points: Points) -> None:
         raise InputError(f"{name} has points of shape {points.shape}, not (N, 3)")
     if not len(points):
         raise InputError(f"{name} is empty: it has no point to compare")
-    finite = np.isfinite(points).all(axis=1)
-    if not finite.all():
+    possible = (np.abs(points) <= _LARGEST).all(axis=1)
+    if not possible.all():
         raise InputError(
-            f"{name}: {np.count_nonzero(~finite)} of {len(points)} points have coordinates that are NaN or "
-            "infinite: remove them first"
+            f"{name}: {np.count_nonzero(~possible)} of {len(points)} points have coordinates that are NaN or "
+            f"infinite, or beyond {_LARGEST:g}: remove them first"
         )
-
-
-def _read_ply_or_obj(path: Path) -> PointCloud | Mesh:
-    trimesh = require("trimesh")
-    try:
-        loaded = trimesh.load(path, process=False, skip_materials=True)
-    except (ValueError, KeyError, IndexError, TypeError, EOFError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path} cannot be read as {path.suffix[1:].upper()}, it may be damaged: {reason_of(error)}"
-        ) from error
-    if isinstance(loaded, trimesh.Scene):
-        if not loaded.geometry:
-            raise InputError(f"{path} is empty: it has no point to compare")
-        loaded = loaded.to_mesh()
-    vertices = np.array(loaded.vertices, np.float64, order="C").reshape(-1, 3)
-    _warn_of_lost_digits(path, vertices)
-    if isinstance(loaded, trimesh.Trimesh) and len(loaded.faces):
-        return Mesh(str(path), vertices, np.array(loaded.faces, np.int64))
-    return PointCloud(str(path), vertices)
 
 
 def _warn_of_lost_digits(path: Path, points: Points) -> None:
     """Map coordinates in 32-bit floats are rounded to decimetres: say so, the numbers would be worthless."""
     largest = float(np.abs(points).max(initial=0.0))
-    if np.isfinite(largest) and largest >= 1e5 and np.array_equal(points, points.astype(np.float32)):
+    if largest >= 1e5 and np.array_equal(points, points.astype(np.float32)):
         step = float(np.spacing(np.float32(largest)))
         logger.warning(
             "%s stores coordinates near %.0f in 32-bit floats, in steps of %.3g: write it with doubles or in "
@@ -131,37 +135,3 @@ def _warn_of_lost_digits(path: Path, points: Points) -> None:
             largest,
             step,
         )
-
-
-def _read_las(path: Path) -> PointCloud:
-    laspy = require("laspy")
-    try:
-        with laspy.open(path) as file:
-            points = np.empty((file.header.point_count, 3))
-            start = 0
-            for chunk in file.chunk_iterator(_LAS_CHUNK):
-                points[start : start + len(chunk)] = np.stack([chunk.x, chunk.y, chunk.z], axis=1)
-                start += len(chunk)
-            crs = _las_crs(file.header)
-    except (laspy.errors.LaspyException, ValueError, EOFError, OSError, RuntimeError) as error:
-        raise InputError(f"{path} cannot be read as LAS/LAZ, it may be damaged: {reason_of(error)}") from error
-    if start < len(points):
-        raise InputError(f"{path} is cut off: its header states {len(points)} points, it has {start}")
-    return PointCloud(str(path), points, crs, z_is_up=True)
-
-
-def _las_crs(header: Any) -> str | None:
-    """The coordinate system as 'projected (NAME)' or 'geographic (NAME)'; None without one."""
-    for record in [*header.vlrs, *(header.evlrs or [])]:
-        wkt = str(getattr(record, "string", "")).strip("\0 ").upper() if record.record_id == 2112 else ""
-        for kind, words in (("projected", _WKT_PROJECTED), ("geographic", _WKT_GEOGRAPHIC)):
-            if any(f"{word}[" in wkt for word in words):
-                name = str(record.string).split('"')
-                return f"{kind} ({name[1]})" if len(name) > 1 else kind
-    for record in header.vlrs:
-        keys = {key.id: key.value_offset for key in getattr(record, "geo_keys", [])}
-        if keys.get(_GEOTIFF_MODEL_TYPE) == _GEOTIFF_PROJECTED:
-            return f"projected (EPSG:{keys.get(_GEOTIFF_PROJECTED_CODE, '?')})"
-        if keys.get(_GEOTIFF_MODEL_TYPE) == _GEOTIFF_GEOGRAPHIC:
-            return "geographic (degrees)"
-    return None

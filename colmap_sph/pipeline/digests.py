@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_sph.errors import InputError, reason_of
+from colmap_sph.project.files import open_regular
 
 _DIGEST_BYTES = 16
 
@@ -55,7 +56,7 @@ def _feed(state: "hashlib.blake2b", value: object) -> None:
 def file_digest(path: Path) -> str:
     """Digest of a file's content; `InputError` where it cannot be read."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             return hashlib.file_digest(file, new_digest).hexdigest()
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({reason_of(error)}); check its permissions.") from error
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); check the file.") from error

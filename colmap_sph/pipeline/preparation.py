@@ -15,7 +15,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts, ImagePlaces
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.undistort import UndistortStage
 from colmap_sph.project.files import scratch_folder
@@ -133,9 +133,8 @@ class Preparation:
         originals = self._originals
         cameras = cameras_of_images(originals.model)
         sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
-        where = f"{originals.image_dir} is usable; check --images."
-        stage = CheckStage(self._context, sizes, originals.image_path, "originals", where, verify=self._verify)
-        return executor(stage)
+        places = ImagePlaces("originals", originals.model_dir, originals.image_dir)
+        return executor(CheckStage(self._context, sizes, places, verify=self._verify))
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""

@@ -23,7 +23,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.self_check import refuse_disagreement
-from colmap_sph.pipeline.stages.check_images import CheckStage
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
@@ -268,12 +268,10 @@ def with_good_images(
     workspace = context.workspace
     there = [view for view in context.scene.views if view.name not in to_come]
     sizes = {view.name: (view.width, view.height) for view in there}
-    where = f"{workspace.images_dir} is usable."
+    places = ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
     images: dict[str, str] = {}
     if there:
-        images = keys_of(
-            executor(CheckStage(context, sizes, workspace.image_path, "images", where, verify=verify))
-        )
+        images = keys_of(executor(CheckStage(context, sizes, places, verify=verify)))
     keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
     return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys)
 

@@ -20,7 +20,8 @@ from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.map_coordinates import local_origin
 from colmap_sph.project.map_files import check_map
 from colmap_sph.project.masks import read_mask
-from colmap_sph.project.sparse_model import cameras_of_images, load_model
+from colmap_sph.project.pair_lists import read_lines
+from colmap_sph.project.sparse_model import cameras_of_images, is_text, load_model, model_files
 from colmap_sph.project.workspace import MapKind, Workspace, mask_path
 from colmap_sph.scene import POINT
 
@@ -75,7 +76,8 @@ def fuse_by_colmap(
     with scratch_folder(scratch):
         try:
             source = workspace.root
-            if partners is not None or origin.any():
+            # What is read here may be more than COLMAP itself would read of a text model.
+            if partners is not None or origin.any() or is_text(model_files(workspace.sparse_dir)):
                 linked = model if partners is None else _with_tracks(model, partners)
                 link_workspace(workspace, linked, origin, scratch)
                 source = scratch
@@ -134,15 +136,10 @@ def _check_written(made: Workspace, num_points: int) -> None:
 
 def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
     """Return the model; `InputError` unless it has every image of ``fusion.cfg``, and these whole maps."""
-    try:
-        names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{workspace.fusion_cfg_path} cannot be read ({reason_of(error)}); list the images in it."
-        ) from error
+    names = read_lines(workspace.fusion_cfg_path, "list the images in it")
     model = load_model(workspace.sparse_dir)
     cameras = cameras_of_images(model)
-    for name in filter(None, map(str.strip, names)):
+    for name in filter(None, names):
         if name not in cameras:
             raise InputError(f"{workspace.fusion_cfg_path} names {name!r}, which is not in the model; remove it.")
         for path in (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)):

@@ -1,11 +1,16 @@
 """COLMAP's lists of images and pairs in a dense workspace: ``fusion.cfg`` and ``patch-match.cfg``."""
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.files import atomic_file
+from colmap_sph.project.files import atomic_file, open_regular
+from colmap_sph.project.given.image_names import KEYWORDS, WHITE
 from colmap_sph.scene import SourceImages
+
+_BYTE_ORDER_MARK = "\ufeff"
+_LIKE_KEYWORD = re.compile("__[a-z]+__")
 
 
 def fusion_cfg(names: Iterable[str]) -> bytes:
@@ -45,6 +50,23 @@ def _source_line(source: SourceImages) -> str:
     return source if isinstance(source, str) else ", ".join(source)
 
 
+def read_lines(path: Path, remedy: str) -> list[str]:
+    """Read the lines of a list as COLMAP does: without white space around them, which no name has.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read; the message ends with the remedy.
+    """
+    try:
+        with open_regular(path) as file:
+            text = file.read().decode()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); {remedy}.") from error
+    # Not `splitlines`, which also splits at signs that a name may have.
+    return [line.strip(WHITE) for line in text.removeprefix(_BYTE_ORDER_MARK).split("\n")]
+
+
 def read_patch_match_cfg(path: Path) -> dict[str, SourceImages]:
     """Read ``patch-match.cfg``: pairs of lines, a reference image and its sources.
 
@@ -58,11 +80,7 @@ def read_patch_match_cfg(path: Path) -> dict[str, SourceImages]:
     InputError
         The file cannot be read or is malformed; the message names the line.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({reason_of(error)}); mend or delete it.") from error
-    numbered = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1)]
+    numbered = enumerate(read_lines(path, "mend or delete it"), start=1)
     lines = [(number, line) for number, line in numbered if line and not line.startswith("#")]
     if len(lines) % 2:
         number, name = lines[-1]
@@ -71,14 +89,14 @@ def read_patch_match_cfg(path: Path) -> dict[str, SourceImages]:
     for (number, reference), (source_number, line) in zip(lines[::2], lines[1::2], strict=True):
         if reference in sources:
             raise InputError(f"{path}, line {number}: {reference!r} is listed twice; keep one of them.")
-        if reference.startswith("__"):
+        if reference in KEYWORDS:
             raise InputError(f"{path}, line {number}: {reference!r} stands where an image name is expected.")
         sources[reference] = _parse_sources(line, reference, f"{path}, line {source_number}")
     return sources
 
 
 def _parse_sources(line: str, reference: str, where: str) -> SourceImages:
-    words = [word.strip() for word in line.split(",")]
+    words = [word.strip(WHITE) for word in line.split(",")]
     if words == ["__all__"]:
         return "__all__"
     if words[0] == "__auto__":
@@ -86,7 +104,7 @@ def _parse_sources(line: str, reference: str, where: str) -> SourceImages:
             raise InputError(f"{where}: {line!r} should read '__auto__, N' with a number N above 0.")
         return int(words[1])
     names = [word for word in words if word]
-    if not names or any(name.startswith("__") for name in names):
+    if not names or any(_LIKE_KEYWORD.fullmatch(name) for name in names):
         raise InputError(f"{where}: {line!r} is not a list of image names, '__auto__, N' or '__all__'.")
     if reference in names:
         raise InputError(f"{where}: {reference!r} is listed as its own source image; remove it.")

@@ -1,11 +1,14 @@
 """COLMAP sparse models: found on disk, checked, read, and reduced to some of their images."""
 
-from pathlib import Path, PurePosixPath
+from collections.abc import Sequence
+from pathlib import Path
 
 import pycolmap
 
 from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.model_check import check_binary_file
+from colmap_sph.project.given.binary_model import read_binary_model
+from colmap_sph.project.given.image_names import check_names
+from colmap_sph.project.given.text_model import read_text_model
 
 MODEL_FILES = ("cameras", "images", "points3D")
 # Files that COLMAP 3.12 added; older models do not have them.
@@ -33,13 +36,8 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
     """
     sparse_dir = Path(sparse_dir)
     files = model_files(sparse_dir)
-    binary = files[0].suffix == ".bin"
-    if binary:
-        for path in files:
-            check_binary_file(path)
     try:
-        model = pycolmap.Reconstruction()
-        (model.read_binary if binary else model.read_text)(sparse_dir)
+        model = read_text_model(files) if is_text(files) else read_binary_model(files)
         registered = model.reg_image_ids()
         names = [model.image(image_id).name for image_id in registered]
     except UnicodeDecodeError as error:
@@ -55,23 +53,13 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         raise InputError(
             f"The model in {sparse_dir} has no registered image; run COLMAP's mapper or give another model."
         )
-    _check_names(names, sparse_dir)
+    check_names(names, sparse_dir)
     return model
 
 
-def _check_names(names: list[str], sparse_dir: Path) -> None:
-    """Every image needs a place of its own; COLMAP ends the process where one lies in the other's."""
-    known = set(names)
-    if len(known) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"The model in {sparse_dir} has two images named {twice!r}; rename one of them.")
-    for name in names:
-        inside = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in known), None)
-        if inside is not None:
-            raise InputError(
-                f"The model in {sparse_dir} has the images {inside!r} and {name!r}, "
-                "and a file cannot be a folder; rename one of them."
-            )
+def is_text(files: Sequence[Path]) -> bool:
+    """Whether the files of a model are text: COLMAP must be given what `load_model` read, not these files."""
+    return files[0].suffix == ".txt"
 
 
 def image_names(model: pycolmap.Reconstruction) -> list[str]:
@@ -119,9 +107,9 @@ def models_inside(folder: Path) -> list[Path]:
 def _files_in(folder: Path) -> list[Path]:
     """The files of the model in a folder, binary preferred to text; none where they are not complete."""
     for extension in _EXTENSIONS:
-        if all((folder / f"{stem}{extension}").is_file() for stem in MODEL_FILES):
+        if all((folder / f"{stem}{extension}").exists() for stem in MODEL_FILES):
             files = [folder / f"{stem}{extension}" for stem in (*MODEL_FILES, *RIG_FILES)]
-            return [path for path in files if path.is_file()]
+            return [path for path in files if path.exists()]
     return []
 
 

@@ -5,25 +5,24 @@ its digest, and decoded only if that is new.
 """
 
 import json
-import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.digests import file_digest
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.given.image_places import tell_problems
 from colmap_sph.project.images.depth import ValueSample, sample_values
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.state.records import read_json
+from colmap_sph.project.workspace import checked_name
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
-
-logger = logging.getLogger(__name__)
 
 Size = tuple[int, int]
 
@@ -67,6 +66,27 @@ class Known:
     sample: ValueSample | None = None
 
 
+@dataclass(frozen=True)
+class ImagePlaces:
+    """Where images are, and how to speak of them.
+
+    Attributes
+    ----------
+    what : {"originals", "images"}
+        As a workspace's own are called after they were undistorted: the second.
+    model_dir, folder : Path
+        The model that names them, and their folder.
+    """
+
+    what: Literal["originals", "images"]
+    model_dir: Path
+    folder: Path
+
+    def path(self, name: str) -> Path:
+        """File of an image; need not exist."""
+        return self.folder / checked_name(name)
+
+
 class CheckStage(Stage[str, ImageFile]):
     """Checks images. Its results have the digests of their contents as keys.
 
@@ -75,12 +95,7 @@ class CheckStage(Stage[str, ImageFile]):
     context : Context
     sizes : mapping of str to (int, int)
         Width and height of each image by its name.
-    path_of : callable
-        Name → file.
-    what : str
-        What they are called in messages and on disk: "originals" or "images".
-    where : str
-        The folder and the option to look at, for the message if none is good.
+    places : ImagePlaces
     verify : bool
         Whether what is known does not count.
     """
@@ -91,18 +106,16 @@ class CheckStage(Stage[str, ImageFile]):
         self,
         context: "Context",
         sizes: Mapping[str, Size],
-        path_of: Callable[[str], Path],
-        what: str,
-        where: str,
+        places: ImagePlaces,
         *,
         verify: bool = False,
     ) -> None:
         super().__init__(context, sorted(sizes))
-        self.name = f"check {what}"  # type: ignore[misc]
+        self.name = f"check {places.what}"  # type: ignore[misc]
         self._sizes = sizes
-        self._path_of = path_of
-        self._where = where
-        self._file = context.workspace.state_dir / f"{what}.json"
+        self._places = places
+        self._bad: dict[str, str] = {}
+        self._file = context.workspace.state_dir / f"{places.what}.json"
         known = (
             None if context.keys.fresh or verify else read_json(self._file, dict[str, Known], max_bytes=_MAX_BYTES)
         )
@@ -111,7 +124,7 @@ class CheckStage(Stage[str, ImageFile]):
 
     def job(self, item: str) -> Job[ImageFile]:
         """See `Stage.job`."""
-        image = ImageFile(self._path_of(item), self._sizes[item])
+        image = ImageFile(self._places.path(item), self._sizes[item])
         if not image.path.is_file():
             raise InputError(f"{image.path} is missing")
         stamp = _stamp_of(image.path)
@@ -129,12 +142,18 @@ class CheckStage(Stage[str, ImageFile]):
     def skip(self, item: str, reason: str) -> None:
         """See `Stage.skip`."""
         self.context.report.skipped_images[item] = reason
-        logger.warning("%s; left out", reason)
+        self._bad[item] = reason.removeprefix(f"{self._places.path(item)} ")
 
     def close(self, results: Mapping[str, Result]) -> None:
-        """Keep what is known of the good images."""
-        if not results:
-            raise InputError(f"None of the {len(self.items)} images in {self._where}")
+        """Tell what is wrong with bad images, and keep what is known of the good ones."""
+        places = self._places
+        problems = {
+            name: image_problem(places.path(name), *self._sizes[name]) or problem
+            for name, problem in sorted(self._bad.items())
+        }
+        tell_problems(
+            places.model_dir, places.folder, problems, len(self.items), undistorted=places.what == "images"
+        )
         good = {
             name: replace(self._seen[name], sample=result.facts.sample)
             for name, result in results.items()

@@ -22,6 +22,20 @@ _BAND_ROWS = 256
 _LUMA = (0.299, 0.587, 0.114)
 
 
+class WrongSize(str):
+    """What is wrong with an image of another size (width, height) than its camera, as the end of a sentence."""
+
+    found: tuple[int, int]
+    wanted: tuple[int, int]
+
+    def __new__(cls, found: tuple[int, int], wanted: tuple[int, int]) -> "WrongSize":
+        words = f"has {found[0]} x {found[1]} pixels, but its camera {wanted[0]} x {wanted[1]}"
+        problem = super().__new__(cls, words)
+        problem.found = found
+        problem.wanted = wanted
+        return problem
+
+
 def image_problem(path: Path, width: int, height: int) -> str | None:
     """Say what is wrong with an image, as the end of a sentence, or return None.
 
@@ -43,7 +57,7 @@ def image_problem(path: Path, width: int, height: int) -> str | None:
         header = read_header(path)
         # Before anything is decoded: a small file can hold a huge image.
         if (header.width, header.height) != (width, height):
-            return f"has {header.width} x {header.height} pixels, but its camera {width} x {height}"
+            return WrongSize((header.width, header.height), (width, height))
         read_pixels(path)
     except OSError as error:
         return f"cannot be read ({reason_of(error)})"

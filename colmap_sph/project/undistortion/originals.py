@@ -1,7 +1,6 @@
 """What is to be undistorted: a sparse model, its images and their masks, found."""
 
 import hashlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pycolmap
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import refuse_panoramas
+from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import image_names, load_model, model_files
 from colmap_sph.project.workspace import Workspace, checked_name, mask_path
@@ -89,25 +89,3 @@ def read_originals(project: Project) -> Originals:
             f"The image folder {images} {'is a file' if is_file else 'does not exist'}; check --images."
         )
     return Originals(project.model, images, project.masks, model)
-
-
-def find_images(model_dir: Path, names: Sequence[str]) -> Path:
-    """Find the image folder of a model by COLMAP's usual layouts.
-
-    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
-    folder that holds most of the model's images is taken, the first among equals.
-
-    Raises
-    ------
-    InputError
-        None of the folders holds any image of the model; the message lists them.
-    """
-    # Of a link to a model both where it is and where it leads to.
-    places = (Path.cwd() / model_dir, model_dir.resolve())
-    parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
-    folders = list(dict.fromkeys(parent / "images" for parent in parents))
-    found = [sum((folder / name).is_file() for name in names) for folder in folders]
-    if max(found) == 0:
-        tried = ", ".join(str(folder) for folder in folders)
-        raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
-    return folders[found.index(max(found))]

@@ -1,4 +1,4 @@
-"""Are the binary files of a COLMAP model whole?
+"""COLMAP binary model → pycolmap model, once its files are known to be whole.
 
 COLMAP's own readers trust the counts in the files: a truncated ``cameras.bin`` gives an invented calibration
 without a word, and a damaged ``points3D.bin`` or ``frames.bin`` keeps them busy for minutes. So each file is
@@ -14,27 +14,45 @@ from pathlib import Path
 import pycolmap
 
 from colmap_sph.errors import InputError, reason_of
+from colmap_sph.project.files import open_regular
 
 _POSE_BYTES = 7 * 8
 
 
-def check_binary_file(path: Path) -> None:
-    """Raise `InputError` unless `path` holds exactly the records it announces.
+def read_binary_model(files: list[Path]) -> pycolmap.Reconstruction:
+    """Read a binary model.
 
     Parameters
     ----------
-    path : Path
-        ``cameras.bin``, ``images.bin``, ``points3D.bin``, ``rigs.bin`` or ``frames.bin``.
+    files : list of Path
+        ``cameras.bin``, ``images.bin`` and ``points3D.bin``, with or without ``rigs.bin`` and
+        ``frames.bin``, of one folder.
+
+    Raises
+    ------
+    InputError
+        A file cannot be read, or does not hold exactly the records it announces.
+    Exception
+        COLMAP's own, where the records contradict each other; for the caller to put into a sentence.
     """
+    for path in files:
+        _check_file(path)
+    model = pycolmap.Reconstruction()
+    model.read_binary(files[0].parent)
+    return model
+
+
+def _check_file(path: Path) -> None:
+    """Raise `InputError` unless `path` holds exactly the records it announces."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             size = path.stat().st_size
             if size < 8:
                 raise InputError(f"{path} is truncated; export the model from COLMAP again.")
             with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 end = _walk(data, _RECORD_END[path.name])
     except OSError as error:
-        raise InputError(f"{path} cannot be read ({reason_of(error)}); check its permissions.") from error
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); check the file.") from error
     if end != size:
         raise InputError(f"{path} is truncated or damaged; export the model from COLMAP again.")
 

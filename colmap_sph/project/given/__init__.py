@@ -1,0 +1,1 @@
+"""What is given, looked at before COLMAP's library sees it: files of models, names, where images are."""

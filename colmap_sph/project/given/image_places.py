@@ -1,0 +1,201 @@
+"""Where a model's images are, and what those that cannot be used have in common: one sentence in place of many."""
+
+import logging
+import os
+import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import islice
+from pathlib import Path, PurePosixPath
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.images.reading import WrongSize
+
+_Size = tuple[int, int]
+
+logger = logging.getLogger(__name__)
+
+# More files than these are not looked through for another spelling of a name.
+_MAX_FILES = 500_000
+_MAX_FACTOR = 16
+_UNDISTORT = "give the sparse model with --model to have them undistorted anew"
+_SHARES = {2: "half", 3: "a third of", 4: "a quarter of", 8: "an eighth of"}
+_SLASHES = (
+    'python -c "import pycolmap; m = pycolmap.Reconstruction({model!r}); '
+    "[setattr(i, 'name', i.name.replace(chr(92), '/')) for i in m.images.values()]; m.write({model!r})\""
+)
+
+
+def find_images(model_dir: Path, names: Sequence[str]) -> Path:
+    """Find the image folder of a model by COLMAP's usual layouts.
+
+    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
+    folder that holds most of the model's images is taken, the first among equals.
+
+    Raises
+    ------
+    InputError
+        None of the folders holds any image of the model; the message lists them, or says what one of them has
+        under another spelling.
+    """
+    # Of a link to a model both where it is and where it leads to.
+    places = (Path.cwd() / model_dir, model_dir.resolve())
+    parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
+    folders = list(dict.fromkeys(parent / "images" for parent in parents))
+    found = [sum((folder / name).is_file() for name in names) for folder in folders]
+    if max(found) > 0:
+        return folders[found.index(max(found))]
+    for folder in folders:
+        misspelled = _common_misspelling(model_dir, folder, names)
+        if misspelled:
+            raise InputError(misspelled)
+    tried = ", ".join(str(folder) for folder in folders)
+    raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
+
+
+def tell_problems(
+    model_dir: Path, folder: Path, problems: Mapping[str, str], num_images: int, *, undistorted: bool
+) -> None:
+    """Warn of images that are left out.
+
+    Parameters
+    ----------
+    model_dir, folder : Path
+        The model, and where its images are looked for.
+    problems : mapping of str to str
+        What is wrong with an image, by its name, as `images.image_problem` says it.
+    num_images : int
+        Of the model.
+    undistorted : bool
+        The images are those of a dense workspace, and not as they were taken.
+
+    Raises
+    ------
+    InputError
+        No image is left; the message says what is wrong with all of them, where that is one thing.
+    """
+    missing = [name for name in problems if not (folder / name).exists()]
+    if len(problems) == num_images:
+        common = _common_size(folder, problems, undistorted) or _common_misspelling(model_dir, folder, missing)
+        if common:
+            raise InputError(common)
+    spelled = other_spellings(folder, missing)
+    for name, problem in problems.items():
+        instead = f", but there is {spelled[name]!r}" if name in spelled else ""
+        logger.warning("%s %s%s; left out", folder / name, problem, instead)
+    if len(problems) == num_images:
+        remedy = _UNDISTORT if undistorted else "check --images"
+        raise InputError(f"None of the model's {num_images} images in {folder} is usable; {remedy}.")
+
+
+def other_spellings(folder: Path, names: Iterable[str]) -> dict[str, str]:
+    r"""Files whose names differ from those of images only in ways that other systems do not tell apart.
+
+    Parameters
+    ----------
+    folder : Path
+    names : iterable of str
+        Of images that are not there.
+
+    Returns
+    -------
+    dict
+        Name → name of the file, relative to the folder: with ``/`` in place of ``\``, in other case, or with its
+        accents written in another way. Only where there is one such file.
+    """
+    wanted = set(names)
+    if not wanted:
+        return {}
+    files: dict[str, list[str]] = {}
+    for file in islice(_files_below(folder), _MAX_FILES):
+        files.setdefault(_folded(file), []).append(file)
+    found = {name: files.get(_folded(name), []) for name in wanted}
+    return {name: alike[0] for name, alike in found.items() if len(alike) == 1}
+
+
+def _files_below(folder: Path) -> Iterable[str]:
+    for place, _, files in os.walk(folder):
+        within = os.path.relpath(place, folder)
+        yield from (file if within == "." else f"{within}/{file}" for file in files)
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
+
+
+def _common_misspelling(model_dir: Path, folder: Path, names: Sequence[str]) -> str | None:
+    """Say how a folder spells the names of a model's images, of which it has none; None where it does not."""
+    spelled = other_spellings(folder, names)
+    if not spelled:
+        return _other_folder(model_dir, folder, names)
+    name = min(spelled)
+    if all("\\" in each and each.replace("\\", "/") == file for each, file in spelled.items()):
+        remedy = f"write the names in the model with /: {_SLASHES.format(model=str(model_dir))}"
+    else:
+        remedy = "rename the files as the model has them"
+    # As it is typed: `repr` doubles each \.
+    called = repr(name).replace(r"\\", "\\")
+    return (
+        f"The model {model_dir} calls an image {called}, and {folder} has {spelled[name]!r} "
+        f"(so for {len(spelled)} of {len(names)} images); {remedy}."
+    )
+
+
+def _other_folder(model_dir: Path, folder: Path, names: Sequence[str]) -> str | None:
+    """Say where the images are, if all in another folder than the model's names say."""
+    files = set(islice(_files_below(folder), _MAX_FILES))
+    for name in names:
+        parts = PurePosixPath(name).parts
+        # The model's names begin with folders above, or leave out folders below.
+        if len(parts) > 1 and "/".join(parts[1:]) in files and (folder.parent / name).is_file():
+            return (
+                f"The model {model_dir} calls an image {name!r}, and {folder} has {'/'.join(parts[1:])!r}; "
+                f"give --images {folder.parent}."
+            )
+    below = {file.partition("/")[0] for file in files if file.partition("/")[2] in names}
+    if len(below) == 1:
+        there = folder / below.pop()
+        return f"The images of {model_dir} are not in {folder}, but in {there}; give that as --images."
+    return None
+
+
+def _common_size(folder: Path, problems: Mapping[str, str], undistorted: bool) -> str | None:
+    """Say how the sizes of images differ from those of their cameras, if all in one way."""
+    wrong = {name: problem for name, problem in problems.items() if isinstance(problem, WrongSize)}
+    if not wrong:
+        return None
+    name, example = min(wrong.items())
+    sizes = [(each.found, each.wanted) for each in wrong.values()]
+    way, remedy = _way_and_remedy(sizes, longest=max(example.found))
+    if not way:
+        return None
+    return (
+        f"All {len(wrong)} images in {folder} {way} their cameras (such as {name!r}, which {example}); "
+        f"{_UNDISTORT if undistorted else remedy}."
+    )
+
+
+def _way_and_remedy(sizes: list[tuple[_Size, _Size]], longest: int) -> tuple[str, str]:
+    """Say how sizes found differ from those wanted, and what to do; empty where not all differ in one way."""
+    if all(found == wanted[::-1] for found, wanted in sizes):
+        return (
+            "are turned by 90 degrees against",
+            "give the images as they were when the model was made, before or after they were turned",
+        )
+    for factor in range(2, _MAX_FACTOR + 1):
+        if all(_is_reduced(wanted, found, factor) for found, wanted in sizes):
+            return (
+                f"have exactly {_SHARES.get(factor, f'1/{factor} of')} the size of",
+                f"give the folder of the full-size images as --images, and --max-image-size {longest} if they are "
+                "to be as small as these",
+            )
+        if all(_is_reduced(found, wanted, factor) for found, wanted in sizes):
+            return (
+                f"have exactly {factor} times the size of",
+                "give the folder of the reduced images, from which the model was made, as --images",
+            )
+    return "", ""
+
+
+def _is_reduced(full: _Size, reduced: _Size, factor: int) -> bool:
+    """Whether a size is another one divided by a factor, rounded up or down."""
+    return all(abs(f / factor - r) < 1 for f, r in zip(full, reduced, strict=True))
