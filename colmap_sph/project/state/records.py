@@ -222,7 +222,7 @@ def invalidate(record: Path, state: Literal["void", "doubtful"] = "void") -> Non
 
 
 def altered_files(known: Record | None, files: Sequence[Path]) -> list[Path]:
-    """Those of `files` which are there, but not as a record of ours left them.
+    """Those of `files` which are there, but not as a record of ours left them; no folders, which writing refuses.
 
     Parameters
     ----------
@@ -230,7 +230,7 @@ def altered_files(known: Record | None, files: Sequence[Path]) -> list[Path]:
         None: there is no record of them.
     files : sequence of Path
     """
-    there = [path for path in files if os.path.lexists(path)]
+    there = [path for path in files if os.path.lexists(path) and (path.is_symlink() or not path.is_dir())]
     if known is None or not there:
         return there
     if known.state == "making":
