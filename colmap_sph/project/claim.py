@@ -53,14 +53,21 @@ def check_links(workspace: Workspace, *, is_given: bool) -> None:
         Whether its images, model and masks are the user's, which are only read and may be anywhere.
     """
     written = [workspace.state_dir, workspace.stereo_dir, *workspace.cloud_paths]
-    if not is_given:
-        written += [workspace.images_dir, workspace.sparse_dir, workspace.masks_dir]
     # Both are removed as a whole before anything is written there, and have links of our own inside.
     remade = {workspace.local_dir, workspace.fusion_scratch_dir}
     check_ways_out(workspace.root, written, unlinked=remade)
+    if not is_given:
+        made = (workspace.images_dir, workspace.sparse_dir, workspace.masks_dir)
+        check_ways_out(workspace.root, made, remedy="give the folder as --workspace, which only reads there")
 
 
-def check_ways_out(root: Path, places: Iterable[Path], *, unlinked: Collection[Path] = ()) -> None:
+def check_ways_out(
+    root: Path,
+    places: Iterable[Path],
+    *,
+    unlinked: Collection[Path] = (),
+    remedy: str = "choose another --output",
+) -> None:
     """Raise `OutputError` where a link at one of the places, or in the folders there, leads out of a folder.
 
     Parameters
@@ -71,6 +78,8 @@ def check_ways_out(root: Path, places: Iterable[Path], *, unlinked: Collection[P
         Files and folders in it; need not exist.
     unlinked : collection of Path
         Folders that must not be links at all, and are not looked into.
+    remedy : str
+        What the user may do instead.
     """
     top = Path(os.path.realpath(root))
     waiting = list(places)
@@ -81,7 +90,7 @@ def check_ways_out(root: Path, places: Iterable[Path], *, unlinked: Collection[P
         if path.is_symlink() and (path in unlinked or not target.is_relative_to(top)):
             raise OutputError(
                 f"{path} is a link to {target}, where this program would write and delete; put a folder or file "
-                "of its own in its place, or choose another --output."
+                f"of its own in its place, or {remedy}."
             )
         if path not in unlinked and target not in seen:
             seen.add(target)
