@@ -245,6 +245,7 @@ def test_users_own_files_in_a_workspace_stay(tmp_path: Path, caplog: pytest.LogC
     prepare(sparse, workspace.root)
     assert {path: path.read_bytes() for path in theirs} == theirs
     assert f"{workspace.sparse_dir} was changed" in caplog.text
+    assert f"{workspace.image_path('a.png')} or its mask was changed" in caplog.text
     caplog.clear()
     prepare(sparse, workspace.root, overwrite=True)
     # What has to make room is named, and kept beside the new one.

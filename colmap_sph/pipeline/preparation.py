@@ -161,7 +161,9 @@ class Preparation:
         for sentence in describe_ranges(ranges):
             logger.info(sentence)
         values = {name: ranges[sample.kind] for name, sample in samples.items()}
-        return executor(UndistortStage(self._context, self._originals, keys_of(images), values))
+        return executor(
+            UndistortStage(self._context, self._originals, keys_of(images), values, verify=self._verify)
+        )
 
     def finish(self, results: Mapping[str, Result]) -> None:
         """Give the workspace its model, where that is not there for these images."""

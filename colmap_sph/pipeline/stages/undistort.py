@@ -18,7 +18,14 @@ from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
 from colmap_sph.project.state.ownership import undistorted_place
-from colmap_sph.project.state.records import altered_files, begin, read_record, vouch, vouched_facts
+from colmap_sph.project.state.records import (
+    altered_files,
+    begin,
+    read_record,
+    vouch,
+    vouched_facts,
+    whole_digests,
+)
 from colmap_sph.project.undistortion.image import ImageToUndistort, undistort
 from colmap_sph.project.undistortion.originals import Originals
 from colmap_sph.project.undistortion.process import ChildProcess
@@ -120,6 +127,8 @@ class UndistortStage(Stage[str, UndistortTask]):
         Digest of the content of each original image that is good.
     values : mapping of str to ValueRange
         What becomes black and white, of each of them that has more than 8 bits.
+    verify : bool
+        Whether to look at every byte of what is there.
     """
 
     name = "undistort"
@@ -131,11 +140,14 @@ class UndistortStage(Stage[str, UndistortTask]):
         originals: Originals,
         digests: Mapping[str, str],
         values: Mapping[str, ValueRange],
+        *,
+        verify: bool = False,
     ) -> None:
         super().__init__(context, sorted(digests))
         self._originals = originals
         self._digests = digests
         self._values = values
+        self._verify = verify
         self._cameras = cameras_of_images(originals.model)
         self._numbers = {name: number for number, name in enumerate(self.items)}
 
@@ -164,10 +176,16 @@ class UndistortStage(Stage[str, UndistortTask]):
             record,
             key,
         )
-        known = vouched_facts(record, key, files, Facts) is not None or self._is_changed_by_user(task, files)
+        known = self._is_as_made(task, files) or self._is_changed_by_user(task, files)
         pixels = camera.width * camera.height
         cost = Cost(_SECONDS * pixels, _PROCESS_BYTES + _BYTES * pixels, _FILE_BYTES * pixels)
         return Job(key, Facts() if known else None, cost, task)
+
+    def _is_as_made(self, task: UndistortTask, files: list[Path]) -> bool:
+        """Whether image and mask are there as they were made; with `verify` every byte of them is looked at."""
+        if vouched_facts(task.record, task.key, files, Facts) is None:
+            return False
+        return not self._verify or whole_digests(task.record, len(files)) == tuple(map(whole_digest, files))
 
     def _is_changed_by_user(self, task: UndistortTask, files: list[Path]) -> bool:
         """Whether an image was made and then exchanged for another good one, or its mask was: they are used."""
@@ -176,7 +194,10 @@ class UndistortStage(Stage[str, UndistortTask]):
         if not is_made or not all(path.is_file() for path in files):
             return False
         camera = task.image.undistorted_camera
-        return image_problem(task.target, camera.width, camera.height) is None
+        if image_problem(task.target, camera.width, camera.height) is not None:
+            return False
+        logger.warning("%s or its mask was changed since this program made it; used as it is", task.target)
+        return True
 
     @contextmanager
     def opened(self) -> Iterator[None]:
