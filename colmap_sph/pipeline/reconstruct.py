@@ -20,7 +20,7 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.self_check import refuse_disagreement
+from colmap_sph.pipeline.self_check import judge_agreement, refuse_disagreement
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
@@ -173,6 +173,7 @@ def reconstruct(
         scene = wanted_scene(scene, selection)
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         go_through_stages(context, selection.unique_pairs(), execute)
+        judge_agreement(report)
     _write_report(context)
     refuse_disagreement(report)
     if not report.points:

@@ -7,9 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.pipeline.records import forget, vouch, vouched_facts
-from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
-from colmap_sph.stereo.agreement import Agreement
 
 MAP_BYTES = 16.0
 """Bytes on disk per pixel, of a depth and a normal map."""
