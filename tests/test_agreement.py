@@ -16,12 +16,13 @@ from colmap_sph.app.run_command import print_summary
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import RunReport
-from colmap_sph.pipeline.self_check import refuse_disagreement, report_agreement
+from colmap_sph.pipeline.self_check import judge_agreement, refuse_disagreement
+from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
-from colmap_sph.stereo.agreement import Agreement, SparseTracks, compare_with_sparse
+from colmap_sph.stereo.agreement import SparseTracks, compare_with_sparse
 
 OPTIONS = RunOptions(threads=2)
 
@@ -38,7 +39,7 @@ def exact(tmp_path_factory):
 
 
 def agreement_of(scene, name, depth, mask=None):
-    return compare_with_sparse(scene.view(name), depth, SparseTracks(scene).sights(name), mask)
+    return Agreement(*compare_with_sparse(scene.view(name), depth, SparseTracks(scene).sights(name), mask))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -62,7 +63,7 @@ def test_points_under_a_mask_are_not_asked(exact):
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, : WIDTH // 2] = 0
     pixels, _ = scene.view("a.png").project(scene.points[scene.view("a.png").point_indices])
-    right = np.count_nonzero(np.rint(pixels[:, 0]) >= WIDTH // 2)
+    right = int(np.count_nonzero(np.rint(pixels[:, 0]) >= WIDTH // 2))
     assert 0 < right < len(pixels)
     assert agreement_of(scene, "a.png", maps["a.png"], mask) == Agreement(right, right, right)
 
@@ -109,8 +110,13 @@ def test_points_without_parallax_tell_nothing(exact):
 
 
 def reported(agreements):
-    report = RunReport()
-    report_agreement(report, agreements)
+    """What the confirmation and the end of a run put into the report."""
+    report = RunReport(
+        agreement={name: found.share for name, found in agreements.items()},
+        sparse_points=sum(agreements.values(), Agreement()),
+    )
+    report.overall_agreement = report.sparse_points.share
+    judge_agreement(report)
     return report
 
 
@@ -164,8 +170,9 @@ def project(four, tmp_path):
 
 def test_sound_input_agrees_and_a_rerun_knows_it(project):
     report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
-    assert report.overall_agreement > 0.95
-    assert sorted(report.agreement) == FOUR_NAMES and min(report.agreement.values()) > 0.9
+    assert report.overall_agreement is not None and report.overall_agreement > 0.95
+    assert sorted(report.agreement) == FOUR_NAMES
+    assert all(share is not None and share > 0.9 for share in report.agreement.values())
     assert report.doubts == report.refusal == ""
     stored = json.loads((project / "dense/colmap_sph/report.json").read_text())
     assert (stored["agreement"], stored["overall_agreement"]) == (report.agreement, report.overall_agreement)

@@ -260,6 +260,17 @@ def test_a_missing_map_is_named(workspace):
         fuse_by_colmap(workspace, OURS.for_colmap())
 
 
+@pytest.mark.parametrize("kind", ["missing", "cut off"])
+def test_a_missing_image_is_named(workspace, kind):
+    """COLMAP would leave it out and not say so."""
+    path = workspace.image_path("c.png")
+    path.write_bytes(path.read_bytes()[:60])
+    if kind == "missing":
+        path.unlink()
+    with pytest.raises(InputError, match=str(path)):
+        fuse_by_colmap(workspace, OURS.for_colmap())
+
+
 def test_fusion_cfg_that_does_not_fit(workspace):
     workspace.fusion_cfg_path.write_text("a.png\nz.png\n")
     with pytest.raises(InputError, match=r"z\.png"):

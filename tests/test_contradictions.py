@@ -78,20 +78,23 @@ def test_the_option_that_leaves_nothing_is_named(project):
         colmap_sph.run(workspace=project / "dense", options=options)
 
 
-def test_pictures_without_any_structure_are_not_blamed_on_confirmation(project):
-    for name in FOUR_NAMES:
-        write_picture(project / "dense/images" / name, np.full((*FOUR_SIZE[::-1], 3), 128, np.uint8))
-    with pytest.raises(NoResultError) as caught:
-        colmap_sph.run(workspace=project / "dense", options=OPTIONS)
-    assert "confirmed" not in str(caught.value) and "found any depth" in str(caught.value)
+def mask_all(project, names):
+    for name in names:
+        write_picture(project / "dense/masks" / f"{name}.png", np.zeros((*FOUR_SIZE[::-1], 3), np.uint8))
 
 
 def test_a_mask_of_everything_is_named(project):
-    mask = project / "dense/masks" / f"{FOUR_NAMES[0]}.png"
-    mask.parent.mkdir()
-    write_picture(mask, np.zeros((*FOUR_SIZE[::-1], 3), np.uint8))
+    mask_all(project, FOUR_NAMES[:1])
     report = colmap_sph.run(workspace=project / "dense", options=OPTIONS)
     assert "mask" in report.skipped_images[FOUR_NAMES[0]]
+
+
+def test_masks_of_everything_are_not_blamed_on_confirmation(project):
+    mask_all(project, FOUR_NAMES)
+    with pytest.raises(NoResultError) as caught:
+        colmap_sph.run(workspace=project / "dense", options=OPTIONS)
+    assert "confirmed" not in str(caught.value)
+    assert "found any depth" in str(caught.value) and "black in the masks" in str(caught.value)
 
 
 # ---- what could not be read --------------------------------------------------------------------------------

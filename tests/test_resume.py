@@ -561,7 +561,7 @@ def test_plan_of_the_fusion(finished: Finished) -> None:
     """The budget bounds ours, not COLMAP's, and more partners take more time."""
 
     def plan(**changes: Any) -> Plan:
-        tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(min_num_pixels=3, **changes))
+        tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(max_depth_error=0.011, **changes))
         return make_plan(Project(workspace=finished.dense), tight)
 
     ours, theirs = plan(), plan(method="colmap")

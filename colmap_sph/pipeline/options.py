@@ -1,7 +1,6 @@
 """Options of all stages in one record: what the command line, the Python API and the pipeline share."""
 
 import os
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 
 from colmap_sph.errors import OptionError
@@ -58,6 +57,15 @@ class RunOptions:
             raise OptionError(f"fusion.mask_path: the folder {folder} does not exist.", "fusion.mask_path")
         backend()  # what COLMAP_SPH_KERNELS asks for must be there, too
 
+    def changed(self, *stages: str) -> list[str]:
+        """Options of some stages that are not at their defaults, as they are typed: "--vote.tolerance 1.0"."""
+        changed = []
+        for stage in stages:
+            chosen, usual = (asdict(getattr(each, stage)) for each in (self, RunOptions()))
+            different = {name: value for name, value in chosen.items() if value != usual[name]}
+            changed += [f"--{stage}.{name.replace('_', '-')} {value}" for name, value in different.items()]
+        return changed
+
     @property
     def num_threads(self) -> int:
         """Worker threads to use."""
@@ -67,14 +75,3 @@ class RunOptions:
     def memory_budget(self) -> int:
         """Bytes of memory the run may use."""
         return budget(parse_memory(self.memory))
-
-
-def changed_options(options: RunOptions, stages: Sequence[str]) -> list[str]:
-    """Options of some stages that are not at their defaults, as they are typed: "--vote.tolerance 1.0"."""
-    changed = []
-    for stage in stages:
-        chosen, usual = (asdict(getattr(each, stage)) for each in (options, RunOptions()))
-        changed += [
-            f"--{stage}.{name} {value}".replace("_", "-") for name, value in chosen.items() if value != usual[name]
-        ]
-    return changed

@@ -22,7 +22,7 @@ from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.self_check import refuse_disagreement
+from colmap_sph.pipeline.self_check import judge_agreement, refuse_disagreement
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
@@ -201,6 +201,7 @@ def reconstruct(
         if verify:
             _verify(context)
         go_through_stages(context, selection.unique_pairs(), execute)
+        judge_agreement(report)
     _write_report(context)
     refuse_disagreement(report)
     if not report.points:

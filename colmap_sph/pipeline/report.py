@@ -3,6 +3,8 @@
 from dataclasses import dataclass, field
 from typing import Protocol
 
+from colmap_sph.pipeline.stages.facts import Agreement
+
 
 class Progress(Protocol):
     """What the pipeline tells a progress display."""
@@ -47,9 +49,11 @@ class RunReport:
         Image name → share of its pixels with a geometric depth.
     agreement : dict
         Image name → share of the sparse points it observes that agree with its geometric depth map; None where
-        there are none that tell.
+        fewer than ten tell.
     overall_agreement : float or None
         The same of all images together.
+    sparse_points : Agreement
+        The numbers behind it.
     doubts : str
         Which images agree with few sparse points, and what that means.
     refusal : str
@@ -75,6 +79,7 @@ class RunReport:
     coverage: dict[str, float] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None
+    sparse_points: Agreement = field(default_factory=Agreement)
     doubts: str = ""
     refusal: str = ""
     points: int = 0

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.report import RunReport
-from colmap_sph.stereo.agreement import Agreement
+from colmap_sph.pipeline.stages.facts import Agreement
 
 logger = logging.getLogger(__name__)
 
@@ -16,29 +16,25 @@ _DOUBTED_SHARE = 0.15
 _REFUSED_SHARE = 0.1
 # Where so large a share of the points with a depth agrees, it may also be that hardly any was matched.
 _RIGHT_SHARE_OF_FOUND = 0.5
-# Fewer points say nothing.
-_FEWEST_OF_IMAGE = 10
+# Fewer points say nothing of a run.
 _FEWEST = 30
 _MAX_NAMED = 10
 
 
-def report_agreement(report: RunReport, agreements: Mapping[str, Agreement]) -> None:
-    """Put the agreement of every image, and of all, into the report; warn where it is low.
+def judge_agreement(report: RunReport) -> None:
+    """Put into the report which images agree with few sparse points, or that hardly any image does.
 
     Parameters
     ----------
     report : RunReport
-    agreements : mapping of str to Agreement
-        Of each image with geometric maps.
+        With the agreement of its images.
     """
-    total = sum(agreements.values(), Agreement())
-    report.agreement = {name: found.share for name, found in agreements.items()}
-    report.overall_agreement = total.share
-    if total.share is None:
+    total = report.sparse_points
+    shares = {name: share for name, share in report.agreement.items() if share is not None}
+    doubted = {name: share for name, share in shares.items() if share < _DOUBTED_SHARE}
+    if not total.tested:
         logger.info("There are no sparse points to check the depth maps against")
-        return
-    doubted = {name: found.share for name, found in agreements.items() if _is_doubted(found)}
-    if _is_refused(total):
+    elif total.tested >= _FEWEST and total.agreeing < _REFUSED_SHARE * total.tested:
         report.refusal = _refusal(total)
     elif doubted:
         report.doubts = _doubts(doubted)
@@ -49,14 +45,6 @@ def refuse_disagreement(report: RunReport) -> None:
     """Raise `NoResultError` where hardly any sparse point agrees with the depth maps."""
     if report.refusal:
         raise NoResultError(report.refusal)
-
-
-def _is_doubted(found: Agreement) -> bool:
-    return found.tested >= _FEWEST_OF_IMAGE and found.agreeing < _DOUBTED_SHARE * found.tested
-
-
-def _is_refused(total: Agreement) -> bool:
-    return total.tested >= _FEWEST and total.agreeing < _REFUSED_SHARE * total.tested
 
 
 def _refusal(total: Agreement) -> str:
@@ -72,8 +60,8 @@ def _refusal(total: Agreement) -> str:
     )
 
 
-def _doubts(doubted: Mapping[str, float | None]) -> str:
-    shares = sorted((share or 0.0, name) for name, share in doubted.items())
+def _doubts(doubted: Mapping[str, float]) -> str:
+    shares = sorted((share, name) for name, share in doubted.items())
     named = ", ".join(f"{name} ({share:.0%})" for share, name in shares[:_MAX_NAMED])
     if len(shares) > _MAX_NAMED:
         named += f" and {len(shares) - _MAX_NAMED} more"

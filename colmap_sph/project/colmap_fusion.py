@@ -17,6 +17,7 @@ from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.cloud_files import check_places, link_workspace, move_cloud_into_place
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import make_dir, scratch_folder
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.map_coordinates import local_origin
 from colmap_sph.project.map_files import check_map
 from colmap_sph.project.masks import read_mask
@@ -135,7 +136,7 @@ def _check_written(made: Workspace, num_points: int) -> None:
 
 
 def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
-    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, and these whole maps."""
+    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, whole as their maps."""
     names = read_lines(workspace.fusion_cfg_path, "list the images in it")
     model = load_model(workspace.sparse_dir)
     cameras = cameras_of_images(model)
@@ -146,6 +147,10 @@ def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
             if not path.is_file():
                 raise InputError(f"The map {path} is missing; compute it, or remove {name!r} from fusion.cfg.")
         shape = (cameras[name].height, cameras[name].width)
+        # COLMAP leaves out an image that it cannot find, without a word to its caller.
+        problem = image_problem(workspace.image_path(name), shape[1], shape[0])
+        if problem is not None:
+            raise InputError(f"{workspace.image_path(name)} {problem}; mend it and run again.")
         check_map(workspace.depth_map_path(name, kind), shape)
         check_map(workspace.normal_map_path(name, kind), (*shape, 3))
     return model

@@ -13,7 +13,7 @@ from scipy import sparse
 from colmap_sph.scene import Scene, View
 
 # Sparse points of a view to look at, an even part of them.
-_MAX_POINTS = 1000
+_MAX_POINTS = 500
 # A map agrees with a point where in no image that observes it the two lie farther apart than this: a few times the
 # noise of structure from motion, of a pixel or less. ...
 _MAX_DISTANCE = 4.0
@@ -42,33 +42,6 @@ class SparseSights:
     point: NDArray[np.int64]
     at_center: NDArray[np.float64]
     at_point: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """How far a view's depth map agrees with its sparse points.
-
-    Attributes
-    ----------
-    tested : int
-        Sparse points in the view's sight, and seen by others under enough parallax to tell their depth.
-    found : int
-        Those of them with a depth in the map.
-    agreeing : int
-        Those of them whose depth agrees.
-    """
-
-    tested: int = 0
-    found: int = 0
-    agreeing: int = 0
-
-    def __add__(self, other: "Agreement") -> "Agreement":
-        return Agreement(self.tested + other.tested, self.found + other.found, self.agreeing + other.agreeing)
-
-    @property
-    def share(self) -> float | None:
-        """Agreeing points of those tested; None where there is none. A point without a depth does not agree."""
-        return self.agreeing / self.tested if self.tested else None
 
 
 class SparseTracks:
@@ -111,7 +84,7 @@ class SparseTracks:
 
 def compare_with_sparse(
     view: View, depth: NDArray[np.float32], sights: SparseSights, mask: NDArray[np.uint8] | None = None
-) -> Agreement:
+) -> tuple[int, int, int]:
     """Compare a view's depth map with its sparse points.
 
     Parameters
@@ -125,7 +98,12 @@ def compare_with_sparse(
 
     Returns
     -------
-    Agreement
+    tested : int
+        Sparse points in the view's sight, and seen by others under enough parallax to tell their depth.
+    found : int
+        Those of them with a depth in the map.
+    agreeing : int
+        Those of them whose depth agrees.
     """
     inside = (sights.pixels >= 0) & (sights.pixels < [view.width, view.height])
     asked = inside.all(axis=1) & (sights.depth > 0)
@@ -139,7 +117,7 @@ def compare_with_sparse(
     found = asked & (nearest > 0)
     ratio = np.divide(nearest, sights.depth, out=np.ones(len(asked)), where=found)
     agreeing = found & (_distances(sights, ratio) <= _MAX_DISTANCE)
-    return Agreement(*(int(np.count_nonzero(which)) for which in (asked, found, agreeing)))
+    return int(asked.sum()), int(found.sum()), int(agreeing.sum())
 
 
 def _distances(sights: SparseSights, ratio: NDArray[np.float64]) -> NDArray[np.float64]:

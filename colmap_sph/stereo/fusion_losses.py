@@ -28,7 +28,7 @@ class GateLosses:
     unseen : float
         No other image has the point in view with a depth there.
     few : float
-        Some have, but not so many as must agree.
+        All that have it agree, but they are fewer than must.
     depth, reprojection, normal : float
         The gate that most often stopped the agreement of a pixel which finds too few others.
     kept : float
@@ -54,7 +54,7 @@ class GateLosses:
         """
         return (
             f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
-            f"by no other depth map, {self.few:.0%} by fewer than must agree, and the rest fail the gates of "
+            f"by no other depth map, {self.few:.0%} by too few that agree, and the rest fail the gates of "
             f"depth ({self.depth:.0%}), reprojection ({self.reprojection:.0%}) and normal ({self.normal:.0%}); "
             f"{self._remedy(options, poses_fit)}."
         )
@@ -146,7 +146,7 @@ def _final_losses(found: NDArray[np.int64], stations: Sequence[int], options: Fu
         seen += (verdicts != _Loss.UNSEEN).any(axis=0)
     gates = np.array([(found == gate).sum(axis=0) for gate in (_Loss.DEPTH, _Loss.REPROJECTION, _Loss.NORMAL)])
     failed = np.where(seen > 0, _Loss.FEW, _Loss.UNSEEN)
-    by_gate = (1 + seen >= options.min_num_pixels) & gates.any(axis=0)
+    by_gate = (agreeing < seen) & gates.any(axis=0)
     failed = np.where(by_gate, gates.argmax(axis=0) + _Loss.DEPTH, failed)
     return np.where(1 + agreeing >= options.min_num_pixels, _Loss.NONE, failed)
 

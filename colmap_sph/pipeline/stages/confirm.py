@@ -11,9 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
-from colmap_sph.pipeline.options import changed_options
-from colmap_sph.pipeline.self_check import report_agreement
-from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
@@ -85,7 +83,8 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
         planes = refine_maps(view, _image(task.reference), confirmed, *planes, sources, task.refinement_options)
     mask = read_mask(task.mask, view.width, view.height)
     normals, depth = planes
-    return task.maps.write(normals, depth, task.key, compare_with_sparse(view, depth, task.sights, mask))
+    agreement = Agreement(*compare_with_sparse(view, depth, task.sights, mask))
+    return task.maps.write(normals, depth, task.key, agreement)
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
@@ -170,7 +169,9 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         report = self.context.report
         names = [view.name for view in self.context.scene.views]
         report.coverage = {name: results[name].facts.coverage if name in results else 0.0 for name in names}
-        report_agreement(report, {name: result.facts.agreement for name, result in results.items()})
+        report.agreement = {name: result.facts.agreement.share for name, result in results.items()}
+        report.sparse_points = sum((result.facts.agreement for result in results.values()), Agreement())
+        report.overall_agreement = report.sparse_points.share
         report.images = sum(share > 0 for share in report.coverage.values())
         failures = [report.skipped_images[name] for name in names if name in report.skipped_images]
         if failures and not report.images:
@@ -191,14 +192,12 @@ class ConfirmStage(Stage[str, ConfirmTask]):
 
     def _why_nothing(self) -> str:
         """Why no image has a depth, and what to look at first."""
-        changed = changed_options(
-            self.context.options, ("rectification", "matching", "vote", "confirm", "normals")
-        )
+        changed = self.context.options.changed("rectification", "matching", "vote", "confirm", "normals")
         found = any(share > 0 for share in self._voted.values())
         what = "No depth was confirmed by a second image" if found else "No pair of images found any depth"
-        questions = ["are the model's poses right for these images?"]
+        questions = ["are the model's poses right for these images"]
         if self.context.workspace.masks_dir.is_dir():
-            questions.append("is black in the masks what is to be ignored?")
+            questions.append("is black in the masks what is to be ignored")
         if changed:
-            questions.insert(0, f"is it the same without {', '.join(changed)}?")
-        return f"{what}; {' '.join(questions)}"
+            questions.insert(0, f"is it the same without {', '.join(changed)}")
+        return f"{what}; {', and '.join(questions)}?"

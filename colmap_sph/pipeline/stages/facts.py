@@ -3,7 +3,35 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from colmap_sph.stereo.agreement import Agreement
+# Fewer sparse points say nothing of an image.
+_FEWEST = 10
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """How far a view's depth map agrees with its sparse points.
+
+    Attributes
+    ----------
+    tested : int
+        Sparse points in the view's sight, and seen by others under enough parallax to tell their depth.
+    found : int
+        Those of them with a depth in the map.
+    agreeing : int
+        Those of them whose depth agrees.
+    """
+
+    tested: int = 0
+    found: int = 0
+    agreeing: int = 0
+
+    def __add__(self, other: "Agreement") -> "Agreement":
+        return Agreement(self.tested + other.tested, self.found + other.found, self.agreeing + other.agreeing)
+
+    @property
+    def share(self) -> float | None:
+        """Agreeing points of those tested (without a depth none agrees); None where these are fewer than ten."""
+        return self.agreeing / self.tested if self.tested >= _FEWEST else None
 
 
 @dataclass(frozen=True)

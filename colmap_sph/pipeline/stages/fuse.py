@@ -228,7 +228,8 @@ class FuseStage(Stage[str, FuseTask]):
             points = sum(result.facts.points for result in results.values())
             self._put_together([self._stem(name) for name in results], points)
             self._known = facts_of_cloud(context, list(results), points, self._partners_among(results))
-            if len(results) == len(self.items) and not self._report_unread(results):
+            is_complete = not self._report_unread(results) and len(results) == len(self.items)
+            if is_complete:
                 vouch_for_cloud(context, self._key, self._known)
         report_cloud(context, self._known)
 

@@ -8,10 +8,9 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.state.records import begin, vouch, vouched_facts, whole_digests
-from colmap_sph.stereo.agreement import Agreement
 
 MAP_BYTES = 16.0
 """Bytes on disk per pixel, of a depth and a normal map."""
