@@ -9,10 +9,13 @@ import numpy as np
 import pycolmap
 from conftest import SMALL_BLOCK, keep_images
 
+from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.project.project import Project
+from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.synthetic import DemoBlock, make_demo_block
@@ -126,6 +129,12 @@ def prepare(
     )
     preparation.run(execute)
     return preparation.workspace
+
+
+def make_context(workspace: Workspace) -> Context:
+    """A run in a workspace, whose images are not checked yet."""
+    options = RunOptions()
+    return Context(workspace, read_scene(workspace.sparse_dir), options, Keys(workspace, options))
 
 
 FOUR_NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from exact_maps import HEIGHT, NAMES, WIDTH, make_workspace
 from projects import FOUR_NAMES, read_picture, render_four_images
-from rich.console import Console
 
 import colmap_sph
 from colmap_sph.app.run_command import print_summary
+from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import RunReport
@@ -141,14 +141,12 @@ def test_hardly_any_agreement_is_no_result():
     refuse_disagreement(reported({"a.jpg": Agreement(10, 5, 0)}))
 
 
-def test_without_sparse_points_there_is_nothing_to_check(tmp_path):
+def test_without_sparse_points_there_is_nothing_to_check(tmp_path, capsys):
     report = reported({"a.jpg": Agreement(), "b.jpg": Agreement()})
     assert (report.overall_agreement, report.doubts, report.refusal) == (None, "", "")
     assert report.agreement == {"a.jpg": None, "b.jpg": None}
-    console = Console(width=200)
-    with console.capture() as captured:
-        print_summary(report, Workspace(tmp_path), console)
-    assert "no sparse points to check against" in captured.get()
+    print_summary(report, Workspace(tmp_path), Terminal())
+    assert "no sparse points to check against" in capsys.readouterr().err
 
 
 # ---- whole runs --------------------------------------------------------------------------------------------

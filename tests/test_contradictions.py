@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from projects import FOUR_NAMES, FOUR_SIZE, render_four_images, write_picture
-from rich.console import Console
 
 import colmap_sph
 from colmap_sph.app import run_command as command_module
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE, RunCommand, run_command
+from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
@@ -126,9 +126,7 @@ def test_a_pair_lost_for_a_moment_makes_the_run_incomplete(project, monkeypatch)
     ("report", "code"),
     [(RunReport(), 0), (RunReport(incomplete={"a.jpg": "its maps cannot be read"}), PARTIAL_EXIT_CODE)],
 )
-def test_incomplete_results_have_their_exit_code(report, code, project, monkeypatch):
+def test_incomplete_results_have_their_exit_code(report, code, project, monkeypatch, capsys):
     monkeypatch.setattr(command_module, "run_project", lambda *_, **__: report)
-    console = Console(width=200)
-    with console.capture() as captured:
-        assert run_command(RunCommand(Project(workspace=project / "dense"), OPTIONS), console) == code
-    assert ("incomplete: a.jpg: its maps cannot be read" in captured.get()) == bool(code)
+    assert run_command(RunCommand(Project(workspace=project / "dense"), OPTIONS), Terminal()) == code
+    assert ("incomplete: a.jpg: its maps cannot be read" in capsys.readouterr().err) == bool(code)

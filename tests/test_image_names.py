@@ -14,10 +14,14 @@ from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError
+from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.pipeline.reconstruct import with_good_images
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
-from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
+from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.sparse_model import load_model
 
 
@@ -160,10 +164,8 @@ def test_a_folder_too_deep_or_too_high(tmp_path: Path) -> None:
 
 
 def prepare_with(sparse: Path, images: Path) -> None:
-    from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
-
     project = Project(sparse, images=images, output=sparse.parents[1] / "other")
-    prepare_workspace(project, UndistortionOptions())
+    Preparation(project, RunOptions()).run(execute)
 
 
 # ---- another size ------------------------------------------------------------------------------------------
@@ -222,7 +224,7 @@ def test_size_of_undistorted_images(tmp_path: Path) -> None:
     with pytest.raises(
         InputError, match=r"exactly half the size of their cameras.*give the sparse model with --model"
     ):
-        leave_out_bad_images(read_scene(workspace.sparse_dir), workspace)
+        with_good_images(make_context(workspace), execute)
 
 
 # ---- what is no file ---------------------------------------------------------------------------------------

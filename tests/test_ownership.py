@@ -370,7 +370,9 @@ def test_maps_that_no_run_makes_are_not_fused(flaw: str, finished: Finished) -> 
 
 
 def vouch_again(maps: MapFiles, key: str) -> None:
-    vouch(maps.record, key, {path: whole_digest(path) for path in (maps.depth, maps.normals)}, MapFacts(0.5))
+    vouch(
+        maps.record, key, {path: whole_digest(path) for path in (maps.depth, maps.normals)}, MapFacts(0.5, 0, 0, 0)
+    )
 
 
 # ---- the disk ----------------------------------------------------------------------------------------------

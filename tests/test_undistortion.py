@@ -15,12 +15,10 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from projects import prepare
+from projects import make_context, prepare
 
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import with_good_images
@@ -456,9 +454,8 @@ def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCapture
     before = sorted(tmp_path.rglob("*"))
     workspace = open_workspace(Project(workspace=tmp_path / "dense"))
     assert sorted(tmp_path.rglob("*")) == before
-    scene = read_scene(workspace.sparse_dir)  # an OPENCV camera without distortion
+    context = make_context(workspace)  # of an OPENCV camera without distortion
     workspace.image_path("a.png").unlink()
-    context = Context(workspace, scene, RunOptions(), Keys(workspace, RunOptions()))
     assert [view.name for view in with_good_images(context, execute).scene.views] == NAMES[1:]
     assert "a.png is missing" in caplog.text
 
