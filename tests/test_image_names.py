@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import pycolmap
 import pytest
-from projects import prepare, read_picture
+from projects import make_context, prepare, read_picture
 from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 
 from colmap_sph.app import cli

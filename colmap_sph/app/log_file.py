@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from colmap_sph.errors import OutputError, printable, reason_of
+from colmap_sph.errors import ColmapSphError, OutputError, printable, reason_of
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -134,6 +134,9 @@ def workspace_log(workspace: Workspace, header: str) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         logger.info("Interrupted")
+        raise
+    except (ColmapSphError, OSError, MemoryError) as error:  # told in a sentence, see `cli`
+        logger.info("Stopped: %s", error)
         raise
     except BaseException:
         logger.info("Stopped", exc_info=True)

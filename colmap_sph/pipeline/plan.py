@@ -126,7 +126,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     if project.model is None:
         dense = open_workspace(project)
     else:
-        preparation = Preparation(project, options, overwrite=overwrite)
+        preparation = Preparation(project, options, overwrite=overwrite, is_plan=True)
         dense = preparation.workspace
         undistorted = preparation.undistort(survey, preparation.check(survey))
         to_make = {name for name, result in undistorted.items() if result.made}

@@ -38,6 +38,7 @@ from colmap_sph.project.undistortion.marker import (
     is_model_changed,
     publish_model,
     remove_model,
+    set_model_aside,
     write_marker,
 )
 from colmap_sph.project.undistortion.model import (
@@ -69,6 +70,8 @@ class Preparation:
         What there is does not count.
     verify : bool
         What is known of images from earlier runs does not count.
+    is_plan : bool
+        The stages will only be asked: with `overwrite`, whatever is there then does not count.
     progress, report : optional
         See `Context`.
 
@@ -92,6 +95,7 @@ class Preparation:
         *,
         overwrite: bool = False,
         verify: bool = False,
+        is_plan: bool = False,
         progress: Progress | None = None,
         report: RunReport | None = None,
     ) -> None:
@@ -111,7 +115,7 @@ class Preparation:
             self.workspace,
             NO_SCENE,
             options,
-            Keys(self.workspace, options, fresh=overwrite),
+            Keys(self.workspace, options, fresh=overwrite and is_plan),
             progress or Silent(),
             report or RunReport(),
         )
@@ -134,7 +138,7 @@ class Preparation:
         cameras = cameras_of_images(originals.model)
         sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
         places = ImagePlaces("originals", originals.model_dir, originals.image_dir)
-        return executor(CheckStage(self._context, sizes, places, verify=self._verify))
+        return executor(CheckStage(self._context, sizes, places, verify=self._verify or self._overwrite))
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""
@@ -217,9 +221,11 @@ class Preparation:
             claim(undistorted_place(self.workspace, name).record)
 
     def _discard(self, found: Marker) -> None:
+        """Make room for all anew: once begun, the next run goes on with it, whether it is told to or not."""
         workspace = self.workspace
-        remove_undistorted(workspace)
-        remove_model(workspace, found)
+        set_model_aside(workspace, found)
         write_marker(workspace, self._marker)
+        remove_undistorted(workspace)
         remove_recorded(workspace)
+        remove_model(workspace)
         remove_empty_folders(workspace.images_dir, workspace.masks_dir, workspace.stereo_dir, workspace.sparse_dir)

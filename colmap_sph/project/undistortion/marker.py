@@ -159,17 +159,18 @@ def is_model_changed(workspace: Workspace, marker: Marker) -> bool:
     return marker.is_finished and not _digests(workspace.sparse_dir).items() <= marker.files.items()
 
 
-def remove_model(workspace: Workspace, marker: Marker) -> None:
-    """Remove the model and the list of pairs, where they are as this program wrote them; give others other names.
-
-    A list of pairs that the user wrote stays, as it is obeyed.
-    """
+def set_model_aside(workspace: Workspace, marker: Marker) -> None:
+    """Give model files that are not as this program wrote them other names."""
     for name, digest in _digests(workspace.sparse_dir).items():
-        path = workspace.sparse_dir / name
-        if not marker.is_finished or marker.files.get(name) == digest:
-            remove(path)
-        else:
+        if marker.is_finished and marker.files.get(name) != digest:
+            path = workspace.sparse_dir / name
             logger.warning("%s is not what this program wrote there; it is now %s", path, set_aside(path).name)
+
+
+def remove_model(workspace: Workspace) -> None:
+    """Remove the model, which is this program's, and the list of pairs unless the user wrote it."""
+    for path in _model_files(workspace.sparse_dir):
+        remove(path)
     if _is_default_pair_list(workspace.patch_match_cfg_path):
         remove(workspace.patch_match_cfg_path)
 

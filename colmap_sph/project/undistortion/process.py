@@ -6,6 +6,7 @@ authors thought impossible.
 
 import os
 import pickle
+import re
 import subprocess
 import sys
 import tempfile
@@ -18,6 +19,8 @@ from colmap_sph.errors import ColmapSphError, InputError, OutputError, reason_of
 
 # What libjpeg says when it ends a process.
 _DISK_FULL = "Output file write error"
+# How COLMAP's library begins a message that ends a process.
+_FATAL = re.compile(r"^F\d{8} [^\]]*\] (.*)$", re.MULTILINE)
 _MAX_WORDS = 200
 
 
@@ -98,13 +101,20 @@ class ChildProcess:
         assert self._words is not None
         code = process.wait()
         self._words.seek(0)
-        lines = self._words.read().decode(errors="replace").split("\n")
-        last = next((line.strip() for line in reversed(lines) if line.strip()), "")[:_MAX_WORDS]
+        words = self._words.read().decode(errors="replace")
         self.close()
-        if _DISK_FULL in last:
+        if _DISK_FULL in words:
             return OutputError(f"{what} cannot be written (the disk is full, or a limit is reached).")
         ended = f"by signal {-code}" if code < 0 else f"with exit code {code}"
+        last = _last_words(words)
         return InputError(f"COLMAP ended {ended} at {what}{f' ({last})' if last else ''}.")
+
+
+def _last_words(text: str) -> str:
+    """Why a process ended: what COLMAP's library says before its stack trace, or else the last line."""
+    fatal = _FATAL.search(text)
+    lines = [line.strip() for line in text.split("\n") if line.strip()]
+    return (fatal.group(1) if fatal else lines[-1] if lines else "")[:_MAX_WORDS]
 
 
 def serve() -> None:
