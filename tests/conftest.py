@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import pycolmap
 import pytest
 
 import colmap_sph
+from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.synthetic import BlockOptions, DemoBlock, make_demo_block
 
 SMALL_BLOCK = BlockOptions(
@@ -16,7 +18,22 @@ SMALL_BLOCK = BlockOptions(
 )
 
 
+_CALL = ChildProcess.call
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def without_child_processes() -> Iterator[None]:
+    """COLMAP works in the tests' own process: a process of its own takes longer to start than most of its work."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ChildProcess, "call", lambda _, function, argument, what: function(argument))
+        yield
+
+
+@pytest.fixture
+def with_child_processes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """COLMAP works in a process of its own, as it does for users."""
+    monkeypatch.setattr(ChildProcess, "call", _CALL)
 
 
 @pytest.fixture

@@ -279,7 +279,6 @@ def test_interrupted_undistortion_is_gone_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overwrite: bool
 ) -> None:
     """Before every single file operation of the workspace; also while an earlier one makes room."""
-    monkeypatch.setattr(ChildProcess, "call", lambda _, function, argument, what: function(argument))
     sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
     whole = prepare(sparse, tmp_path / "whole")
     expected = contents(whole)
@@ -346,7 +345,8 @@ def test_unfinished_workspace_is_not_worked_in(tmp_path: Path) -> None:
         open_workspace(Project(workspace=workspace.root))
 
 
-def test_colmaps_end_is_that_of_one_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("with_child_processes")
+def test_colmaps_end_is_that_of_one_image(tmp_path: Path) -> None:
     """Its process is gone, with its last words; the next images get another."""
     child = ChildProcess(tmp_path)
     with pytest.raises(InputError, match=r"COLMAP ended with exit code 7 at x\.jpg \(so it ends\)"):
@@ -375,6 +375,7 @@ def raise_error(error: Exception) -> None:
     raise error
 
 
+@pytest.mark.usefixtures("with_child_processes")
 @pytest.mark.parametrize(
     ("camera_model", "extra", "size"),
     [
