@@ -133,8 +133,7 @@ def prepare(project: Path, seed: int, case: Path) -> tuple[str, list[str]]:
 
 def run_command(arguments: list[str]) -> str:
     """Run the command; its exit code, and its sentence where it failed, or what it should not have done."""
-    from colmap_sph.project.undistortion.process import ChildProcess
-from colmap_sph.app import cli
+    from colmap_sph.app import cli
 
     output = io.StringIO()
     try:
@@ -165,8 +164,11 @@ def is_mended(workspace: Path, finished: Path, damaged: str) -> bool:
 
 def main(project: Path, first: int, last: int) -> None:
     """Run cases `first` to `last` - 1."""
+    from colmap_sph.project.undistortion.process import ChildProcess
+
     warnings.simplefilter("error")
     logging.captureWarnings(False)
+    # A process of its own for COLMAP takes longer to start than most of its work.
     ChildProcess.call = lambda _, function, argument, what: function(argument)  # type: ignore[method-assign]
     resource.setrlimit(resource.RLIMIT_AS, (_BYTES, _BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
