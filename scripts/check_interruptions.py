@@ -257,9 +257,7 @@ def _disturb_one(way: Way, stage: str, fault: Fault, output: Path, *, only_main:
     finished = finished_files(workspace)
     second = run(["run", *way.again, str(workspace)], Surroundings(_surroundings(output / "second"), seconds=3600))
     end_group(around)
-    remade = bool(fault.stop) * sum(
-        not path.exists() or path.stat().st_mtime_ns != stamp for path, stamp in finished.items()
-    )
+    remade = files_made_again(finished) if fault.stop else 0
     wrong = [*differences(workspace, way.whole), *leftovers(workspace)]
     hit = next(iter(control.operations), None)
     return Disturbance(f"{way.name}, {stage}, {fault}", hit, first, second, remade, "; ".join(wrong))
@@ -275,6 +273,11 @@ def finished_files(workspace: Path) -> dict[Path, int]:
     if (state / "cloud.json").exists():
         files += [workspace / "fused.ply", workspace / "fused.ply.vis"]
     return {path: path.stat().st_mtime_ns for path in files}
+
+
+def files_made_again(finished: dict[Path, int]) -> int:
+    """Number of files that are not there any more, or were written since their time stamps were taken."""
+    return sum(not path.exists() or path.stat().st_mtime_ns != stamp for path, stamp in finished.items())
 
 
 def leftovers(workspace: Path) -> list[str]:
