@@ -20,6 +20,10 @@ class InputError(ColmapSphError):
     exit_code = 2
 
 
+class DamageError(InputError):
+    """A file of our own that holds something else than was written to it."""
+
+
 class OptionError(ColmapSphError, ValueError):
     """An option out of its bounds, or options that contradict each other.
 

@@ -5,6 +5,7 @@ a test or a renderer. Frames are COLMAP's: x right, y down, z forward, ``x_cam =
 the first pixel's centre is at (0.5, 0.5).
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -156,8 +157,16 @@ class Scene:
         """Whether any view observes a sparse point."""
         return any(len(view.point_indices) for view in self.views)
 
+    def only(self, names: Collection[str]) -> "Scene":
+        """The scene with the views of these images alone."""
+        return replace(self, views=tuple(view for view in self.views if view.name in names))
+
     def view(self, name: str) -> View:
         """Return the view of image `name`; `InputError` where the scene has none."""
         if name not in self.index_of:
             raise InputError(f"The model has no registered image named {name!r}; use a name from its list.")
         return self.views[self.index_of[name]]
+
+
+NO_SCENE = Scene((), np.zeros((0, 3)))
+"""What is known of a scene before its model is read."""

@@ -108,7 +108,7 @@ def prepare(project: Path, seed: int, case: Path) -> tuple[str, list[str]]:
     kind = ("binary", "text", "binary", "text", "image", "workspace", "mask", "finished")[seed % 8]
     if kind == "finished":
         shutil.copytree(project / "finished", case / "finished")
-        pattern = str(rng.choice(["*.bin", "*.npz", "*.json", "fused.ply*"]))
+        pattern = str(rng.choice(["*.bin", "*.sph", "*.json", "fused.ply*"]))
         folder = case / "finished" / ("stereo" if pattern == "*.bin" else "")
         return _damage_one(folder, pattern, rng, damage_bytes), ["--workspace", str(case / "finished")]
     if kind == "workspace":

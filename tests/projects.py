@@ -9,8 +9,11 @@ import numpy as np
 import pycolmap
 from conftest import SMALL_BLOCK, keep_images
 
+from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.project.project import Project
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.synthetic import DemoBlock, make_demo_block
 
@@ -116,8 +119,13 @@ def prepare(
     overwrite: bool = False,
 ) -> Workspace:
     """The workspace of a model's undistorted images, which are found."""
-    project = Project(model, masks=masks, output=output)
-    return prepare_workspace(project, options or UndistortionOptions(), overwrite=overwrite).workspace
+    preparation = Preparation(
+        Project(model, masks=masks, output=output),
+        RunOptions(undistortion=options or UndistortionOptions()),
+        overwrite=overwrite,
+    )
+    preparation.run(execute)
+    return preparation.workspace
 
 
 FOUR_NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]

@@ -142,7 +142,7 @@ def test_stages_of_file_operations(scripts_on_path: None) -> None:
 @pytest.mark.parametrize(
     ("moment", "number", "code"),
     [
-        ("colmap_sph/pairs/*.npz", *STOPS[0]),
+        ("colmap_sph/pairs/*.sph", *STOPS[0]),
         ("stereo/depth_maps/*.photometric.bin", *STOPS[1]),
         ("stereo/depth_maps/*.geometric.bin", *STOPS[0]),
     ],
@@ -163,7 +163,7 @@ def test_signals_stop_a_run_which_then_goes_on(
     assert said.splitlines()[-1].startswith("interrupted; what is finished is kept")
     assert not (dense / "fused.ply").exists()
     assert not list(dense.rglob(".*.tmp"))
-    kept = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.npz")}
+    kept = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.sph")}
     assert len(kept) >= 2
     complete("--model", project / "sparse/0")
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -292,7 +292,7 @@ def test_full_disk(stage: int, uninterrupted: Path, small_disk: Path) -> None:
     assert not (dense / "fused.ply").exists()
     truth = maps(uninterrupted)
     assert {name: content for name, content in maps(dense).items() if truth[name] != content} == {}
-    done = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.npz")}
+    done = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.sph")}
     assert len(done) >= [0, 1, 6, 10, 10][stage]
     ballast.unlink()
     complete("--model", model, "--output", dense)

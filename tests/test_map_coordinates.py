@@ -18,7 +18,7 @@ from colmap_sph.project import map_coordinates
 from colmap_sph.project.map_coordinates import local_origin, move_cloud
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.staging import discard_workspace
+from colmap_sph.project.state.ownership import remove_recorded
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.partners.pairs import PairOptions
@@ -128,7 +128,7 @@ def test_local_workspace_is_made_again(near: Near, tmp_path: Path) -> None:
     shutil.rmtree(local)
     assert colmap_sph.run(model, options=OPTIONS).made["fuse"] == 1
     assert pycolmap.Reconstruction(local / "sparse").num_reg_images() == len(NADIR)
-    discard_workspace(Workspace(tmp_path / "dense"))
+    remove_recorded(Workspace(tmp_path / "dense"))
     assert not local.exists()
     colmap_sph.run(model, options=OPTIONS)
     shutil.rmtree(sparse)

@@ -16,7 +16,6 @@ from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 import colmap_sph
 from colmap_sph.app import cli
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE
-from colmap_sph.errors import InputError
 from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
@@ -112,16 +111,22 @@ def test_a_mask_undistorts_with_ideal_fisheyes(tmp_path: Path) -> None:
         assert not np.array_equal(mask, blobs(seed))
 
 
-def test_other_masks_are_another_workspace(tmp_path: Path) -> None:
+def test_a_changed_mask_is_undistorted_anew(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     write_masks(tmp_path / "masks", NAMES)
-    prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
-    prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
-    with pytest.raises(InputError, match="different masks"):
-        prepare(sparse, tmp_path / "dense")
-    (tmp_path / "masks" / f"{NAMES[0]}.png").unlink()
-    with pytest.raises(InputError, match="different masks"):
-        prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
+    masks = tmp_path / "masks"
+    workspace = prepare(sparse, tmp_path / "dense", masks=masks)
+    before = {name: workspace.mask_path(name).stat().st_mtime_ns for name in NAMES}
+    (masks / f"{NAMES[0]}.png").unlink()
+    (masks / f"{NAMES[2]}.png").write_bytes((masks / f"{NAMES[1]}.png").read_bytes())
+    prepare(sparse, tmp_path / "dense", masks=masks)
+    assert not workspace.mask_path(NAMES[0]).exists()
+    kept = [read_picture(workspace.mask_path(name), cv2.IMREAD_GRAYSCALE) for name in NAMES[1:3]]
+    np.testing.assert_array_equal(kept[0], kept[1])
+    for name in (NAMES[1], NAMES[3]):
+        assert workspace.mask_path(name).stat().st_mtime_ns == before[name]
+    prepare(sparse, tmp_path / "dense")  # without --masks
+    assert not list(workspace.masks_dir.rglob("*.png"))
 
 
 @pytest.mark.parametrize("kind", ["grey", "16 bits", "colour", "alpha", "palette"])

@@ -6,13 +6,12 @@ from pathlib import Path
 import pycolmap
 import pytest
 from projects import prepare
-from test_undistortion import NAMES, make_project
+from test_undistortion import make_project
 
 from colmap_sph.app import cli
 from colmap_sph.errors import ColmapSphError, InputError, OptionError
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.sparse_model import models_inside
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
 
 
 @pytest.fixture
@@ -55,15 +54,6 @@ def test_database(tmp_path: Path) -> None:
     shutil.copy(tmp_path / "database.db", tmp_path / "sparse/0/database.db")
     assert project.database() == tmp_path / "sparse/0/database.db"
     assert Project(workspace=tmp_path).database() is None
-
-
-def test_images_that_are_left_out_are_still_expected(tmp_path: Path) -> None:
-    project = Project(make_project(tmp_path))
-    (tmp_path / "images" / NAMES[1]).unlink()
-    for _ in range(2):  # made, and found made
-        prepared = prepare_workspace(project, UndistortionOptions())
-        assert prepared.expected == tuple(NAMES)
-        assert prepared.workspace.fusion_cfg_path.read_text().split() == [NAMES[0], *NAMES[2:]]
 
 
 # ---- mistakes ----------------------------------------------------------------------------------------------

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from colmap_sph.pipeline.records import forget, vouch, vouched_facts
 from hypothesis import given
 from hypothesis import strategies as st
 
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.pipeline.program import program_digest
-from colmap_sph.pipeline.records import forget, vouch, vouched_facts
 
 PLAIN = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

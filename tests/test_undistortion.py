@@ -1,7 +1,15 @@
 """Undistorted workspaces: COLMAP's model of them holds exactly, and bad input never stops the process."""
 
+import itertools
+import json
 import logging
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,16 +18,22 @@ import pytest
 from projects import prepare
 
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.project import staging
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.pipeline.reconstruct import check_workspace_images
 from colmap_sph.project.images import image_problem, read_grey
-from colmap_sph.project.originals import find_images
 from colmap_sph.project.project import Project, open_workspace
-from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
-from colmap_sph.project.undistortion import UndistortionOptions, foresee_workspace, prepare_workspace
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.undistortion.originals import find_images
+from colmap_sph.project.undistortion.process import ChildProcess
+from colmap_sph.project.workspace import Workspace
 
 WIDTH, HEIGHT, FOCAL = 96, 64, 90.0
 NAMES = ["a.png", "b.png", "cam/c.png", "cam/d.png"]
-OPTIONS = UndistortionOptions()
 
 
 def make_project(
@@ -59,11 +73,11 @@ def test_workspace_of_undistorted_images(tmp_path: Path, text: bool) -> None:
     assert [view.name for view in read_scene(workspace.sparse_dir).views] == NAMES
     for name in NAMES:
         assert workspace.image_path(name).read_bytes() == (tmp_path / "images" / name).read_bytes()
-        assert workspace.depth_map_path(name, "geometric").parent.is_dir()
     assert workspace.fusion_cfg_path.read_text().split() == NAMES
-    expected = ["colmap_sph", "images", "run-colmap-geometric.sh", "run-colmap-photometric.sh", "sparse"]
-    assert sorted(path.name for path in workspace.root.iterdir()) == [*expected, "stereo"]
-    assert [path.name for path in workspace.state_dir.iterdir()] == ["undistortion.json"]
+    # Without COLMAP's scripts, which would write over our maps.
+    assert sorted(path.name for path in workspace.root.iterdir()) == ["colmap_sph", "images", "sparse", "stereo"]
+    state = sorted(path.name for path in workspace.state_dir.iterdir())
+    assert state == ["originals.json", "state", "undistortion.json"]
 
 
 def test_max_image_size(tmp_path: Path) -> None:
@@ -151,70 +165,244 @@ def test_no_usable_image(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     for name in NAMES:
         damage(tmp_path / "images" / name, "size")
-    with pytest.raises(InputError, match="None of the model's 4 images"):
+    with pytest.raises(InputError, match="None of the 4 images"):
         prepare(sparse, tmp_path / "dense")
     assert not (tmp_path / "dense").exists()
 
 
-def test_finished_workspace_is_reused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def times(workspace: Workspace) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in workspace.images_dir.rglob("*") if path.is_file()}
+
+
+def test_finished_workspace_is_reused(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    before = times(workspace)
     prepare(sparse, tmp_path / "dense")
-    monkeypatch.setattr(pycolmap, "undistort_images", None)
-    prepare(sparse, tmp_path / "dense")
+    assert times(workspace) == before
     with pytest.raises(InputError, match="different options"):
         prepare(sparse, tmp_path / "dense", UndistortionOptions(48))
-    (tmp_path / "images" / "a.png").unlink()
-    with pytest.raises(InputError, match="different images"):
-        prepare(sparse, tmp_path / "dense")
+    other = make_project(tmp_path / "other", "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(InputError, match="different model"):
+        prepare(other, tmp_path / "dense")
+    assert times(workspace) == before
 
 
-def test_interrupted_undistortion_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_copied_project_is_known_by_its_content(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path / "project", "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    prepare(sparse, tmp_path / "project" / "dense")
+    shutil.copytree(tmp_path / "project", tmp_path / "copy", copy_function=shutil.copyfile)  # with new times
+    workspace = Workspace(tmp_path / "copy" / "dense")
+    before = times(workspace)
+    prepare(tmp_path / "copy" / "sparse" / "0", workspace.root)
+    assert times(workspace) == before
+
+
+@pytest.mark.parametrize("keep_time", [False, True])
+def test_a_changed_image_is_undistorted_anew(tmp_path: Path, keep_time: bool) -> None:
+    """Also one of the same size whose time was set back."""
     sparse = make_project(tmp_path)
-    dense = tmp_path / "dense"
-
-    def interrupted(output: Path, *args: object, **kwargs: object) -> None:
-        (output / "images").mkdir()
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(pycolmap, "undistort_images", interrupted)
-        prepare(sparse, dense)
-    assert not dense.exists()
-    # A killed process cleans nothing up.
-    (dense / "colmap_sph" / "undistorting" / "images").mkdir(parents=True)
-    workspace = prepare(sparse, dense)
+    workspace = prepare(sparse, tmp_path / "dense")
+    before = times(workspace)
+    path = tmp_path / "images" / "b.png"
+    status = path.stat()
+    path.write_bytes((tmp_path / "images" / "a.png").read_bytes())
+    if keep_time:
+        os.utime(path, ns=(status.st_atime_ns, status.st_mtime_ns))
+    prepare(sparse, tmp_path / "dense")
+    assert workspace.image_path("b.png").read_bytes() == path.read_bytes()
+    changed = {path for path, time in times(workspace).items() if time != before[path]}
+    assert changed == {workspace.image_path("b.png")}
     assert len(read_scene(workspace.sparse_dir).views) == 4
 
 
-@pytest.mark.parametrize("num_moved", range(7))
-def test_interrupted_move_is_finished(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, num_moved: int) -> None:
+def test_an_image_that_comes_and_goes(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
+    path = tmp_path / "images" / "b.png"
+    away = path.rename(tmp_path / "b.png")
+    workspace = prepare(sparse, tmp_path / "dense")
+    assert [view.name for view in read_scene(workspace.sparse_dir).views] == ["a.png", "cam/c.png", "cam/d.png"]
+    away.rename(path)
+    prepare(sparse, tmp_path / "dense")
+    assert [view.name for view in read_scene(workspace.sparse_dir).views] == NAMES
+
+
+def test_users_own_files_in_a_workspace_stay(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """An image exchanged, a model, a list of pairs and notes: in use, and there after --overwrite."""
+    sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    workspace = prepare(sparse, tmp_path / "dense")
+    theirs = {
+        workspace.image_path("a.png"): workspace.image_path("b.png").read_bytes(),
+        workspace.sparse_dir / "points3D.bin": bytes(8),
+        workspace.patch_match_cfg_path: b"a.png\nb.png\n",
+        workspace.images_dir / "notes.txt": b"mine",
+        workspace.masks_dir / "a.png.png": b"mine",
+        workspace.state_dir / "state" / "notes.txt": b"mine",
+    }
+    for path, content in theirs.items():
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(content)
+    prepare(sparse, workspace.root)
+    assert {path: path.read_bytes() for path in theirs} == theirs
+    assert f"{workspace.sparse_dir} was changed" in caplog.text
+    caplog.clear()
+    prepare(sparse, workspace.root, overwrite=True)
+    # What has to make room is named, and kept beside the new one.
+    moved = workspace.image_path("a.png")
+    assert f"{moved} is not what this program wrote there; it is now a.png.backup" in caplog.text
+    assert moved.with_name("a.png.backup").read_bytes() == theirs.pop(moved)
+    model = workspace.sparse_dir / "points3D.bin"
+    assert model.with_name("points3D.bin.backup").read_bytes() == theirs.pop(model)
+    assert {path: path.read_bytes() for path in theirs} == theirs
+    assert len(read_scene(workspace.sparse_dir).points) == 20
+
+
+@pytest.mark.parametrize("what", ["model", "images", "masks"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_input_inside_the_output_is_refused(tmp_path: Path, what: str, overwrite: bool) -> None:
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    places = {"model": sparse, "images": tmp_path / "images", "masks": None}
+    places[what] = shutil.copytree(places[what] or tmp_path / "images", workspace.root / "given")
+    before = sorted(tmp_path.rglob("*"))
+    project = Project(places["model"], places["images"], places["masks"], workspace.root)
+    with pytest.raises(InputError, match=f"--{what} .*given lies inside the workspace"):
+        Preparation(project, RunOptions(), overwrite=overwrite)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+class Killed(BaseException):
+    """The process ends without a chance to clean up."""
+
+
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_interrupted_undistortion_is_gone_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, overwrite: bool
+) -> None:
+    """Before every single file operation of the workspace; also while an earlier one makes room."""
+    monkeypatch.setattr(ChildProcess, "call", lambda _, function, argument, what: function(argument))
+    sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    whole = prepare(sparse, tmp_path / "whole")
+    expected = contents(whole)
+    for stop in itertools.count():
+        dense = tmp_path / f"dense{stop}"
+        if overwrite:
+            shutil.copytree(whole.root, dense)
+        left = iter(range(stop))
+
+        def step(operation: Callable[..., Any], left: Iterator[int] = left) -> Callable[..., Any]:
+            def counted(*arguments: Any, **options: Any) -> Any:
+                if next(left, None) is None:
+                    raise Killed
+                return operation(*arguments, **options)
+
+            return counted
+
+        with monkeypatch.context() as patch:
+            for name in ("replace", "rename", "unlink", "rmdir"):
+                patch.setattr(Path, name, step(getattr(Path, name)))
+            patch.setattr(shutil, "rmtree", lambda *_, **__: None)
+            try:
+                prepare(sparse, dense, overwrite=overwrite)
+                break
+            except Killed:
+                pass
+        assert contents(prepare(sparse, dense)) == expected
+    assert stop > 20
+
+
+def contents(workspace: Workspace) -> dict[str, bytes]:
+    folders = (workspace.images_dir, workspace.sparse_dir, workspace.stereo_dir)
+    paths = [path for folder in folders for path in folder.rglob("*") if path.is_file()]
+    return {str(path.relative_to(workspace.root)): path.read_bytes() for path in paths}
+
+
+def test_workspace_of_an_earlier_version(tmp_path: Path) -> None:
+    """Made all at once, with other facts in its marker and COLMAP's scripts: it is gone on with."""
+    sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    new = prepare(sparse, tmp_path / "new")
     dense = tmp_path / "dense"
-    masks = tmp_path / "masks"
-    masks.mkdir()
-    assert cv2.imwrite(str(masks / "a.png.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
-    finished = prepare(sparse, tmp_path / "other", masks=masks)
-    scratch = dense / "colmap_sph" / "undistorting"
-    scratch.mkdir(parents=True)
-    (finished.state_dir / "undistortion.json").rename(scratch / "undistortion.json")
-    for index, part in enumerate(staging._PARTS):
-        (finished.root / part).rename((dense if index < num_moved else scratch) / part)
-    monkeypatch.setattr(pycolmap, "undistort_images", None)
-    assert foresee_workspace(Project(sparse, masks=masks, output=dense), OPTIONS, overwrite=False) is not None
-    assert foresee_workspace(Project(sparse, masks=masks, output=dense), OPTIONS, overwrite=True) is not None
-    if num_moved:
-        with pytest.raises(InputError, match=r"different masks.*--overwrite"):
-            prepare(sparse, dense)
-    workspace = prepare(sparse, dense, masks=masks)
-    assert workspace.mask_path("a.png").is_file()
-    assert len(leave_out_bad_images(read_scene(workspace.sparse_dir), workspace).views) == 4
-    assert not scratch.exists()
+    old = Workspace(dense)
+    pycolmap.undistort_images(dense, sparse, tmp_path / "images")
+    marker = {"version": 1, "options": {"max_image_size": -1}, "images": "digest", "masks": None}
+    marker["model"] = json.loads(new.marker_path.read_bytes())["model"]
+    old.state_dir.mkdir()
+    old.marker_path.write_text(json.dumps(marker))
+    old.patch_match_cfg_path.write_text("a.png\nb.png\n")
+    with pytest.raises(InputError, match="different options"):
+        prepare(sparse, dense, UndistortionOptions(48))
+    prepare(sparse, dense)
+    assert not list(dense.glob("run-colmap-*"))
+    assert not list(dense.rglob("*.backup*"))
+    assert contents(old).keys() == contents(new).keys()
+    assert old.patch_match_cfg_path.read_text() == "a.png\nb.png\n"
+
+
+def test_unfinished_workspace_is_not_worked_in(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    marker = json.loads(workspace.marker_path.read_bytes())
+    workspace.marker_path.write_text(json.dumps(marker | {"images": []}))
+    with pytest.raises(InputError, match="not finished; run with --model"):
+        open_workspace(Project(workspace=workspace.root))
+
+
+def test_colmaps_end_is_that_of_one_image(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its process is gone, with its last words; the next images get another."""
+    child = ChildProcess(tmp_path)
+    with pytest.raises(InputError, match=r"COLMAP ended with exit code 7 at x\.jpg \(so it ends\)"):
+        child.call(end_process, "so it ends", "x.jpg")
+    with pytest.raises(OutputError, match=r"x\.jpg cannot be written"):
+        child.call(end_process, "Output file write error --- out of disk space?", "x.jpg")
+    with pytest.raises(InputError, match="COLMAP ended by signal 11"):
+        child.call(kill_process, signal.SIGSEGV, "x.jpg")
+    with pytest.raises(InputError, match="what it says itself"):
+        child.call(raise_error, InputError("what it says itself"), "x.jpg")
+    child.call(Path.touch, tmp_path / "done", "x.jpg")
+    assert (tmp_path / "done").exists()
+    child.close()
+
+
+def end_process(words: str) -> None:
+    print(words, file=sys.stderr)
+    os._exit(7)
+
+
+def kill_process(number: int) -> None:
+    os.kill(os.getpid(), number)
+
+
+def raise_error(error: Exception) -> None:
+    raise error
+
+
+@pytest.mark.parametrize(
+    ("camera_model", "extra", "size"),
+    [
+        ("OPENCV", (0.1, 0.01, 1e-3, -1e-3), -1),
+        ("OPENCV", (0.1, 0.01, 1e-3, -1e-3), 60),
+        ("PINHOLE", (), 48),
+        ("SIMPLE_RADIAL_FISHEYE", (0.1,), -1),
+    ],
+)
+def test_images_and_model_are_those_of_colmaps_undistorter(
+    tmp_path: Path, camera_model: str, extra: tuple[float, ...], size: int
+) -> None:
+    sparse = make_project(tmp_path, camera_model, extra)
+    options = UndistortionOptions(size)
+    workspace = prepare(sparse, tmp_path / "dense", options)
+    theirs = Workspace(tmp_path / "theirs")
+    pycolmap.undistort_images(theirs.root, sparse, tmp_path / "images", undistort_options=options.for_colmap())
+    for name in NAMES:
+        assert workspace.image_path(name).read_bytes() == theirs.image_path(name).read_bytes()
+    for name in ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"):
+        assert (workspace.sparse_dir / name).read_bytes() == (theirs.sparse_dir / name).read_bytes()
 
 
 def test_folder_of_someone_else_is_left_alone(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     # The project folder itself, whose images are the originals.
-    with pytest.raises(InputError, match="did not make"):
+    with pytest.raises(InputError, match="lies inside the workspace"):
         prepare(sparse, tmp_path)
     assert (tmp_path / "images" / "a.png").is_file()
     assert not (tmp_path / "colmap_sph").exists()
@@ -253,7 +441,7 @@ def test_images_not_found_lists_the_folders(tmp_path: Path) -> None:
 def test_wrong_image_folder(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     with pytest.raises(InputError, match="--images"):
-        prepare_workspace(Project(sparse, tmp_path / "nowhere", output=tmp_path / "dense"), OPTIONS)
+        Preparation(Project(sparse, tmp_path / "nowhere", output=tmp_path / "dense"), RunOptions())
 
 
 def test_options() -> None:
@@ -269,7 +457,8 @@ def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCapture
     assert sorted(tmp_path.rglob("*")) == before
     scene = read_scene(workspace.sparse_dir)  # an OPENCV camera without distortion
     workspace.image_path("a.png").unlink()
-    assert [view.name for view in leave_out_bad_images(scene, workspace).views] == NAMES[1:]
+    context = Context(workspace, scene, RunOptions(), Keys(workspace, RunOptions()))
+    assert sorted(check_workspace_images(context, execute)) == NAMES[1:]
     assert "a.png is missing" in caplog.text
 
 

@@ -43,7 +43,10 @@ class RunCommand:
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only say what is to do, and about how much time, memory and disk it takes. Nothing is written."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Do everything again, also what an earlier run in this workspace has finished."""
+    """Do everything again, also what an earlier run in this workspace has finished. Maps and clouds that other
+    programs made are kept under another name."""
+    verify: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Look at every byte of earlier results first, and make again what is damaged."""
 
 
 def run_command(command: RunCommand, console: Console) -> int:
@@ -56,7 +59,9 @@ def run_command(command: RunCommand, console: Console) -> int:
         print_plan(make_plan(project, options, overwrite=command.overwrite), workspace, console)
         return 0
     with workspace_log(workspace, header(command)), Display(console) as display:
-        report = run_project(project, options, progress=display, overwrite=command.overwrite)
+        report = run_project(
+            project, options, progress=display, overwrite=command.overwrite, verify=command.verify
+        )
     print_summary(report, workspace, console)
     return PARTIAL_EXIT_CODE if report.skipped_images else 0
 

@@ -6,11 +6,14 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import get_args
 
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.maps import MapFiles
+from colmap_sph.project.state.array_file import SUFFIX
+from colmap_sph.project.state.ownership import Place, cloud_place, map_place
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Scene
 
@@ -42,25 +45,29 @@ class Context:
     def pair_path(self, a: str, b: str) -> Path:
         """Disparity map of a pair: named by COLMAP's image ids, since names may hold anything."""
         low, high = sorted((self.scene.view(a).image_id, self.scene.view(b).image_id))
-        return self.workspace.pairs_dir / f"{low:06d}-{high:06d}.npz"
+        return self.workspace.pairs_dir / f"{low:06d}-{high:06d}{SUFFIX}"
 
     def estimate_path(self, name: str) -> Path:
         """Photometric depth of an image with its standard deviation and support."""
-        return self.workspace.photometric_dir / f"{name}.npz"
+        return self.workspace.photometric_dir / f"{name}{SUFFIX}"
 
     def map_files(self, name: str, kind: MapKind) -> MapFiles:
         """Depth and normal map of an image, and the record that vouches for them."""
-        return MapFiles(
-            self.workspace.depth_map_path(name, kind),
-            self.workspace.normal_map_path(name, kind),
-            self.workspace.records_dir / f"{name}.{kind}.json",
-        )
+        place = map_place(self.workspace, name, kind)
+        depth, normals = place.files
+        return MapFiles(depth, normals, place.record)
 
     @property
-    def cloud_paths(self) -> list[Path]:
-        """The cloud and its visibility, and for a model in map coordinates the cloud near its origin."""
-        local = [Workspace(self.workspace.local_dir).fused_path] if self.scene.origin.any() else []
-        return [*self.workspace.cloud_paths, *local]
+    def cloud_place(self) -> Place:
+        """The cloud, and the record that vouches for it."""
+        return cloud_place(self.workspace, local=bool(self.scene.origin.any()))
+
+    @property
+    def places(self) -> list[Place]:
+        """All that the run writes in COLMAP's formats."""
+        names = [view.name for view in self.scene.views]
+        maps = [map_place(self.workspace, name, kind) for name in names for kind in get_args(MapKind)]
+        return [*maps, self.cloud_place]
 
     def stage(self, name: str, total: int) -> AbstractContextManager[None]:
         """Announce a stage of `total` steps, and report its wall time."""

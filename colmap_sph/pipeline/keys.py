@@ -15,7 +15,13 @@ from colmap_sph.stereo.rectified_pair import RectifiedPair
 # The modules whose code makes each kind of result.
 _MAKERS = {
     kind: f"colmap_sph.pipeline.stages.{module}"
-    for kind, module in {"pair": "match", "vote": "vote", "geometric": "confirm", "cloud": "fuse"}.items()
+    for kind, module in {
+        "undistorted": "undistort",
+        "pair": "match",
+        "vote": "vote",
+        "geometric": "confirm",
+        "cloud": "fuse",
+    }.items()
 }
 
 
@@ -33,30 +39,54 @@ class Keys:
     Parameters
     ----------
     workspace : Workspace
-        Its images and their masks are read once each. What else a key holds is passed in by the stage.
+        The masks of its images are read once each. What else a key holds is passed in by the stage.
     options : RunOptions
+    images : mapping of str to str, optional
+        Digest of the content of each image in the workspace. One that is not there yet has none, and its results
+        get keys that no result can have.
     fresh : bool
-        Nothing of what there may be counts: the keys are none that a result can have, and images are not read.
+        Nothing of what there may be counts: so it is with all results.
     """
 
-    def __init__(self, workspace: Workspace, options: RunOptions, *, fresh: bool = False) -> None:
+    def __init__(
+        self,
+        workspace: Workspace,
+        options: RunOptions,
+        images: Mapping[str, str] | None = None,
+        *,
+        fresh: bool = False,
+    ) -> None:
+        self.fresh = fresh
         self._workspace = workspace
         self._options = options
-        self._fresh = fresh
+        self._images = images or {}
         self._programs = program_digests()
-        self._images: LoadCache[str | None] = LoadCache(lambda _: 0)
         self._masks: LoadCache[str | None] = LoadCache(lambda _: 0)
 
     def _image(self, name: str) -> str | None:
-        path = self._workspace.image_path(name)
-        return self._images.get(name, lambda: None if self._fresh else file_digest(path))
+        return self._images.get(name)
 
     def _mask(self, name: str) -> str | None:
         path = self._workspace.mask_path(name)
-        return self._masks.get(name, lambda: None if self._fresh else _digest_if_there(path))
+        return self._masks.get(name, lambda: None if self.fresh else _digest_if_there(path))
 
     def _key(self, kind: str, *parts: object) -> str:
-        return digest(kind, self._programs.get(kind), self._fresh, *parts)
+        return digest(kind, self._programs.get(kind), self.fresh, *parts)
+
+    def undistorted(self, image: str, camera: tuple[object, ...], mask: Path | None) -> str:
+        """Of an undistorted image.
+
+        Parameters
+        ----------
+        image : str
+            Digest of the content of the original.
+        camera : tuple
+            All that its camera is.
+        mask : Path or None
+            Of the original, where there is one.
+        """
+        mask_digest = None if mask is None or self.fresh else file_digest(mask)
+        return self._key("undistorted", image, camera, mask_digest, self._options.undistortion)
 
     def pair(self, left: View, right: View, geometry: RectifiedPair) -> str:
         """Of a disparity map.
@@ -108,7 +138,7 @@ class Keys:
             [self._image(name) for name in maps],
             partners,
             (scene.origin, scene.anchor, scene.image_ids),
-            [] if self._fresh else [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
+            [] if self.fresh else [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
             self._options.fusion,
             [_digest_if_there(mask_path(folder, name)) for name in maps] if folder else [],
         )

@@ -16,14 +16,20 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions, num_cores
-from colmap_sph.pipeline.reconstruct import check_input, choose_pairs, go_through_stages, wanted_scene
+from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.pipeline.reconstruct import (
+    check_input,
+    check_workspace_images,
+    choose_pairs,
+    go_through_stages,
+    wanted_scene,
+)
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage, keys_of
 from colmap_sph.project.files import free_space
 from colmap_sph.project.project import Project, open_workspace
-from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
-from colmap_sph.project.undistortion import foresee_workspace
-from colmap_sph.project.workspace import Workspace
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.ownership import foreign_files, named
 from colmap_sph.stereo.anchor import anchored
 
 logger = logging.getLogger(__name__)
@@ -31,9 +37,6 @@ logger = logging.getLogger(__name__)
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
 
-# Processor seconds and bytes per megapixel and pixel of the original images, while these are undistorted.
-_UNDISTORT_SECONDS = 0.06
-_UNDISTORTED_BYTES = 1.0
 # Bytes that the interpreter and the libraries have in use.
 _BASE_MEMORY = 200e6
 
@@ -85,7 +88,7 @@ class Plan:
     free_disk : int
         Free space where these go, bytes.
     stages : tuple of StagePlan
-        Of each stage, in their order; the undistortion, where it is to do, before them.
+        Of each stage, in their order; with a sparse model the undistortion before them.
     """
 
     undistort: bool
@@ -117,32 +120,38 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     Plan
     """
     check_input(project, options)
-    foreseen = None
-    dense = open_workspace(project) if project.model is None else Workspace(project.root)
-    if project.model is not None:
-        foreseen = foresee_workspace(project, options.undistortion, overwrite=overwrite)
-    if foreseen is None:
-        scene = leave_out_bad_images(anchored(read_scene(dense.sparse_dir)), dense)
-    else:
-        scene = anchored(foreseen.scene)
-    selection = choose_pairs(dense if foreseen is None else None, scene, options, project.database())
-    keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
-    context = Context(dense, wanted_scene(scene, selection), options, keys)
     survey = Survey()
+    foreseen = None
+    to_make: set[str] = set()
+    if project.model is None:
+        dense = open_workspace(project)
+    else:
+        preparation = Preparation(project, options, overwrite=overwrite)
+        dense = preparation.workspace
+        undistorted = preparation.undistort(survey, preparation.check(survey))
+        to_make = {name for name, result in undistorted.items() if result.made}
+        foreseen = preparation.scene(undistorted)
+    scene = anchored(read_scene(dense.sparse_dir) if foreseen is None else foreseen)
+    there = scene.only(scene.index_of.keys() - to_make)
+    context = Context(dense, there, options, Keys(dense, options, fresh=overwrite))
+    images = check_workspace_images(context, survey) if there.views else {}
+    scene = scene.only({*images, *to_make})
+    selection = choose_pairs(dense if foreseen is None else None, scene, options, project.database())
+    keys = Keys(dense, options, keys_of(images), fresh=overwrite)
+    context = Context(dense, wanted_scene(scene, selection), options, keys)
+    foreign = foreign_files(context.places, overwrite=overwrite)
+    if foreign:
+        logger.warning("Would get another name, as this program did not make it: %s", named(foreign))
     go_through_stages(context, selection.unique_pairs(), survey)
     stages = survey.stages
-    pairs, _, images, cloud = stages
-    if foreseen is not None:
-        pixels = sum(view.num_pixels for view in context.scene.views)
-        seconds = _UNDISTORT_SECONDS * foreseen.original_pixels / 1e6
-        stages = [StagePlan("undistort", 1, 0, seconds, _BASE_MEMORY, _UNDISTORTED_BYTES * pixels), *stages]
+    pairs, _, maps, cloud = stages[-4:]
     return Plan(
-        undistort=foreseen is not None,
+        undistort=bool(to_make),
         pair_source=selection.source,
         pairs=pairs.total,
         pairs_done=pairs.done,
-        images=images.total,
-        images_done=images.done,
+        images=maps.total,
+        images_done=maps.done,
         fuse=cloud.done < cloud.total,
         seconds=sum(stage.seconds for stage in stages) / min(options.num_threads, num_cores()),
         memory=max(stage.memory for stage in stages),

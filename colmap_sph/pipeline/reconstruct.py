@@ -6,9 +6,10 @@ deviations, geometric maps, the cloud. What an earlier run finished with the sam
 
 import itertools
 import json
+import logging
 import resource
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -18,7 +19,9 @@ from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.stages.check_images import CheckStage
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
@@ -30,14 +33,16 @@ from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
-from colmap_sph.project.scene_reader import leave_out_bad_images, read_scene
-from colmap_sph.project.staging import discard_results
-from colmap_sph.project.undistortion import UndistortionOptions, prepare_workspace
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.ownership import damaged_files, discard_results, named, results_of, take_places
+from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
+
+logger = logging.getLogger(__name__)
 
 
 def run(
@@ -50,6 +55,7 @@ def run(
     options: RunOptions | None = None,
     progress: Progress | None = None,
     overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """From a sparse model, or a dense workspace, to depth maps, normal maps and a fused cloud.
 
@@ -63,7 +69,9 @@ def run(
     progress : Progress, optional
     overwrite : bool
         Do everything again. A workspace that this program undistorted is removed first; one given as `workspace`
-        keeps its images and model.
+        keeps its images and model. Files that this program did not make, where it will write, get another name.
+    verify : bool
+        Look at every byte of earlier results first, and make again what is damaged.
 
     Returns
     -------
@@ -81,11 +89,18 @@ def run(
     >>> print(report.points, report.coverage)  # doctest: +SKIP
     """
     paths = (None if path is None else Path(path) for path in (model, images, masks, output, workspace))
-    return run_project(Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite)
+    return run_project(
+        Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite, verify=verify
+    )
 
 
 def run_project(
-    project: Project, options: RunOptions, *, progress: Progress | None = None, overwrite: bool = False
+    project: Project,
+    options: RunOptions,
+    *,
+    progress: Progress | None = None,
+    overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """Do what `run` does, for what is in one record.
 
@@ -93,30 +108,35 @@ def run_project(
     ----------
     project : Project
     options : RunOptions
-    progress, overwrite
+    progress, overwrite, verify
         See `run`.
     """
     check_input(project, options)
     program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
     report = RunReport()
+    dense = Workspace(project.root)
     if project.model is None:
         dense = open_workspace(project)
         with claimed(dense):
             if overwrite:
                 discard_results(dense)
-            return reconstruct(dense, options, progress=progress, report=report)
-    with claimed(Workspace(project.root)):
-        with timed_stage("undistort", 1, progress, report):
-            prepared = prepare_workspace(project, options.undistortion, overwrite=overwrite)
-            progress.advance()
+            return reconstruct(
+                dense, options, progress=progress, report=report, overwrite=overwrite, verify=verify
+            )
+    with claimed(dense):
+        preparation = Preparation(
+            project, options, overwrite=overwrite, verify=verify, progress=progress, report=report
+        )
+        preparation.run(execute)
         return reconstruct(
-            prepared.workspace,
+            dense,
             options,
             progress=progress,
             report=report,
             database=project.database(),
-            expected=prepared.expected,
+            overwrite=overwrite,
+            verify=verify,
         )
 
 
@@ -135,7 +155,8 @@ def reconstruct(
     progress: Progress | None = None,
     report: RunReport | None = None,
     database: Path | None = None,
-    expected: Iterable[str] = (),
+    overwrite: bool = False,
+    verify: bool = False,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -148,8 +169,11 @@ def reconstruct(
         What is known of the run so far.
     database : Path, optional
         COLMAP's database, whose verified matches serve where the model has no tracks.
-    expected : iterable of str
-        Names of images that are reported as skipped where the workspace does not have them.
+    overwrite : bool
+        Files that this program did not make, where maps and cloud go, get another name; without it they are
+        refused.
+    verify : bool
+        See `run`.
 
     Returns
     -------
@@ -159,22 +183,39 @@ def reconstruct(
     report = report or RunReport()
     make_dir(workspace.state_dir)
     with one_opencv_thread():
-        whole = anchored(read_scene(workspace.sparse_dir))
-        scene = leave_out_bad_images(whole, workspace)
-        for name in sorted({*expected, *whole.index_of} - scene.index_of.keys()):
-            report.skipped_images[name] = "its image is missing, damaged or not of its camera's size; see the log"
+        scene = anchored(read_scene(workspace.sparse_dir))
+        context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
+        images = check_workspace_images(context, execute, verify=verify)
+        scene = scene.only(images)
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
             selection = choose_pairs(workspace, scene, options, database)
             report.pair_source = selection.source
             progress.advance()
         scene = wanted_scene(scene, selection)
-        context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
+        context = replace(context, scene=scene, keys=Keys(workspace, options, keys_of(images)))
+        take_places(context.places, overwrite=overwrite)
+        if verify:
+            _verify(context)
         go_through_stages(context, selection.unique_pairs(), execute)
     _write_report(context)
     if not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
+
+
+def _verify(context: Context) -> None:
+    """Look at every byte of earlier results; what is damaged is not there for the stages that follow."""
+    results = list(results_of(context.workspace))
+    damaged = []
+    with timed_stage("verify", len(results), context.progress, context.report):
+        for result in results:
+            damaged += damaged_files(result)
+            context.progress.advance()
+    if damaged:
+        logger.warning("Damaged, and made again: %s", named(damaged))
+    else:
+        logger.info("No earlier result is damaged")
 
 
 class Executor(Protocol):
@@ -199,6 +240,14 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     vote_keys = keys_of(executor(VoteStage(context, pair_keys)))
     maps = executor(ConfirmStage(context, pair_keys, vote_keys))
     executor(fuse_stage(context, pair_keys, maps))
+
+
+def check_workspace_images(context: Context, executor: Executor, *, verify: bool = False) -> dict[str, Result]:
+    """Check the undistorted images of a scene, with `verify` all anew; return the results of the good ones."""
+    workspace = context.workspace
+    sizes = {view.name: (view.width, view.height) for view in context.scene.views}
+    where = f"{workspace.images_dir} is usable."
+    return executor(CheckStage(context, sizes, workspace.image_path, "images", where, verify=verify))
 
 
 def choose_pairs(
@@ -227,8 +276,7 @@ def choose_pairs(
 
 def wanted_scene(scene: Scene, selection: PairSelection) -> Scene:
     """Return the scene without the views that are not asked for."""
-    wanted = {*selection.partners, *itertools.chain(*selection.unique_pairs())}
-    return replace(scene, views=tuple(view for view in scene.views if view.name in wanted))
+    return scene.only({*selection.partners, *itertools.chain(*selection.unique_pairs())})
 
 
 def _write_report(context: Context) -> None:

@@ -6,6 +6,8 @@ that is new in COLMAP's library works where the answers here, which come from th
 that needs more (a panorama, say) enters here.
 """
 
+import copy
+
 import numpy as np
 import pycolmap
 
@@ -44,27 +46,43 @@ def refuse_panoramas(model: pycolmap.Reconstruction) -> None:
             )
 
 
-def replace_ideal_fisheyes(model: pycolmap.Reconstruction) -> bool:
-    """Make COLMAP undistort fisheye cameras whose coefficients are all zero; return whether there are any.
+def plain_camera(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """Return a camera that maps alike and that COLMAP undistorts rightly; mostly the camera itself.
 
-    COLMAP takes any camera without distortion coefficients for a pinhole and copies its images. A coefficient
-    just above its threshold (1e-8) changes nothing: at 1 rad and f = 4000 px it is 4e-4 px.
+    COLMAP takes any camera without distortion coefficients for a pinhole: with one that is a pinhole of another
+    model it cuts off a pixel of the image, and of a fisheye it copies the image. A coefficient just above its
+    threshold (1e-8) changes nothing: at 1 rad and f = 4000 px it is 4e-4 px.
     """
-    changed = False
-    for camera in model.cameras.values():
-        if camera.is_undistorted() and not is_pinhole(camera):
-            K = camera.calibration_matrix()
-            camera.model = pycolmap.CameraModelId.OPENCV_FISHEYE
-            camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 1e-7, 0.0, 0.0, 0.0]
-            changed = True
-    return changed
+    if not camera.is_undistorted() or camera.model == pycolmap.CameraModelId.PINHOLE:
+        return camera
+    plain = copy.deepcopy(camera)
+    if is_pinhole(camera):
+        make_pinhole(plain)
+    else:
+        K = camera.calibration_matrix()
+        plain.model = pycolmap.CameraModelId.OPENCV_FISHEYE
+        plain.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], 1e-7, 0.0, 0.0, 0.0]
+    return plain
+
+
+def undistorted_camera(
+    camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions
+) -> pycolmap.Camera | None:
+    """Return the camera of an undistorted image, from a `plain_camera`; None where it is that of the original."""
+    undistorted = pycolmap.undistort_camera(options, camera)
+    same_size = (undistorted.width, undistorted.height) == (camera.width, camera.height)
+    return None if same_size and camera.is_undistorted() else undistorted
 
 
 def undistort_cameras(model: pycolmap.Reconstruction, options: pycolmap.UndistortCameraOptions) -> None:
     """Give a model, in place, the cameras that its undistorted images will have."""
-    replace_ideal_fisheyes(model)
     for camera in model.cameras.values():
-        undistorted = pycolmap.undistort_camera(options, camera)
-        camera.model = undistorted.model
-        camera.params = undistorted.params
-        camera.width, camera.height = undistorted.width, undistorted.height
+        plain = plain_camera(camera)
+        change_camera(camera, undistorted_camera(plain, options) or plain)
+
+
+def change_camera(camera: pycolmap.Camera, other: pycolmap.Camera) -> None:
+    """Give a camera, in place, the model, size and parameters of another."""
+    camera.model = other.model
+    camera.params = list(other.params)
+    camera.width, camera.height = other.width, other.height

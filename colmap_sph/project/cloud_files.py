@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import OutputError
-from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.files import atomic_file, make_dir, set_aside
 from colmap_sph.project.map_coordinates import move_cloud, move_model
+from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES
 from colmap_sph.project.workspace import Workspace
 
 _HEADER = "\n".join(
@@ -42,7 +44,10 @@ def write_part(stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.ui
     """
     count = 0
     # One alone is an atomic file, whose temporary name is that of the thread.
-    with atomic_file(stem.with_suffix(".points")) as cloud, stem.with_suffix(".vis").open("wb") as visible:
+    with (
+        atomic_file(stem.with_suffix(".points"), sync=False) as cloud,
+        stem.with_suffix(".vis").open("wb") as visible,
+    ):
         for points, visibility in bands:
             cloud.write(points.data)
             visible.write(visibility.astype("<u4", copy=False).data)
@@ -73,7 +78,7 @@ def join_parts(stems: Sequence[Path], folder: Path, count: int) -> None:
 
 
 def _join(stems: Sequence[Path], suffix: str, target: Path, start: bytes) -> None:
-    with atomic_file(target) as file:
+    with atomic_file(target, sync=False) as file:  # until it is in its place
         file.write(start)
         for stem in stems:
             with stem.with_suffix(suffix).open("rb") as part:
@@ -140,7 +145,7 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
     OutputError
         The cloud in map coordinates cannot be written.
     """
-    shutil.rmtree(workspace.local_dir, ignore_errors=True)
+    remove_local_workspace(workspace)
     if origin.any():
         _keep_local_workspace(workspace, Workspace(scratch), origin)
     # A kill in between must not leave a cloud beside the visibility of another.
@@ -149,16 +154,33 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
         made.replace(place)
 
 
+def remove_local_workspace(workspace: Workspace) -> None:
+    """Remove what this program left there; a mesh that COLMAP made there stays."""
+    local = Workspace(workspace.local_dir)
+    for link in (local.images_dir, local.stereo_dir, local.visibility_path):
+        if link.is_symlink():
+            link.unlink()
+    for name in (*MODEL_FILES, *RIG_FILES):
+        (local.sparse_dir / f"{name}.bin").unlink(missing_ok=True)
+    local.fused_path.unlink(missing_ok=True)
+    workspace.local_origin_path.unlink(missing_ok=True)
+    for folder in (local.sparse_dir, local.root):
+        with suppress(OSError):  # not there, or not empty
+            folder.rmdir()
+
+
 def _keep_local_workspace(workspace: Workspace, linked: Workspace, origin: NDArray[np.float64]) -> None:
     """Keep what was fused near the origin, and leave the cloud in map coordinates in its place."""
     local = Workspace(workspace.local_dir)
-    local.root.mkdir()
+    local.root.mkdir(exist_ok=True)
     for made, kept in (
         (linked.fused_path, local.fused_path),
         (linked.images_dir, local.images_dir),
         (linked.stereo_dir, local.stereo_dir),
         (linked.sparse_dir, local.sparse_dir),
     ):
+        if os.path.lexists(kept):  # with files of the user
+            set_aside(kept)
         made.rename(kept)
     # Relative, so that the workspace can be moved as a whole.
     local.visibility_path.symlink_to(os.path.relpath(workspace.visibility_path, local.root))

@@ -15,10 +15,10 @@ import pycolmap
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.cloud_files import check_places, link_workspace, move_cloud_into_place
 from colmap_sph.project.colmap_library import quiet_colmap
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.map_coordinates import local_origin
 from colmap_sph.project.map_files import check_map
 from colmap_sph.project.sparse_model import cameras_of_images, load_model
-from colmap_sph.project.staging import scratch_folder
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import POINT
 

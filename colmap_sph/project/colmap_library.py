@@ -9,10 +9,10 @@ COLMAP_VERSION: str = pycolmap.__version__
 
 
 @contextmanager
-def quiet_colmap() -> Iterator[None]:
-    """Keep COLMAP's messages to warnings and errors."""
+def quiet_colmap(least: int = int(pycolmap.logging.WARNING)) -> Iterator[None]:
+    """Keep COLMAP's messages to those of a level or above: by default warnings and errors."""
     level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.WARNING)
+    pycolmap.logging.minloglevel = least
     try:
         yield
     finally:

@@ -1,20 +1,27 @@
-"""Folders and files made and removed for the user: errors are sentences, and no file is ever half-written."""
+"""Folders and files made, read and removed for the user: errors are sentences, no file is ever half-written."""
 
+import errno
 import os
 import re
 import shutil
+import stat
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from colmap_sph.errors import OutputError, reason_of
+import xxhash
+
+from colmap_sph.errors import InputError, OutputError, reason_of
 
 # What a file is called until it is complete: short, so that it fits wherever the real name fits; one per thread,
 # which writes one file at a time.
 _TEMPORARY_NAME = ".{process}-{thread}.tmp"
 _TEMPORARY = re.compile(r"\.\d+-\d+\.tmp")
+# What a file system answers that cannot sync at all: there is nothing to wait for then.
+_NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
+_READ_BYTES = 1 << 20
 
 
 def make_dir(folder: Path) -> None:
@@ -32,12 +39,36 @@ def free_space(path: Path) -> int:
     return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free
 
 
+class NewFile:
+    """A file that is being written, and the digest of what has been written to it so far."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self._state = xxhash.xxh3_128()
+
+    def write(self, data: bytes | memoryview) -> int:
+        """Append bytes."""
+        self._state.update(data)
+        return self._file.write(data)
+
+    @property
+    def digest(self) -> str:
+        """As `whole_digest` of the file."""
+        return self._state.hexdigest()
+
+
 @contextmanager
-def atomic_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for writing that appears under its name only when it is complete.
+def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
+    """Open a file for writing that appears under its name only when it is complete, and on the disk.
 
     The bytes go to a temporary name in the same folder, which then replaces `path` in one step; after an
-    error or an interruption `path` is as it was.
+    error, an interruption or a power cut `path` is as it was, or complete.
+
+    Parameters
+    ----------
+    path : Path
+    sync : bool
+        Whether to wait until the disk has it. Not for what is thrown away with the run.
 
     Raises
     ------
@@ -48,8 +79,13 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     temporary = path.parent / name
     try:
         with temporary.open("wb") as file:
-            yield file
+            yield NewFile(file)
+            file.flush()
+            if sync:
+                _sync(file.fileno())
         temporary.replace(path)
+        if sync:
+            sync_folder(path.parent)
     except OSError as error:
         raise OutputError(
             f"{path} cannot be written ({reason_of(error)}); check space and permissions."
@@ -57,6 +93,99 @@ def atomic_file(path: Path) -> Iterator[BinaryIO]:
     finally:
         with suppress(OSError):  # not there, or on a disk that has become read-only
             temporary.unlink()
+
+
+def sync_file(path: Path) -> None:
+    """Wait until the disk has a file's content; raises `OSError`."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        _sync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the disk has the names in a folder; raises `OSError`."""
+    with suppress(PermissionError):  # one that may be written to, but not read
+        sync_file(folder)
+
+
+def _sync(descriptor: int) -> None:
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in _NO_SYNC:
+            raise
+
+
+def open_regular(path: Path, *, follow: bool = True) -> BinaryIO:
+    """Open a file for reading: a regular one, never a pipe or device, for which one could wait for ever.
+
+    Parameters
+    ----------
+    path : Path
+    follow : bool
+        Whether it may be a link to a file.
+
+    Raises
+    ------
+    OSError
+        It is not there, cannot be opened, or is no regular file.
+    """
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
+    descriptor = os.open(path, flags)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(errno.EINVAL, "not a regular file", str(path))
+    return os.fdopen(descriptor, "rb")
+
+
+def read_small(path: Path, max_bytes: int, *, follow: bool = True) -> bytes:
+    """Read a whole file that cannot be large; otherwise as `open_regular`, and `OSError` for a larger one."""
+    with open_regular(path, follow=follow) as file:
+        if os.fstat(file.fileno()).st_size > max_bytes:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG), str(path))
+        return file.read()
+
+
+def whole_digest(path: Path) -> str:
+    """Digest of every byte of a file: 32 hexadecimal digits.
+
+    It finds damage; against someone who wants two files to have the same one it is no help.
+
+    Raises
+    ------
+    InputError
+        The file cannot be read.
+    """
+    state = xxhash.xxh3_128()
+    try:
+        with open_regular(path) as file:
+            while block := file.read(_READ_BYTES):
+                state.update(block)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read ({reason_of(error)}); check its permissions.") from error
+    return state.hexdigest()
+
+
+def set_aside(path: Path) -> Path:
+    """Give a file, link or folder another name beside it, ``NAME.backup``, ``NAME.backup2`` …, and return that.
+
+    Raises
+    ------
+    OutputError
+        It cannot be renamed.
+    """
+    number = 1
+    backup = path.with_name(f"{path.name}.backup")
+    while os.path.lexists(backup):
+        number += 1
+        backup = path.with_name(f"{path.name}.backup{number}")
+    try:
+        path.rename(backup)
+    except OSError as error:
+        raise OutputError(f"{path} cannot be set aside ({reason_of(error)}); check permissions.") from error
+    return backup
 
 
 def remove_temporary_files(folder: Path) -> None:
@@ -76,3 +205,14 @@ def remove(path: Path) -> None:
             path.unlink(missing_ok=True)
     except OSError as error:
         raise OutputError(f"{path} cannot be removed ({reason_of(error)}); check permissions.") from error
+
+
+@contextmanager
+def scratch_folder(scratch: Path) -> Iterator[None]:
+    """Start with an empty scratch folder and leave nothing behind, on success as on failure."""
+    shutil.rmtree(scratch, ignore_errors=True)
+    make_dir(scratch)
+    try:
+        yield
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)

@@ -7,19 +7,25 @@ ASCII ``width&height&channels&`` followed by little-endian float32, plane after 
 import re
 from collections.abc import Iterable
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
+import xxhash
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.files import atomic_file
+from colmap_sph.errors import DamageError, InputError, reason_of
+from colmap_sph.project.files import atomic_file, open_regular
 
 _MAX_HEADER = 30
+# Of the square of a normal's length.
+_UNIT_TOLERANCE = 0.01
+# Values of a plane that are looked at together: what stays in the processor's cache.
+_BAND_VALUES = 1 << 15
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
 
 
-def write_depth_map(path: Path, depth: NDArray[np.float32]) -> None:
-    """Write a depth map in COLMAP's format.
+def write_depth_map(path: Path, depth: NDArray[np.float32]) -> str:
+    """Write a depth map in COLMAP's format; returns the `files.whole_digest` of the file.
 
     Parameters
     ----------
@@ -36,16 +42,34 @@ def write_depth_map(path: Path, depth: NDArray[np.float32]) -> None:
     if depth.ndim != 2:
         raise ValueError(f"a depth map has shape (H, W), not {depth.shape}")
     # Fusion's test is `depth <= 0`, which NaN passes.
-    _write_planes(path, [np.where(np.isfinite(depth), depth, 0.0)], (*depth.shape, 1))
+    return _write_planes(path, [np.where(np.isfinite(depth), depth, 0.0)], (*depth.shape, 1))
 
 
-def read_depth_map(path: Path) -> NDArray[np.float32]:
-    """Read a COLMAP depth map as an (H, W) float32 array; `InputError` where it is missing or damaged."""
-    return np.asarray(_read_planes(path, channels=1)[0])
+def read_depth_map(path: Path, digest: str | None = None) -> NDArray[np.float32]:
+    """Read a COLMAP depth map.
+
+    Parameters
+    ----------
+    path : Path
+    digest : str, optional
+        Of the whole file, as it must be.
+
+    Returns
+    -------
+    (H, W) float32 ndarray
+
+    Raises
+    ------
+    DamageError
+        The file is another than the digest says.
+    InputError
+        It is missing, cannot be read, or is no depth map.
+    """
+    return np.asarray(_read_planes(path, 1, digest)[0])
 
 
-def write_normal_map(path: Path, normals: NDArray[np.float32]) -> None:
-    """Write a normal map in COLMAP's format.
+def write_normal_map(path: Path, normals: NDArray[np.float32]) -> str:
+    """Write a normal map in COLMAP's format; returns the `files.whole_digest` of the file.
 
     Parameters
     ----------
@@ -62,7 +86,7 @@ def write_normal_map(path: Path, normals: NDArray[np.float32]) -> None:
     if normals.ndim != 3 or normals.shape[2] != 3:
         raise ValueError(f"a normal map has shape (H, W, 3), not {normals.shape}")
     finite = np.isfinite(normals).all(axis=2)
-    _write_planes(path, (np.where(finite, normals[..., k], 0.0) for k in range(3)), (*finite.shape, 3))
+    return _write_planes(path, (np.where(finite, normals[..., k], 0.0) for k in range(3)), (*finite.shape, 3))
 
 
 def read_normal_map(path: Path) -> NDArray[np.float32]:
@@ -70,18 +94,19 @@ def read_normal_map(path: Path) -> NDArray[np.float32]:
     return np.ascontiguousarray(read_normal_planes(path).transpose(1, 2, 0))
 
 
-def read_normal_planes(path: Path) -> NDArray[np.float32]:
-    """Read a COLMAP normal map as it lies in the file: a (3, H, W) float32 array; raises as `read_normal_map`."""
-    return _read_planes(path, channels=3)
+def read_normal_planes(path: Path, digest: str | None = None) -> NDArray[np.float32]:
+    """Read a COLMAP normal map as it lies in the file: a (3, H, W) float32 array; else as `read_depth_map`."""
+    return _read_planes(path, 3, digest)
 
 
-def _write_planes(path: Path, planes: Iterable[NDArray[np.floating]], shape: tuple[int, int, int]) -> None:
+def _write_planes(path: Path, planes: Iterable[NDArray[np.floating]], shape: tuple[int, int, int]) -> str:
     """Write planes one after the other, so that only one has to be in memory; `shape` is (H, W, planes)."""
     height, width, channels = shape
     with atomic_file(path) as file:
         file.write(f"{width}&{height}&{channels}&".encode())
         for plane in planes:
             file.write(np.ascontiguousarray(plane, dtype="<f4").data)
+        return file.digest
 
 
 def check_map(path: Path, shape: tuple[int, ...]) -> None:
@@ -91,9 +116,9 @@ def check_map(path: Path, shape: tuple[int, ...]) -> None:
     error that does not name it.
     """
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(_MAX_HEADER)
-            size = path.stat().st_size
+            size = file.seek(0, 2)
     except OSError as error:
         raise InputError(f"The map {path} cannot be read ({reason_of(error)}); compute it again.") from error
     channels = shape[2] if len(shape) == 3 else 1
@@ -118,17 +143,59 @@ def _parse_header(path: Path, start: bytes, size: int, channels: int) -> tuple[t
     return (height, width), header.end()
 
 
-def _read_planes(path: Path, *, channels: int) -> NDArray[np.float32]:
+def _read_planes(path: Path, channels: int, digest: str | None) -> NDArray[np.float32]:
     """Read a map file as a (channels, H, W) array."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             start = file.read(_MAX_HEADER)
-            size = path.stat().st_size
+            size = file.seek(0, 2)
             (height, width), header = _parse_header(path, start, size, channels)
             file.seek(header)
-            values = np.fromfile(file, "<f4", channels * height * width)
+            values = _read_values(path, file, channels * height * width)
     except OSError as error:
         raise InputError(f"The map {path} cannot be read ({reason_of(error)}); compute it again.") from error
-    if len(values) < channels * height * width:
-        raise InputError(f"{path} is truncated or damaged; delete it and compute it again.")
+    if digest is not None and digest != _digest(start[:header], values):
+        raise DamageError(f"The map {path} is not what this program wrote; run again, to make it anew.")
     return values.astype(np.float32, copy=False).reshape(channels, height, width)
+
+
+def _read_values(path: Path, file: BinaryIO, count: int) -> NDArray[np.float32]:
+    values = np.empty(count, "<f4")
+    if file.readinto(values.view(np.uint8).data) != values.nbytes:  # type: ignore[attr-defined]
+        raise InputError(f"{path} is truncated or damaged; delete it and compute it again.")
+    return values
+
+
+def _digest(header: bytes, values: NDArray[np.float32]) -> str:
+    state = xxhash.xxh3_128(header)
+    state.update(values.data)
+    return state.hexdigest()
+
+
+def find_flaw(depth: NDArray[np.float32], normals: NDArray[np.float32]) -> str | None:
+    """Say what makes maps unfit for fusion, whoever wrote them.
+
+    Parameters
+    ----------
+    depth : (H, W) float32 ndarray
+    normals : (3, H, W) float32 ndarray
+
+    Returns
+    -------
+    str or None
+        None where depths are finite, and normals unit vectors or zero.
+    """
+    step = max(_BAND_VALUES // depth.shape[1], 1)
+    for first in range(0, depth.shape[0], step):
+        rows = slice(first, first + step)
+        if not np.isfinite(depth[rows]).all():
+            return "a depth that is not finite"
+        x, y, z = normals[:, rows]
+        # What is too large to be squared becomes infinite, and is found so.
+        with np.errstate(over="ignore", invalid="ignore"):
+            squared = x * x + y * y + z * z
+        # In this form, as no comparison with NaN holds.
+        is_unit = np.abs(squared - 1) <= _UNIT_TOLERANCE
+        if not (is_unit | (squared == 0)).all():
+            return "a normal that is not of unit length"
+    return None

@@ -8,10 +8,16 @@ from colmap_sph.project.files import atomic_file
 from colmap_sph.scene import SourceImages
 
 
-def write_fusion_cfg(path: Path, names: Iterable[str]) -> None:
-    """Write ``fusion.cfg``: the images that fusion reads, one name per line, without comments."""
+def fusion_cfg(names: Iterable[str]) -> bytes:
+    """Content of ``fusion.cfg``: the images that fusion reads, one name per line, without comments."""
+    return "".join(f"{name}\n" for name in names).encode()
+
+
+def write_fusion_cfg(path: Path, names: Iterable[str]) -> str:
+    """Write ``fusion.cfg``, see `fusion_cfg`; returns the `files.whole_digest` of the file."""
     with atomic_file(path) as file:
-        file.write("".join(f"{name}\n" for name in names).encode())
+        file.write(fusion_cfg(names))
+        return file.digest
 
 
 def write_patch_match_cfg(path: Path, sources: Mapping[str, SourceImages]) -> None:

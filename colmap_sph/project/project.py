@@ -7,6 +7,7 @@ from colmap_sph.errors import InputError, OptionError
 from colmap_sph.project.database import find_database
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.sparse_model import cameras_of_images, has_model, load_model, model_files, models_inside
+from colmap_sph.project.undistortion.marker import refuse_unfinished
 from colmap_sph.project.workspace import Workspace
 
 
@@ -95,10 +96,12 @@ def open_workspace(project: Project) -> Workspace:
     Raises
     ------
     InputError
-        The folder is missing or is not a dense workspace, or a mask does not fit its image.
+        The folder is missing or is not a dense workspace, or its undistortion was not finished, or a mask does not
+        fit its image.
     """
     workspace = Workspace(project.root, project.masks)
     _check_folders(workspace)
+    refuse_unfinished(workspace)
     model = load_model(workspace.sparse_dir)
     if project.masks is not None or workspace.masks_dir.is_dir():
         check_masks(workspace.masks_dir, cameras_of_images(model))

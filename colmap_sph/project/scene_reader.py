@@ -1,7 +1,6 @@
 """COLMAP sparse model → frozen `Scene` of pinhole `View`s and sparse points; those whose images are good."""
 
 import logging
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,10 +9,8 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import is_pinhole
-from colmap_sph.project.images import image_problem
 from colmap_sph.project.map_coordinates import is_plausible, local_origin
 from colmap_sph.project.sparse_model import load_model
-from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 
 logger = logging.getLogger(__name__)
@@ -115,25 +112,3 @@ def _is_possible(view: View) -> bool:
         and (np.abs(view.R) < 1.01).all()
         and abs(np.linalg.det(view.R) - 1.0) < 1e-3
     )
-
-
-def leave_out_bad_images(scene: Scene, workspace: Workspace) -> Scene:
-    """Return the scene without the views whose undistorted image is missing, damaged or of another size.
-
-    Each of them is reported by a warning.
-
-    Raises
-    ------
-    InputError
-        No view is left.
-    """
-    good = []
-    for view in scene.views:
-        problem = image_problem(workspace.image_path(view.name), view.width, view.height)
-        if problem is None:
-            good.append(view)
-        else:
-            logger.warning("%s %s; left out", workspace.image_path(view.name), problem)
-    if not good:
-        raise InputError(f"None of the {len(scene.views)} images in {workspace.images_dir} is usable.")
-    return replace(scene, views=tuple(good))

@@ -115,6 +115,11 @@ class Workspace:
         return self.state_dir / "cloud.json"
 
     @property
+    def fusion_cfg_record_path(self) -> Path:
+        """Record of ``fusion.cfg`` as this program wrote it."""
+        return self.state_dir / "fusion_cfg.json"
+
+    @property
     def fusion_scratch_dir(self) -> Path:
         """While maps are fused: parts of the cloud."""
         return self.state_dir / "fusion"

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.pipeline.stages.pair_files import read_estimate
 from colmap_sph.project.images import read_grey, read_undistorted
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.scene_reader import read_scene
@@ -87,8 +88,7 @@ class Demo:
 
     def voted(self, name: str) -> DepthEstimate:
         """The photometric depth with its standard deviation and support, before planes are fitted to it."""
-        with np.load(self.workspace.state_dir / "photometric" / f"{name}.npz") as arrays:
-            return DepthEstimate(arrays["depth"], arrays["sigma"], arrays["support"])
+        return read_estimate(self.workspace.photometric_dir / f"{name}.sph", self.scene.view(name))
 
     def rectified(self, left: str, right: str, options: RectificationOptions | None = None) -> MatchedPair:
         """Rectify a pair; its disparity map comes when it is asked for."""

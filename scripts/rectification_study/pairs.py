@@ -66,7 +66,7 @@ class ExactMaps:
 def pair_files(run: Run) -> dict[tuple[str, str], Path]:
     """File of every pair that a run matched, by the names of its images."""
     found = {}
-    for file in sorted((run.workspace.state_dir / "pairs").glob("*.npz")):
+    for file in sorted((run.workspace.state_dir / "pairs").glob("*.sph")):
         pair = read_pair(file)
         found[pair.left, pair.right] = file
     return found

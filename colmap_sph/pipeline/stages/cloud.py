@@ -2,12 +2,20 @@
 
 import logging
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
+from msgspec import Meta
+
+from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.pipeline.load_cache import LoadCache
-from colmap_sph.pipeline.records import vouch, vouched_facts
+from colmap_sph.project.files import read_small, sync_file, sync_folder, whole_digest
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
+from colmap_sph.project.pair_lists import fusion_cfg, write_fusion_cfg
+from colmap_sph.project.sparse_model import image_names, load_model
+from colmap_sph.project.state.ownership import fusion_cfg_place
+from colmap_sph.project.state.records import begin, claim, vouch, vouched_facts
 from colmap_sph.stereo.fusion_losses import DepthAndNormals, explain_losses
 
 if TYPE_CHECKING:
@@ -21,20 +29,27 @@ _FEW_POINTS = 0.02
 _MOSTLY = 0.5
 # Bytes of maps in memory meanwhile.
 _CACHE_BYTES = 1 << 30
+_MAX_LIST_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
 class CloudFacts:
     """The number of points of a cloud, and what to advise where they are few."""
 
-    points: int
+    points: Annotated[int, Meta(ge=0)]
     advice: str
 
 
 def known_cloud(context: "Context", key: str) -> CloudFacts | None:
     """What is known of the cloud, or None where it must be made."""
-    known = vouched_facts(context.workspace.cloud_record_path, key, context.cloud_paths)
-    return None if known is None else CloudFacts(**known)
+    place = context.cloud_place
+    return vouched_facts(place.record, key, place.files, CloudFacts)
+
+
+def begin_cloud(context: "Context") -> None:
+    """Say that the cloud is about to be made anew; what is not ours in its place is set aside."""
+    place = context.cloud_place
+    begin(place.record, place.files)
 
 
 def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts) -> None:
@@ -47,7 +62,47 @@ def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts) -> None:
         Under which it was made.
     facts : CloudFacts
     """
-    vouch(context.workspace.cloud_record_path, key, context.cloud_paths, **asdict(facts))
+    place = context.cloud_place
+    try:
+        for path in place.files:
+            sync_file(path)
+            sync_folder(path.parent)
+    except OSError as error:
+        raise OutputError(
+            f"{place.files[0]} cannot be written ({reason_of(error)}); check space and permissions."
+        ) from error
+    vouch(place.record, key, {path: whole_digest(path) for path in place.files}, facts)
+
+
+def list_fused_images(context: "Context", names: Sequence[str]) -> None:
+    """Write ``fusion.cfg``, where it says something else; what the user made of it is set aside.
+
+    Parameters
+    ----------
+    context : Context
+    names : sequence of str
+        Images that are fused.
+    """
+    workspace = context.workspace
+    place = fusion_cfg_place(workspace)
+    found = _found_list(workspace.fusion_cfg_path)
+    if found == fusion_cfg(names):
+        return
+    if found is not None and set(found.decode(errors="replace").split("\n")) - {""} == _all_images(context):
+        claim(place.record)  # as COLMAP's undistortion writes it
+    begin(place.record, place.files)
+    vouch(place.record, "", {workspace.fusion_cfg_path: write_fusion_cfg(workspace.fusion_cfg_path, names)})
+
+
+def _found_list(path: Path) -> bytes | None:
+    try:
+        return read_small(path, _MAX_LIST_BYTES)
+    except OSError:
+        return None
+
+
+def _all_images(context: "Context") -> set[str]:
+    return set(image_names(load_model(context.workspace.sparse_dir)))
 
 
 def report_cloud(context: "Context", facts: CloudFacts) -> None:

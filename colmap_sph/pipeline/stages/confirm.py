@@ -14,8 +14,9 @@ from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
+from colmap_sph.pipeline.stages.pair_files import read_estimate
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
-from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS, read_estimate
+from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images import read_undistorted
 from colmap_sph.scene import View
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
@@ -80,7 +81,7 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
-    return _estimates.get(file_stamp(file.estimate), lambda: read_estimate(file.estimate))
+    return _estimates.get(file_stamp(file.estimate), lambda: read_estimate(file.estimate, file.view))
 
 
 def _image(file: EstimateFile) -> NDArray[np.uint8]:

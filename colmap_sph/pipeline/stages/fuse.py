@@ -16,11 +16,17 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.memory import format_memory, resident
-from colmap_sph.pipeline.records import forget
-from colmap_sph.pipeline.stages.cloud import facts_of_cloud, known_cloud, report_cloud, vouch_for_cloud
+from colmap_sph.pipeline.stages.cloud import (
+    begin_cloud,
+    facts_of_cloud,
+    known_cloud,
+    list_fused_images,
+    report_cloud,
+    vouch_for_cloud,
+)
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
-from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
+from colmap_sph.pipeline.stages.view_maps import MapSources, read_sound_maps, read_view_maps
 from colmap_sph.project.cloud_files import (
     check_places,
     join_parts,
@@ -29,9 +35,8 @@ from colmap_sph.project.cloud_files import (
     write_part,
 )
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
-from colmap_sph.project.pair_lists import write_fusion_cfg
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.sparse_model import load_model
-from colmap_sph.project.staging import scratch_folder
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.partners.pairing import Pair, partners_of
@@ -144,6 +149,7 @@ class FuseStage(Stage[str, FuseTask]):
         self._known = known_cloud(context, self._key)
         self._is_there = self._known is not None
         self._index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
+        self._known_sources: dict[str, MapSources] = {}
         self._scratch = context.workspace.fusion_scratch_dir
 
     def job(self, item: str) -> Job[FuseTask]:
@@ -164,17 +170,10 @@ class FuseStage(Stage[str, FuseTask]):
         return Job(self._key, None if self._known is None else Facts(), cost, task)
 
     def _sources(self, name: str) -> MapSources:
-        view = self.context.scene.view(name)
-        options = self.context.options.fusion
-        maps = self.context.map_files(name, options.input)
-        return MapSources(
-            view.without_points(),
-            self._index_of[view.image_id],
-            maps.depth,
-            maps.normals,
-            self.context.workspace.image_path(name),
-            None if options.mask_path is None else mask_path(options.mask_path, name),
-        )
+        if name not in self._known_sources:
+            index = self._index_of[self.context.scene.view(name).image_id]
+            self._known_sources[name] = _sources_of(self.context, name, index)
+        return self._known_sources[name]
 
     def _stem(self, name: str) -> Path:
         return self._scratch / f"{self.context.scene.view(name).image_id}"
@@ -189,12 +188,12 @@ class FuseStage(Stage[str, FuseTask]):
     @contextmanager
     def opened(self) -> Iterator[None]:
         """Begin the cloud anew where it must be made; its parts are there until this ends."""
-        write_fusion_cfg(self.context.workspace.fusion_cfg_path, self.items)
+        list_fused_images(self.context, self.items)
         if self._known is not None:
             yield
             return
         check_places(self.context.workspace)
-        forget(self.context.workspace.cloud_record_path)
+        begin_cloud(self.context)
         with scratch_folder(self._scratch):
             yield
 
@@ -236,6 +235,21 @@ class FuseStage(Stage[str, FuseTask]):
         return int(not self._is_there), int(self._is_there)
 
 
+def _sources_of(context: "Context", name: str, index: int) -> MapSources:
+    options = context.options.fusion
+    maps = context.map_files(name, options.input)
+    return MapSources(
+        context.scene.view(name).without_points(),
+        index,
+        maps.depth,
+        maps.normals,
+        context.workspace.image_path(name),
+        None if options.mask_path is None else mask_path(options.mask_path, name),
+        maps.digests(),
+        maps.record,
+    )
+
+
 def _partners_in_fusion(
     context: "Context", pair_keys: Mapping[Pair, str], names: Sequence[str]
 ) -> dict[str, list[str]]:
@@ -260,6 +274,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
         super().__init__(context, ["the cloud"])
         self._names = list(maps)
+        self._sound = self._names
         self._views = [context.scene.view(name) for name in self._names]
         # Without tracks COLMAP would find no images that overlap.
         self._partners = None if context.scene.has_tracks else partners_of(pair_keys)
@@ -284,12 +299,25 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
     @contextmanager
     def opened(self) -> Iterator[None]:
         """Begin the cloud anew where it must be made."""
-        write_fusion_cfg(self.context.workspace.fusion_cfg_path, self._names)
         if self._known is None:
             check_places(self.context.workspace)
-            forget(self.context.workspace.cloud_record_path)
+            self._sound = list(filter(self._is_sound, self._names))
+            if not self._sound:
+                reason = self.context.report.skipped_images[self._names[0]]
+                raise NoResultError(f"No image could be fused ({reason})")
+            begin_cloud(self.context)
             self._warn_of_memory()
+        list_fused_images(self.context, self._sound)
         yield
+
+    def _is_sound(self, name: str) -> bool:
+        """Whether COLMAP can be given an image's maps, which it trusts."""
+        try:
+            read_sound_maps(_sources_of(self.context, name, 0))
+        except InputError as error:
+            self.context.skip_view(name, str(error))
+            return False
+        return True
 
     def _warn_of_memory(self) -> None:
         """COLMAP's cache bounds its memory, but makes it many times slower."""
@@ -308,6 +336,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         """See `Stage.close`."""
         if self._known is None:
             points = sum(result.facts.points for result in results.values())
-            self._known = facts_of_cloud(self.context, self._names, points)
-            vouch_for_cloud(self.context, self._key, self._known)
+            self._known = facts_of_cloud(self.context, self._sound, points)
+            if self._sound == self._names:
+                vouch_for_cloud(self.context, self._key, self._known)
         report_cloud(self.context, self._known)

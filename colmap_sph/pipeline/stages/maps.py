@@ -2,16 +2,25 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
-from colmap_sph.pipeline.records import forget, vouch, vouched_facts
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
+from colmap_sph.project.state.records import begin, vouch, vouched_facts, whole_digests
 
 MAP_BYTES = 16.0
 """Bytes on disk per pixel, of a depth and a normal map."""
+
+
+@dataclass(frozen=True)
+class MapFacts:
+    """What the record of maps says of them: the share of pixels with a depth."""
+
+    coverage: Annotated[float, Meta(ge=0, le=1)]
 
 
 @dataclass(frozen=True)
@@ -37,14 +46,18 @@ class MapFiles:
         Facts
             With the share of pixels with a depth.
         """
-        forget(self.record)
-        write_depth_map(self.depth, depth)
-        write_normal_map(self.normals, normals)
-        coverage = float((depth > 0).mean())
-        vouch(self.record, key, [self.depth, self.normals], coverage=coverage)
-        return Facts(coverage=coverage)
+        begin(self.record, [self.depth, self.normals])
+        digests = {self.depth: write_depth_map(self.depth, depth)}
+        digests[self.normals] = write_normal_map(self.normals, normals)
+        facts = MapFacts(float((depth > 0).mean()))
+        vouch(self.record, key, digests, facts)
+        return Facts(coverage=facts.coverage)
 
     def facts(self, key: str) -> Facts | None:
         """What is known of the maps, or None where they must be made."""
-        known = vouched_facts(self.record, key, [self.depth, self.normals])
-        return None if known is None else Facts(coverage=known["coverage"])
+        known = vouched_facts(self.record, key, [self.depth, self.normals], MapFacts)
+        return None if known is None else Facts(coverage=known.coverage)
+
+    def digests(self) -> tuple[str, ...] | None:
+        """Of the whole depth map and the whole normal map, as they were written; None of maps of others."""
+        return whole_digests(self.record, 2)

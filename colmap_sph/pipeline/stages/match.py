@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.pair_files import stored_key, write_pair
+from colmap_sph.pipeline.stages.pair_files import is_pair_there, write_pair
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images import grey_bytes, read_grey
 from colmap_sph.project.masks import read_mask
+from colmap_sph.project.state.array_file import OLD_SUFFIX
+from colmap_sph.project.state.ownership import remove_array_files
 from colmap_sph.scene import View
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair
@@ -134,7 +136,8 @@ class MatchStage(Stage[Pair, MatchTask]):
             target,
             key,
         )
-        return Job(key, Facts() if stored_key(target) == key else None, cost, task)
+        is_there = is_pair_there(target, key, left.name, right.name, geometry)
+        return Job(key, Facts() if is_there else None, cost, task)
 
     def _photo(self, view: View) -> PhotoFile:
         workspace = self.context.workspace
@@ -162,6 +165,7 @@ class MatchStage(Stage[Pair, MatchTask]):
     def opened(self) -> Iterator[None]:
         """See `Stage.opened`."""
         make_dir(self.context.workspace.pairs_dir)
+        remove_array_files(self.context.workspace, OLD_SUFFIX)
         yield
 
     @contextmanager

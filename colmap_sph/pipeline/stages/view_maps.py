@@ -4,11 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
+import numpy as np
+from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import DamageError, InputError
 from colmap_sph.project.images import read_undistorted
-from colmap_sph.project.map_files import read_depth_map, read_normal_planes
+from colmap_sph.project.map_files import check_map, find_flaw, read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_mask
+from colmap_sph.project.state.records import invalidate
 from colmap_sph.scene import View
 from colmap_sph.stereo.fusion import ViewMaps
 
@@ -26,6 +29,10 @@ class MapSources:
         Its maps, and its undistorted image for the colours.
     mask : Path or None
         Where its mask would be, black = excluded.
+    digests : tuple of str, optional
+        Of the whole files of both maps, as they must be.
+    record : Path, optional
+        What vouches for the maps, and shall not any more where they are found to be damaged.
     """
 
     view: View
@@ -34,6 +41,8 @@ class MapSources:
     normals: Path
     image: Path
     mask: Path | None
+    digests: tuple[str, ...] | None = None
+    record: Path | None = None
 
 
 def read_view_maps(sources: MapSources) -> ViewMaps:
@@ -45,16 +54,40 @@ def read_view_maps(sources: MapSources) -> ViewMaps:
         A map, the image or the mask is missing, damaged or not of the camera's size.
     """
     view = sources.view
-    depth = read_depth_map(sources.depth)
-    normals = read_normal_planes(sources.normals)
+    depth, normals = read_sound_maps(sources)
     image = read_undistorted(sources.image, cv2.IMREAD_COLOR)
     shape = (view.height, view.width)
-    if depth.shape != shape or normals.shape[1:] != shape or image.shape[:2] != shape:
-        raise InputError(
-            f"The maps or the image of {view.name} are not of its camera's {shape[1]} x {shape[0]} pixels; "
-            "delete the maps and compute them again."
-        )
+    if image.shape[:2] != shape:
+        raise InputError(f"The image {sources.image} is not of its camera's {shape[1]} x {shape[0]} pixels.")
     mask = None if sources.mask is None else read_mask(sources.mask, view.width, view.height)
     if mask is not None:
         depth[mask == 0] = 0
     return ViewMaps(view, sources.index, depth, normals, image)
+
+
+def read_sound_maps(sources: MapSources) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Read both maps of a view, (H, W) and (3, H, W), and check every byte and value.
+
+    Raises
+    ------
+    InputError
+        A map is missing, damaged, not of the camera's size, or holds what no map may hold. Where it was damaged
+        after it was written, its record vouches for it no more, so that the next run makes it anew.
+    """
+    shape = (sources.view.height, sources.view.width)
+    check_map(sources.depth, shape)
+    check_map(sources.normals, (*shape, 3))
+    try:
+        depth_digest, normals_digest = sources.digests or (None, None)
+        depth = read_depth_map(sources.depth, depth_digest)
+        normals = read_normal_planes(sources.normals, normals_digest)
+        flaw = find_flaw(depth, normals)
+        if flaw is not None:
+            raise DamageError(
+                f"The maps {sources.depth} and {sources.normals} have {flaw}; run again, to make them anew."
+            )
+    except DamageError:
+        if sources.record is not None:
+            invalidate(sources.record, "doubtful")
+        raise
+    return depth, normals

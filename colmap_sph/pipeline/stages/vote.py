@@ -8,7 +8,13 @@ from typing import TYPE_CHECKING
 
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
-from colmap_sph.pipeline.stages.pair_files import disparity_bytes, read_arrays, read_pair, stored_key, write_arrays
+from colmap_sph.pipeline.stages.pair_files import (
+    disparity_bytes,
+    is_estimate_there,
+    read_estimate,
+    read_pair,
+    write_estimate,
+)
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.masks import read_mask
@@ -49,7 +55,7 @@ class VoteTask:
 
 def make_photometric_maps(task: VoteTask) -> Facts:
     """Vote on the depth of a view; writes it with its standard deviation and support, and the photometric maps."""
-    estimate = read_estimate(task.estimate) if task.is_voted else _vote(task)
+    estimate = read_estimate(task.estimate, task.view) if task.is_voted else _vote(task)
     planes = fit_normals(task.view, estimate, task.normal_options)
     return task.maps.write(*planes, task.maps_key)
 
@@ -60,14 +66,8 @@ def _vote(task: VoteTask) -> DepthEstimate:
     if mask is not None:
         # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
         estimate.depth[mask == 0] = 0
-    arrays = {"depth": estimate.depth, "sigma": estimate.sigma, "support": estimate.support}
-    write_arrays(task.estimate, arrays, task.vote_key)
+    write_estimate(task.estimate, estimate, task.vote_key)
     return estimate
-
-
-def read_estimate(path: Path) -> DepthEstimate:
-    """Read what a vote has written; `InputError` where it is missing or damaged."""
-    return DepthEstimate(**read_arrays(path, ("depth", "sigma", "support")))
 
 
 class VoteStage(Stage[str, VoteTask]):
@@ -91,7 +91,7 @@ class VoteStage(Stage[str, VoteTask]):
         maps_key = context.keys.photometric(key)
         estimate = context.estimate_path(item)
         maps = context.map_files(item, "photometric")
-        is_voted = stored_key(estimate) == key
+        is_voted = is_estimate_there(estimate, key, view)
         task = VoteTask(
             view.without_points(),
             files,

@@ -1,0 +1,216 @@
+"""First part of a run with a sparse model: a dense workspace with its undistorted images.
+
+What a dry run asks and what a run does are the same stages. An interruption at any point leaves a workspace that
+says of itself that it is not finished, and that the next run goes on with.
+"""
+
+import logging
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.stages.check_images import CheckStage
+from colmap_sph.pipeline.stages.stage import Result, keys_of
+from colmap_sph.pipeline.stages.undistort import UndistortStage
+from colmap_sph.project.files import scratch_folder
+from colmap_sph.project.masks import check_masks
+from colmap_sph.project.project import Project
+from colmap_sph.project.sparse_model import cameras_of_images, has_model, image_names
+from colmap_sph.project.state.ownership import (
+    remove_empty_folders,
+    remove_recorded,
+    remove_undistorted,
+    undistorted_place,
+)
+from colmap_sph.project.state.records import claim
+from colmap_sph.project.undistortion.marker import (
+    Marker,
+    adopt,
+    check_made_from,
+    check_ours,
+    is_model_changed,
+    publish_model,
+    remove_model,
+    write_marker,
+)
+from colmap_sph.project.undistortion.model import (
+    ModelToUndistort,
+    check_space,
+    foreseen_scene,
+    undistort_model,
+)
+from colmap_sph.project.undistortion.originals import read_originals
+from colmap_sph.project.undistortion.process import ChildProcess
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import NO_SCENE, Scene
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.reconstruct import Executor
+
+logger = logging.getLogger(__name__)
+
+
+class Preparation:
+    """The undistortion of one project; writes nothing before it is asked to.
+
+    Parameters
+    ----------
+    project : Project
+        With a model, of any camera model that has a pinhole equivalent.
+    options : RunOptions
+    overwrite : bool
+        What there is does not count.
+    verify : bool
+        What is known of images from earlier runs does not count.
+    progress, report : optional
+        See `Context`.
+
+    Attributes
+    ----------
+    workspace : Workspace
+    names : tuple of str
+        Sorted names of all registered images of the original model.
+
+    Raises
+    ------
+    InputError
+        No usable model, a mask that does not fit its image, or the folder holds a workspace of something else or
+        made from something else.
+    """
+
+    def __init__(
+        self,
+        project: Project,
+        options: RunOptions,
+        *,
+        overwrite: bool = False,
+        verify: bool = False,
+        progress: Progress | None = None,
+        report: RunReport | None = None,
+    ) -> None:
+        self.workspace = Workspace(project.root)
+        self._originals = read_originals(project)
+        self._originals.check_outside(self.workspace)
+        self._options = options
+        self._overwrite = overwrite
+        self._verify = verify
+        self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
+        self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
+        self.names = tuple(image_names(self._originals.model))
+        self._context = Context(
+            self.workspace,
+            NO_SCENE,
+            options,
+            Keys(self.workspace, options, fresh=overwrite),
+            progress or Silent(),
+            report or RunReport(),
+        )
+        if self._originals.mask_dir is not None:
+            check_masks(self._originals.mask_dir, cameras_of_images(self._originals.model))
+
+    def run(self, executor: "Executor") -> None:
+        """Make the workspace.
+
+        Parameters
+        ----------
+        executor : callable
+            What is done with each stage, see `Executor`.
+        """
+        images = self.check(executor)
+        self.begin(images)
+        self.finish(self.undistort(executor, images))
+
+    def check(self, executor: "Executor") -> dict[str, str]:
+        """Go through the first stage: check the original images; return digests of the contents of good ones."""
+        originals = self._originals
+        cameras = cameras_of_images(originals.model)
+        sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+        where = f"{originals.image_dir} is usable; check --images."
+        return keys_of(
+            executor(
+                CheckStage(self._context, sizes, originals.image_path, "originals", where, verify=self._verify)
+            )
+        )
+
+    def begin(self, images: Collection[str]) -> None:
+        """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""
+        check_space(self._originals, images, self.workspace.root, self._options.undistortion)
+        found = self._found
+        if found is not None and found.version == 1:
+            found = adopt(self.workspace, found)
+            self._adopt_images(found.images)
+        if found is not None and self._overwrite:
+            self._discard(found)
+            found = None
+        if found is None or not found.is_finished:
+            write_marker(self.workspace, self._marker)
+        self._found = found
+
+    def undistort(self, executor: "Executor", images: Mapping[str, str]) -> dict[str, Result]:
+        """Go through the second stage: undistort the images that `check` found good; return their results."""
+        return executor(UndistortStage(self._context, self._originals, images))
+
+    def finish(self, results: Mapping[str, Result]) -> None:
+        """Give the workspace its model, where that is not there for these images."""
+        names = sorted(results)
+        found = self._found
+        if found is not None and is_model_changed(self.workspace, found):
+            logger.warning(
+                "%s was changed since this program made it; it is used as it is", self.workspace.sparse_dir
+            )
+            return
+        if found is not None and list(found.images) == names and has_model(self.workspace.sparse_dir):
+            logger.info("The undistorted images in %s are up to date", self.workspace.root)
+            return
+        scratch = self.workspace.undistortion_scratch_dir
+        with scratch_folder(scratch):
+            made = self._undistort_model(scratch, names)
+            publish_model(self.workspace, self._marker, made, names)
+        logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
+
+    def scene(self, results: Mapping[str, Result]) -> Scene | None:
+        """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
+        found = self._found
+        is_there = not self._overwrite and found is not None and found.version > 1
+        if (
+            is_there
+            and found is not None
+            and (list(found.images) == sorted(results) or is_model_changed(self.workspace, found))
+        ):
+            return None
+        return foreseen_scene(self._originals, results, self._options.undistortion)
+
+    def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
+        """Undistort the model in a process of its own; return the folder where it is."""
+        task = ModelToUndistort(self._originals.model_dir, tuple(names), self._options.undistortion, scratch)
+        child = ChildProcess(scratch)
+        try:
+            child.call(undistort_model, task, f"the model in {self.workspace.root}")
+        except InputError as error:
+            # The model was read before: what can go wrong is that the disk does not take the new one.
+            raise OutputError(
+                f"The model of the undistorted images cannot be written ({reason_of(error)}); check space and "
+                "permissions."
+            ) from error
+        finally:
+            child.close()
+        return task.final_dir
+
+    def _adopt_images(self, names: Sequence[str]) -> None:
+        """Take what an earlier version undistorted for this program's, so that it may be replaced."""
+        for name in names:
+            claim(undistorted_place(self.workspace, name).record)
+
+    def _discard(self, found: Marker) -> None:
+        workspace = self.workspace
+        remove_undistorted(workspace)
+        remove_model(workspace, found)
+        write_marker(workspace, self._marker)
+        remove_recorded(workspace)
+        remove_empty_folders(workspace.images_dir, workspace.masks_dir, workspace.stereo_dir, workspace.sparse_dir)

@@ -1,0 +1,137 @@
+"""Before anything else: every image is decoded once, and what is known of it is kept with a digest of its content.
+
+A file whose size, times and place on the disk are as they were is not read again; one that was copied is read for
+its digest, and decoded only if that is new.
+"""
+
+import json
+import logging
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_sph.errors import InputError
+from colmap_sph.pipeline.digests import file_digest
+from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
+from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.images import image_problem
+from colmap_sph.project.state.records import read_json
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+
+logger = logging.getLogger(__name__)
+
+Size = tuple[int, int]
+
+_MAX_BYTES = 1 << 30
+
+# Processor seconds per megapixel, and largest bytes in use per pixel, while an image is decoded.
+_SECONDS = 0.012
+_DECODE_BYTES = 12.0
+
+
+@dataclass(frozen=True)
+class ImageFile:
+    """An image and the size that it must have: (width, height) in pixels."""
+
+    path: Path
+    size: Size
+
+
+def check_image(task: ImageFile) -> Facts:
+    """Decode an image; `InputError` where it is missing, damaged or of another size."""
+    problem = image_problem(task.path, *task.size)
+    if problem is not None:
+        raise InputError(f"{task.path} {problem}")
+    return Facts()
+
+
+@dataclass(frozen=True)
+class Known:
+    """Of an image that was found good: its size, the digest of its content, and when that was read."""
+
+    size: Size
+    digest: str
+    stamp: tuple[int, ...]
+
+
+class CheckStage(Stage[str, ImageFile]):
+    """Checks images. Its results have the digests of their contents as keys.
+
+    Parameters
+    ----------
+    context : Context
+    sizes : mapping of str to (int, int)
+        Width and height of each image by its name.
+    path_of : callable
+        Name → file.
+    what : str
+        What they are called in messages and on disk: "originals" or "images".
+    where : str
+        The folder and the option to look at, for the message if none is good.
+    verify : bool
+        Whether what is known does not count.
+    """
+
+    make = staticmethod(check_image)
+
+    def __init__(
+        self,
+        context: "Context",
+        sizes: Mapping[str, Size],
+        path_of: Callable[[str], Path],
+        what: str,
+        where: str,
+        *,
+        verify: bool = False,
+    ) -> None:
+        super().__init__(context, sorted(sizes))
+        self.name = f"check {what}"  # type: ignore[misc]
+        self._sizes = sizes
+        self._path_of = path_of
+        self._where = where
+        self._file = context.workspace.state_dir / f"{what}.json"
+        known = (
+            None if context.keys.fresh or verify else read_json(self._file, dict[str, Known], max_bytes=_MAX_BYTES)
+        )
+        self._known = known or {}
+        self._seen: dict[str, Known] = {}
+
+    def job(self, item: str) -> Job[ImageFile]:
+        """See `Stage.job`."""
+        image = ImageFile(self._path_of(item), self._sizes[item])
+        if not image.path.is_file():
+            raise InputError(f"{image.path} is missing")
+        stamp = _stamp_of(image.path)
+        known = self._known.get(item)
+        is_read = known is not None and known.stamp == stamp
+        digest = known.digest if known is not None and is_read else file_digest(image.path)
+        self._seen[item] = Known(image.size, digest, stamp)
+        is_good = known is not None and (known.digest, known.size) == (digest, image.size)
+        pixels = image.size[0] * image.size[1]
+        cost = Cost(_SECONDS * pixels / 1e6, _DECODE_BYTES * pixels, 0.0)
+        return Job(digest, Facts() if is_good else None, cost, image)
+
+    def skip(self, item: str, reason: str) -> None:
+        """See `Stage.skip`."""
+        self.context.report.skipped_images[item] = reason
+        logger.warning("%s; left out", reason)
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """Keep what is known of the good images."""
+        if not results:
+            raise InputError(f"None of the {len(self.items)} images in {self._where}")
+        good = {name: self._seen[name] for name in results}
+        if good != self._known:
+            make_dir(self._file.parent)
+            with atomic_file(self._file) as file:
+                file.write(json.dumps({name: asdict(known) for name, known in good.items()}, indent=0).encode())
+
+
+def _stamp_of(path: Path) -> tuple[int, ...]:
+    """What changes whenever a file's content may have: also the time of the last change of its size or times."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_dev, status.st_ino

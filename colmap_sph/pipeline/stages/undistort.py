@@ -1,0 +1,193 @@
+"""With a sparse model: every original image → the undistorted one, with its mask."""
+
+import logging
+import shutil
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
+from colmap_sph.project.cameras import plain_camera, undistorted_camera
+from colmap_sph.project.files import make_dir, remove, scratch_folder, sync_file, sync_folder, whole_digest
+from colmap_sph.project.images import image_problem
+from colmap_sph.project.sparse_model import cameras_of_images
+from colmap_sph.project.state.ownership import undistorted_place
+from colmap_sph.project.state.records import altered_files, begin, read_record, vouch, vouched_facts
+from colmap_sph.project.undistortion.image import ImageToUndistort, undistort
+from colmap_sph.project.undistortion.originals import Originals
+from colmap_sph.project.undistortion.process import ChildProcess
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+
+logger = logging.getLogger(__name__)
+
+# Processor seconds and bytes on disk per pixel of the original image; largest bytes in use, and of a process.
+_SECONDS = 0.06e-6
+_FILE_BYTES = 1.0
+_BYTES = 14.0
+_PROCESS_BYTES = 120e6
+
+_thread = threading.local()
+_children: list[ChildProcess] = []
+
+
+@dataclass(frozen=True, eq=False)
+class UndistortTask:
+    """An image to undistort in a scratch folder, where it goes from there, and what vouches for it.
+
+    Attributes
+    ----------
+    image : ImageToUndistort
+    is_changed : bool
+        Whether the undistorted image will differ from the original one.
+    target, mask_target : Path
+        The undistorted image in the workspace, and its mask.
+    record : Path
+    key : str
+    """
+
+    image: ImageToUndistort
+    is_changed: bool
+    target: Path
+    mask_target: Path
+    record: Path
+    key: str
+
+
+def make_undistorted_image(task: UndistortTask) -> Facts:
+    """Undistort an image and its mask; writes both into the workspace."""
+    image = task.image
+    make_dir(image.mask_folder)
+    try:
+        if task.is_changed:
+            _child(image.folder.parent).call(undistort, image, str(task.target))
+        else:
+            undistort(image)
+        _publish(task)
+    except OSError as error:
+        raise OutputError(
+            f"{task.target} cannot be written ({reason_of(error)}); check space and permissions."
+        ) from error
+    finally:
+        shutil.rmtree(image.folder, ignore_errors=True)
+    return Facts()
+
+
+def _publish(task: UndistortTask) -> None:
+    """Move what was made into its place."""
+    moves = {task.target: task.image.image_path}
+    if task.image.mask is not None:
+        moves[task.mask_target] = task.image.mask_path
+    elif _is_mask_of_earlier_run(task):
+        remove(task.mask_target)
+    digests = {target: whole_digest(made) for target, made in moves.items()}
+    begin(task.record, list(moves))
+    for target, made in moves.items():
+        make_dir(target.parent)
+        sync_file(made)
+        made.replace(target)
+        sync_folder(target.parent)
+    vouch(task.record, task.key, digests)
+
+
+def _is_mask_of_earlier_run(task: UndistortTask) -> bool:
+    """Whether there is a mask that was made when the original image had one."""
+    return task.mask_target not in altered_files(read_record(task.record), [task.target, task.mask_target])
+
+
+def _child(folder: Path) -> ChildProcess:
+    """The process for COLMAP of the current thread, and of the run whose scratch folder this is."""
+    child: ChildProcess | None = getattr(_thread, "child", None)
+    if child is None or child.folder != folder:
+        child = ChildProcess(folder)
+        _thread.child = child
+        _children.append(child)
+    return child
+
+
+class UndistortStage(Stage[str, UndistortTask]):
+    """Undistorts images of a sparse model.
+
+    Parameters
+    ----------
+    context : Context
+    originals : Originals
+    digests : mapping of str to str
+        Digest of the content of each original image that is good.
+    """
+
+    name = "undistort"
+    make = staticmethod(make_undistorted_image)
+
+    def __init__(self, context: "Context", originals: Originals, digests: Mapping[str, str]) -> None:
+        super().__init__(context, sorted(digests))
+        self._originals = originals
+        self._digests = digests
+        self._cameras = cameras_of_images(originals.model)
+        self._numbers = {name: number for number, name in enumerate(self.items)}
+
+    def job(self, item: str) -> Job[UndistortTask]:
+        """See `Stage.job`."""
+        context = self.context
+        workspace = context.workspace
+        options = context.options.undistortion
+        camera = plain_camera(self._cameras[item])
+        mask = self._originals.mask_of(item)
+        # Of its own for each image, as its name may be another's without the folders.
+        scratch = workspace.undistortion_scratch_dir / str(self._numbers[item])
+        image = ImageToUndistort(
+            self._originals.image_path(item), mask, camera, options, scratch, scratch / "masks"
+        )
+        camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params))
+        key = context.keys.undistorted(self._digests[item], camera_parts, mask)
+        target = workspace.image_path(item)
+        record = undistorted_place(workspace, item).record
+        files = [target] if mask is None else [target, workspace.mask_path(item)]
+        task = UndistortTask(
+            image,
+            undistorted_camera(camera, options.for_colmap()) is not None,
+            target,
+            workspace.mask_path(item),
+            record,
+            key,
+        )
+        known = vouched_facts(record, key, files, Facts) is not None or self._is_changed_by_user(task, files)
+        pixels = camera.width * camera.height
+        cost = Cost(_SECONDS * pixels, _PROCESS_BYTES + _BYTES * pixels, _FILE_BYTES * pixels)
+        return Job(key, Facts() if known else None, cost, task)
+
+    def _is_changed_by_user(self, task: UndistortTask, files: list[Path]) -> bool:
+        """Whether an image was made and then exchanged for another good one, or its mask was: they are used."""
+        record = read_record(task.record)
+        is_made = record is not None and (record.key, record.state) == (task.key, "done")
+        if not is_made or not all(path.is_file() for path in files):
+            return False
+        camera = undistorted_camera(task.image.camera, task.image.options.for_colmap()) or task.image.camera
+        return image_problem(task.target, camera.width, camera.height) is None
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Undistort in a folder of its own, which is there until this ends."""
+        with scratch_folder(self.context.workspace.undistortion_scratch_dir):
+            yield
+
+    @contextmanager
+    def holding(self, kept: Kept) -> Iterator[None]:
+        """Keep the processes of COLMAP until the end."""
+        try:
+            yield
+        finally:
+            while _children:
+                _children.pop().close()
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """See `Stage.close`."""
+        if not results:
+            reason = next(iter(self.context.report.skipped_images.values()))
+            raise InputError(f"None of the images could be undistorted ({reason})")

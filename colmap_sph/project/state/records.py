@@ -1,0 +1,267 @@
+"""Records: which files in COLMAP's formats are ours, what they were made from, and whether they are whole.
+
+A record is a small JSON file. Whatever else is found in its place vouches for nothing.
+"""
+
+import hashlib
+import json
+import logging
+import os
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
+
+import msgspec
+import xxhash
+from msgspec import Meta
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.files import atomic_file, make_dir, open_regular, read_small, set_aside, whole_digest
+
+if TYPE_CHECKING:
+    from _typeshed import DataclassInstance
+
+logger = logging.getLogger(__name__)
+
+T = TypeVar("T")
+
+_STAMP_BLOCKS = 16
+_BLOCK_BYTES = 4096
+_MAX_BYTES = 1 << 20
+
+Word = Annotated[str, Meta(max_length=100)]
+
+
+class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a record says.
+
+    Attributes
+    ----------
+    key : str
+        Digest of what the files were made from.
+    stamps : tuple of str
+        Size, and digest of some blocks, of each file as it was when the record was written.
+    digests : tuple of str
+        Digest of every byte of each file; earlier versions had none.
+    facts : dict
+        What a later run wants to know of the files without reading them.
+    state : {"done", "void", "doubtful", "making"}
+        Whether the files are complete; to be made again; damaged somewhere, and to be made again; or just being
+        written, so that their content is unknown. In each of these states they are ours.
+    """
+
+    key: Word = ""
+    stamps: Annotated[tuple[Word, ...], Meta(max_length=10)] = ()
+    digests: Annotated[tuple[Word, ...], Meta(max_length=10)] = ()
+    facts: dict[str, Any] = {}
+    state: Literal["done", "void", "doubtful", "making"] = "done"
+
+
+_UNREADABLE = Record(state="void")
+
+
+def read_json(path: Path, kind: type[T], *, max_bytes: int = _MAX_BYTES) -> T | None:
+    """Read a JSON file of ours.
+
+    Parameters
+    ----------
+    path : Path
+    kind : type
+        What it must hold: a plain type, dataclass or `msgspec.Struct`, whose fields' types are checked.
+    max_bytes : int
+        A longer file is not ours.
+
+    Returns
+    -------
+    object or None
+        Of type `kind`. None where the file is missing, cannot be read, or holds anything else.
+    """
+    try:
+        return msgspec.json.decode(read_small(path, max_bytes, follow=False), type=kind)
+    except (OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return None
+
+
+def read_record(path: Path) -> Record | None:
+    """Read a record; None where there is none, and one that knows nothing of its files where it is damaged."""
+    if not os.path.lexists(path):
+        return None
+    content = read_json(path, dict[str, Any])
+    if content is None:
+        return _UNREADABLE
+    check = content.pop("check", None)
+    try:
+        # Those of earlier versions had other checks. They vouch for nothing any more, but say what is ours.
+        if "digests" in content and check != _check(content):
+            return _UNREADABLE
+        return msgspec.convert(content, Record)
+    except (msgspec.MsgspecError, RecursionError):
+        return _UNREADABLE
+
+
+def _check(content: Mapping[str, Any]) -> str:
+    return xxhash.xxh3_128_hexdigest(json.dumps(content, sort_keys=True).encode())
+
+
+def _write(path: Path, record: Record) -> None:
+    content = msgspec.to_builtins(record)
+    make_dir(path.parent)
+    with atomic_file(path) as file:
+        file.write(json.dumps(content | {"check": _check(content)}, indent=1).encode())
+
+
+def begin(record: Path, files: Sequence[Path]) -> None:
+    """Say that `files` are about to be written: from here on their content is unknown, but ours.
+
+    Nothing of others is lost: a file that is not as the record knows it, or of which no record knows, is set aside
+    under another name, with a warning.
+
+    Parameters
+    ----------
+    record : Path
+    files : sequence of Path
+        The same, in the same order, as for `vouch`.
+
+    Raises
+    ------
+    OutputError
+        The record cannot be written, or a file cannot be set aside.
+    """
+    known = read_record(record)
+    if known is not None and known.state == "making":
+        return
+    for path in altered_files(known, files):
+        backup = set_aside(path)
+        logger.warning("%s is not what this program wrote there; it is now %s", path, backup.name)
+    claim(record)
+
+
+def claim(record: Path) -> None:
+    """Take what is in a record's place for ours, whatever it is: it may be replaced."""
+    _write(record, Record(state="making"))
+
+
+def vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassInstance | None" = None) -> None:
+    """Write a record: `files` are complete, and were made under `key`.
+
+    Parameters
+    ----------
+    record : Path
+        JSON file to write; its folder is created.
+    key : str
+    files : mapping of Path to str
+        With the digest of every byte, see `files.whole_digest`.
+    facts : dataclass, optional
+        What a later run wants to know without reading the files.
+    """
+    stamps = []
+    for path in files:
+        try:
+            stamps.append(_stamp(path))
+        except OSError as error:
+            raise OutputError(f"{path} cannot be read back ({reason_of(error)}); run again.") from error
+    plain = {} if facts is None else asdict(facts)
+    _write(record, Record(key, tuple(stamps), tuple(files.values()), plain))
+
+
+def vouched_facts(record: Path, key: str, files: Sequence[Path], kind: type[T]) -> T | None:
+    """Return what `vouch` recorded, or None where the files must be made.
+
+    They must be made where the record is missing, damaged or of another key, and where a file is missing, cut
+    off or was written by another program. Every block of a small file is looked at, but only some of a large one.
+
+    Parameters
+    ----------
+    record, key, files
+        As for `vouch`.
+    kind : type
+        Dataclass of the facts.
+
+    Returns
+    -------
+    object of that type, or None
+    """
+    known = read_record(record)
+    if known is None or known.state != "done" or known.key != key or len(known.digests) != len(files):
+        return None
+    if altered_files(known, files) or not all(path.is_file() for path in files):
+        return None
+    try:
+        return msgspec.convert(known.facts, kind)
+    except (msgspec.MsgspecError, RecursionError):
+        return None
+
+
+def whole_digests(record: Path, number: int) -> tuple[str, ...] | None:
+    """Digests of every byte of the files of a record that vouches for so many.
+
+    Empty words, which no digest equals, where it vouches for nothing; None where there is no record.
+    """
+    known = read_record(record)
+    if known is None:
+        return None
+    if known.state != "done" or len(known.digests) != number:
+        return ("",) * number
+    return known.digests
+
+
+def invalidate(record: Path, state: Literal["void", "doubtful"] = "void") -> None:
+    """Make a record vouch no more: its files are to be made again, and are still ours.
+
+    Parameters
+    ----------
+    record : Path
+    state : {"void", "doubtful"}
+        "doubtful": one of the files is damaged in a place that a stamp need not show.
+    """
+    known = read_record(record)
+    if known is not None and known.state in ("done", "void"):
+        _write(record, msgspec.structs.replace(known, state=state))
+
+
+def altered_files(known: Record | None, files: Sequence[Path]) -> list[Path]:
+    """Those of `files` which are there, but not as a record of ours left them.
+
+    Parameters
+    ----------
+    known : Record or None
+        None: there is no record of them.
+    files : sequence of Path
+    """
+    there = [path for path in files if os.path.lexists(path)]
+    if known is None or not there:
+        return there
+    if known.state == "making":
+        return []
+    stamps = dict(zip(files, known.stamps, strict=False))
+    altered = [path for path in there if _stamp_if_readable(path) != stamps.get(path)]
+    if known.state == "doubtful":
+        digests = dict(zip(files, known.digests, strict=False))
+        altered += [path for path in there if path not in altered and _digest(path) != digests.get(path)]
+    return altered
+
+
+def _digest(path: Path) -> str | None:
+    with suppress(InputError):
+        return whole_digest(path)
+    return None
+
+
+def _stamp_if_readable(path: Path) -> str | None:
+    with suppress(OSError):
+        return _stamp(path)
+    return None
+
+
+def _stamp(path: Path) -> str:
+    """Size, and digest of evenly spread blocks: reading all of the maps again would take minutes."""
+    state = hashlib.blake2b(digest_size=16)
+    with open_regular(path) as file:
+        size = os.fstat(file.fileno()).st_size
+        last = max(0, size - _BLOCK_BYTES)
+        for index in range(_STAMP_BLOCKS):
+            file.seek(last * index // (_STAMP_BLOCKS - 1))
+            state.update(file.read(_BLOCK_BYTES))
+    return f"{size} {state.hexdigest()}"

@@ -1,0 +1,233 @@
+"""The marker of a workspace: what its images were undistorted from, and what its model was when it was written.
+
+It is there before the first undistorted image, and says that the workspace is finished when the model is in its
+place. A model file that is not as the marker says is the user's: it is neither removed nor replaced.
+"""
+
+import hashlib
+import json
+import logging
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.files import atomic_file, make_dir, remove, set_aside
+from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
+from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
+from colmap_sph.project.state.records import read_json
+from colmap_sph.project.workspace import Workspace
+
+logger = logging.getLogger(__name__)
+
+_VERSION = 2
+_MAX_BYTES = 256 << 20
+# What undistortion makes.
+_PARTS = ("images", "masks", "stereo", "sparse")
+# COLMAP's scripts, which would write over our maps. Earlier versions left them there.
+_SCRIPTS = ("run-colmap-photometric.sh", "run-colmap-geometric.sh")
+_SOURCES = 20
+
+
+@dataclass(frozen=True)
+class Marker:
+    """What is known of a workspace that this program made.
+
+    Attributes
+    ----------
+    model : str
+        Digest of the files of the original model.
+    options : dict
+        How its images were undistorted: plain values.
+    images : tuple of str
+        Sorted names of the images in the model of the workspace; empty until that is complete.
+    files : dict
+        Digest of each file of the workspace's model as it was written, by its name.
+    version : int
+        Of the program's marker: what version 1 lists is other things.
+    """
+
+    model: str
+    options: dict[str, Any]
+    images: tuple[str, ...] = ()
+    files: dict[str, str] = field(default_factory=dict)
+    version: int = _VERSION
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether model and lists are complete."""
+        return bool(self.images) or self.version == 1
+
+
+@dataclass(frozen=True)
+class _OldMarker:
+    """What is needed of a marker of version 1, whose `images` is a digest."""
+
+    version: Literal[1]
+    model: str
+    options: dict[str, Any]
+
+
+def read_marker(workspace: Workspace) -> Marker | None:
+    """Return the marker, or None where there is no readable one."""
+    # Earlier versions had it in the scratch folder until all was in its place.
+    for path in (workspace.marker_path, workspace.undistortion_scratch_dir / workspace.marker_path.name):
+        marker = read_json(path, Marker, max_bytes=_MAX_BYTES)
+        if marker is not None and marker.version == _VERSION:
+            return marker
+        old = read_json(path, _OldMarker, max_bytes=_MAX_BYTES)
+        if old is not None:
+            return Marker(old.model, old.options, version=1)
+    return None
+
+
+def write_marker(workspace: Workspace, marker: Marker) -> None:
+    """Write the marker; `OutputError` where that fails."""
+    make_dir(workspace.state_dir)
+    with atomic_file(workspace.marker_path) as file:
+        file.write(json.dumps(asdict(marker), indent=1).encode())
+
+
+def check_made_from(workspace: Workspace, marker: Marker) -> Marker | None:
+    """Return the marker of a workspace that was made, or begun, from these inputs; None where there is nothing.
+
+    Raises
+    ------
+    InputError
+        Something else made it, or it was made from other inputs.
+    """
+    found = check_ours(workspace)
+    if found is None or not found.is_finished:
+        return found
+    changed = [name for name in ("model", "options") if getattr(found, name) != getattr(marker, name)]
+    if changed:
+        raise InputError(
+            f"{workspace.root} was made with different {' and '.join(changed)}; "
+            "choose another --output, or start afresh with --overwrite."
+        )
+    return found
+
+
+def check_ours(workspace: Workspace) -> Marker | None:
+    """Return the marker; `InputError` where the folder has none and holds a workspace of something else."""
+    found = read_marker(workspace)
+    there = [part for part in _PARTS if (workspace.root / part).exists()]
+    if found is None and there:
+        raise InputError(
+            f"{workspace.root} already has {' and '.join(there)} which this program did not make; choose another "
+            "--output, or delete the folder first, or give it as --workspace if COLMAP undistorted it."
+        )
+    return found
+
+
+def refuse_unfinished(workspace: Workspace) -> None:
+    """Raise `InputError` for a workspace whose undistortion was begun, but is not complete."""
+    marker = read_marker(workspace)
+    if marker is not None and not marker.is_finished:
+        raise InputError(
+            f"The undistortion into {workspace.root} was not finished; run with --model, as it was begun."
+        )
+
+
+# ---- the workspace's model -----------------------------------------------------------------------------------
+
+
+def adopt(workspace: Workspace, marker: Marker) -> Marker:
+    """Make the marker of an earlier version one of this, which names the model's files; return it.
+
+    COLMAP's scripts are removed.
+    """
+    for name in _SCRIPTS:
+        remove(workspace.root / name)
+    names = tuple(names_in_model(workspace))
+    marker = replace(marker, images=names, files=_digests(workspace.sparse_dir), version=_VERSION)
+    write_marker(workspace, marker)
+    return marker
+
+
+def names_in_model(workspace: Workspace) -> list[str]:
+    """Names of the images in the workspace's model; none where it has no readable one."""
+    with suppress(InputError):
+        return image_names(load_model(workspace.sparse_dir))
+    return []
+
+
+def is_model_changed(workspace: Workspace, marker: Marker) -> bool:
+    """Whether the workspace has model files which are not as this program wrote them."""
+    return marker.is_finished and not _digests(workspace.sparse_dir).items() <= marker.files.items()
+
+
+def remove_model(workspace: Workspace, marker: Marker) -> None:
+    """Remove the model and the list of pairs, where they are as this program wrote them; give others other names.
+
+    A list of pairs that the user wrote stays, as it is obeyed.
+    """
+    for name, digest in _digests(workspace.sparse_dir).items():
+        path = workspace.sparse_dir / name
+        if not marker.is_finished or marker.files.get(name) == digest:
+            remove(path)
+        else:
+            logger.warning("%s is not what this program wrote there; it is now %s", path, set_aside(path).name)
+    if _is_default_pair_list(workspace.patch_match_cfg_path):
+        remove(workspace.patch_match_cfg_path)
+
+
+def publish_model(workspace: Workspace, marker: Marker, made: Path, names: Sequence[str]) -> None:
+    """Put a new model into its place, with COLMAP's lists of its images, and write the finished marker.
+
+    An interruption leaves an unfinished marker, and is made good by the next run.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    marker : Marker
+        Unfinished.
+    made : Path
+        Folder with the files of the model, on the same disk; they are moved.
+    names : sequence of str
+        Sorted names of its images.
+    """
+    write_marker(workspace, replace(marker, images=(), files={}))
+    files = _digests(made)
+    make_dir(workspace.sparse_dir)
+    make_dir(workspace.stereo_dir)
+    for path in _model_files(workspace.sparse_dir):
+        if path.name not in files:
+            remove(path)
+    try:
+        for name in sorted(files):
+            (made / name).replace(workspace.sparse_dir / name)
+    except OSError as error:
+        raise OutputError(
+            f"The model cannot be moved into {workspace.sparse_dir} ({reason_of(error)}); check permissions."
+        ) from error
+    if not workspace.patch_match_cfg_path.exists() or _is_default_pair_list(workspace.patch_match_cfg_path):
+        write_patch_match_cfg(workspace.patch_match_cfg_path, dict.fromkeys(names, _SOURCES))
+    if not workspace.fusion_cfg_path.exists():
+        write_fusion_cfg(workspace.fusion_cfg_path, names)
+    write_marker(workspace, replace(marker, images=tuple(names), files=files))
+
+
+def _is_default_pair_list(path: Path) -> bool:
+    """Whether a list of pairs leaves the choice to the program for every image, as it was written."""
+    try:
+        sources = read_patch_match_cfg(path)
+    except InputError:
+        return False
+    return all(source == _SOURCES for source in sources.values())
+
+
+def _model_files(folder: Path) -> list[Path]:
+    paths = (folder / f"{stem}{end}" for stem in (*MODEL_FILES, *RIG_FILES) for end in (".bin", ".txt"))
+    return [path for path in paths if path.is_file()]
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """Digests of the model's files in a folder, by name."""
+    digests = {}
+    for path in _model_files(folder):
+        with path.open("rb") as file:
+            digests[path.name] = hashlib.file_digest(file, "blake2b").hexdigest()[:32]
+    return digests

@@ -1,0 +1,152 @@
+"""The model of the undistorted images: what it will be, and as COLMAP writes it.
+
+COLMAP leaves images that were not undistorted, and cameras without distortion but of a distorted model, in the
+model it writes; that is mended here.
+"""
+
+import errno
+import os
+import tempfile
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.cameras import change_camera, make_pinhole, plain_camera, undistort_cameras
+from colmap_sph.project.colmap_library import quiet_colmap
+from colmap_sph.project.files import free_space, make_dir
+from colmap_sph.project.scene_reader import scene_of_model
+from colmap_sph.project.sparse_model import cameras_of_images, load_model, model_files, submodel
+from colmap_sph.project.undistortion.options import UndistortionOptions
+from colmap_sph.project.undistortion.originals import Originals
+from colmap_sph.scene import Scene
+
+_FULL_DISK_BYTES = 64 << 20
+# Space that undistortion is given, relative to the files it starts from; JPEGs come out up to 1.6 times larger.
+_SPACE_FACTOR = 2
+
+
+def foreseen_scene(originals: Originals, names: Collection[str], options: UndistortionOptions) -> Scene:
+    """Return the scene of the undistorted images `names`, before they are there."""
+    model = submodel(originals.model, set(names))
+    undistort_cameras(model, options.for_colmap())
+    return scene_of_model(model, originals.model_dir)
+
+
+@dataclass(frozen=True)
+class ModelToUndistort:
+    """A model to undistort.
+
+    Attributes
+    ----------
+    model_dir : Path
+        The original model, which is whole.
+    names : tuple of str
+        Its images that are undistorted.
+    options : UndistortionOptions
+    folder : Path
+        To work in; the model of the undistorted images is left in its folder ``final``.
+    """
+
+    model_dir: Path
+    names: tuple[str, ...]
+    options: UndistortionOptions
+    folder: Path
+
+    @property
+    def final_dir(self) -> Path:
+        """Where the new model goes."""
+        return self.folder / "final"
+
+
+def undistort_model(task: ModelToUndistort) -> None:
+    """Write the model of the undistorted images, with PINHOLE cameras; cameras and features are COLMAP's work.
+
+    Raises
+    ------
+    InputError, OutputError
+        COLMAP cannot do it, or nothing more can be written.
+    """
+    model = load_model(task.model_dir)
+    plain = task.folder / "plain"
+    _write_plain_model(model, plain)
+    # COLMAP undistorts the images that it is told of, or all: it gets one, and does not find it.
+    nowhere = task.folder / "no images"
+    make_dir(nowhere)
+    try:
+        with quiet_colmap(int(pycolmap.logging.FATAL)):
+            pycolmap.undistort_images(
+                task.folder,
+                plain,
+                nowhere,
+                image_names=[task.names[0]],
+                undistort_options=task.options.for_colmap(),
+                num_threads=1,
+            )
+    except (RuntimeError, ValueError, OSError) as error:
+        raise_if_disk_is_full(task.folder)
+        raise InputError(f"COLMAP cannot undistort {task.model_dir}: {reason_of(error)}") from error
+    _write_final_model(task.folder / "sparse", task.final_dir, task.names)
+
+
+def _write_plain_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model with cameras that COLMAP undistorts rightly, see `plain_camera`."""
+    for camera in model.cameras.values():
+        change_camera(camera, plain_camera(camera))
+    make_dir(folder)
+    model.write_binary(folder)
+    _load_written_model(folder)
+
+
+def _write_final_model(source: Path, target: Path, names: Collection[str]) -> None:
+    """Write the model that COLMAP left in `source` with images `names` alone, and PINHOLE cameras."""
+    model = _load_written_model(source)
+    if len(names) < model.num_reg_images():
+        model = submodel(model, set(names))
+    for camera in model.cameras.values():
+        make_pinhole(camera)
+    make_dir(target)
+    model.write_binary(target)
+    _load_written_model(target)
+
+
+def check_space(originals: Originals, names: Iterable[str], output: Path, options: UndistortionOptions) -> None:
+    """Raise `OutputError` unless the undistorted images `names` will fit: COLMAP may not notice a full disk."""
+    needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
+    cameras = cameras_of_images(originals.model)
+    limit = options.max_image_size
+    for name in names:
+        longest = max(cameras[name].width, cameras[name].height)
+        scale = min(1.0, limit / longest) if limit > 0 else 1.0
+        needed += int(scale**2 * (originals.image_dir / name).stat().st_size)
+    needed *= _SPACE_FACTOR
+    free = free_space(output)
+    if free < needed:
+        raise OutputError(
+            f"The undistorted images need about {needed / 1e6:.0f} MB, but on the disk of {output} only "
+            f"{free / 1e6:.0f} MB are free; free some space or choose another --output."
+        )
+
+
+def _load_written_model(folder: Path) -> pycolmap.Reconstruction:
+    """Read a model that COLMAP has just written, without noticing whether the disk took it."""
+    try:
+        return load_model(folder)
+    except InputError:
+        raise_if_disk_is_full(folder)
+        raise
+
+
+def raise_if_disk_is_full(folder: Path) -> None:
+    """Raise `OutputError` where there is no room: the disk is full, or a quota or a limit on files is reached."""
+    with tempfile.TemporaryFile(dir=folder) as file:
+        try:
+            os.posix_fallocate(file.fileno(), 0, _FULL_DISK_BYTES)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+                raise OutputError(
+                    f"Nothing more can be written to {folder} ({reason_of(error)}); free some space or choose "
+                    "another --output."
+                ) from error

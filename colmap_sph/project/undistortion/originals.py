@@ -1,0 +1,113 @@
+"""What is to be undistorted: a sparse model, its images and their masks, found."""
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pycolmap
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.cameras import refuse_panoramas
+from colmap_sph.project.project import Project
+from colmap_sph.project.sparse_model import image_names, load_model, model_files
+from colmap_sph.project.workspace import Workspace, checked_name, mask_path
+
+
+@dataclass(frozen=True, eq=False)
+class Originals:
+    """A sparse model, its images, and their masks.
+
+    Attributes
+    ----------
+    model_dir, image_dir : Path
+    mask_dir : Path or None
+        None: without masks.
+    model : pycolmap.Reconstruction
+        What is in `model_dir`.
+    """
+
+    model_dir: Path
+    image_dir: Path
+    mask_dir: Path | None
+    model: pycolmap.Reconstruction
+
+    def model_digest(self) -> str:
+        """Digest of the content of the model's files."""
+        digest = hashlib.sha256()
+        for path in model_files(self.model_dir):
+            with path.open("rb") as file:
+                digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
+        return digest.hexdigest()
+
+    def image_path(self, name: str) -> Path:
+        """Original image `name`; need not exist."""
+        return self.image_dir / checked_name(name)
+
+    def mask_of(self, name: str) -> Path | None:
+        """Mask of original image `name`, if there is one."""
+        path = None if self.mask_dir is None else mask_path(self.mask_dir, name)
+        return path if path is not None and path.is_file() else None
+
+    def check_outside(self, workspace: Workspace) -> None:
+        """Raise `InputError` where the model, the images or the masks lie where a workspace is to be written."""
+        root = workspace.root.resolve()
+        for option, place in (("model", self.model_dir), ("images", self.image_dir), ("masks", self.mask_dir)):
+            if place is not None and place.resolve().is_relative_to(root):
+                raise InputError(
+                    f"--{option} {place} lies inside the workspace {workspace.root} that is to be written; choose "
+                    "another --output."
+                )
+
+
+def read_originals(project: Project) -> Originals:
+    """Read a project's sparse model; where its images are is found out, if not given.
+
+    Parameters
+    ----------
+    project : Project
+        With a model.
+
+    Returns
+    -------
+    Originals
+
+    Raises
+    ------
+    InputError
+        No readable model, a camera without pinhole equivalent, or no images.
+    """
+    assert project.model is not None
+    model = load_model(project.model)
+    refuse_panoramas(model)
+    images = project.images
+    if images is None:
+        images = find_images(project.model, image_names(model))
+    elif not images.is_dir():
+        is_file = images.is_file()
+        raise InputError(
+            f"The image folder {images} {'is a file' if is_file else 'does not exist'}; check --images."
+        )
+    return Originals(project.model, images, project.masks, model)
+
+
+def find_images(model_dir: Path, names: Sequence[str]) -> Path:
+    """Find the image folder of a model by COLMAP's usual layouts.
+
+    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
+    folder that holds most of the model's images is taken, the first among equals.
+
+    Raises
+    ------
+    InputError
+        None of the folders holds any image of the model; the message lists them.
+    """
+    # Of a link to a model both where it is and where it leads to.
+    places = (Path.cwd() / model_dir, model_dir.resolve())
+    parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
+    folders = list(dict.fromkeys(parent / "images" for parent in parents))
+    found = [sum((folder / name).is_file() for name in names) for folder in folders]
+    if max(found) == 0:
+        tried = ", ".join(str(folder) for folder in folders)
+        raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
+    return folders[found.index(max(found))]
