@@ -267,12 +267,20 @@ def finished_files(workspace: Path) -> dict[Path, int]:
     """Time stamps of the results that are complete: of maps and cloud those which a record vouches for."""
     state = workspace / "colmap_sph"
     files = [path for part in ("pairs", "photometric") for path in (state / part).rglob("[!.]*") if path.is_file()]
-    for record in state.glob("state/**/[!.]*.json"):
-        name = record.relative_to(state / "state").with_suffix(".bin")
-        files += [workspace / "stereo" / folder / name for folder in ("depth_maps", "normal_maps")]
-    if (state / "cloud.json").exists():
+    for record in filter(_vouches, state.glob("state/**/[!.]*.json")):
+        name = record.relative_to(state / "state").with_suffix("")
+        if name.suffix == ".undistorted":
+            files.append(workspace / "images" / name.with_suffix(""))
+        else:
+            files += [workspace / "stereo" / folder / f"{name}.bin" for folder in ("depth_maps", "normal_maps")]
+    if _vouches(state / "cloud.json"):
         files += [workspace / "fused.ply", workspace / "fused.ply.vis"]
     return {path: path.stat().st_mtime_ns for path in files}
+
+
+def _vouches(record: Path) -> bool:
+    """Whether a record is there and says that its files are complete."""
+    return record.exists() and b'"state": "done"' in record.read_bytes()
 
 
 def files_made_again(finished: dict[Path, int]) -> int:

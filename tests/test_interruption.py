@@ -99,7 +99,8 @@ def test_the_check_of_interruptions_finds_faults(tmp_path: Path) -> None:
     disturbed, whole = tmp_path / "disturbed", tmp_path / "whole"
     for name in ("pairs/1-2", "photometric/cam/a.jpg", "state/cam/a.jpg.geometric.json", "cloud.json"):
         (disturbed / "colmap_sph" / name).parent.mkdir(parents=True, exist_ok=True)
-        (disturbed / "colmap_sph" / name).write_bytes(b"1")
+        (disturbed / "colmap_sph" / name).write_bytes(b'{"state": "done"}')
+    (disturbed / "colmap_sph/state/b.jpg.geometric.json").write_bytes(b'{"state": "making"}')
     finished = script.finished_files(disturbed)
     assert len(finished) == 6
     assert script.files_made_again(finished) == 0

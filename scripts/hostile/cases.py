@@ -46,6 +46,8 @@ class Case:
         Of the model, relative to the project's.
     same_as : Path or None
         Workspace whose maps and cloud must come out to the bit, wherever the exit code is 0.
+    same_at_once : bool
+        So it must be after the first run; else it may be only after those that follow.
     again : tuple of str
         Arguments of a run without fault afterwards, which must end with 0 and such maps; empty: none.
     attempts : int
@@ -70,6 +72,7 @@ class Case:
     codes: frozenset[int] = CODES
     scale: float = 1.0
     same_as: Path | None = None
+    same_at_once: bool = True
     again: tuple[str, ...] = ()
     attempts: int = 1
     fault: Fault | None = None

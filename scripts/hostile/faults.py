@@ -64,9 +64,11 @@ def set_up(stage: Stage, name: str) -> Scenario:
     root = stage.copy_project(project, finished=not name.startswith("new"))
     dense = root / "dense"
     if name == "resumed":
-        shutil.rmtree(dense / "colmap_sph" / "state")
-        (dense / "colmap_sph" / "cloud.json").unlink()
+        shutil.rmtree(dense / "colmap_sph" / "photometric")
         min((dense / "colmap_sph" / "pairs").iterdir()).unlink()
+        (dense / "fused.ply").unlink()
+        for path in dense.glob("stereo/depth_maps/*.bin"):
+            path.unlink()
     again = model_run(root)
     more = ("--overwrite",) if name == "overwritten" else ()
     return Scenario(root, (*again, *more), again, dense, grounds.project(project) / "dense")

@@ -37,7 +37,12 @@ _PLACES = (
         "run-colmap-photometric.sh",
     ),
     *("stereo/depth_maps/N_0_1.png.geometric.bin", "stereo/normal_maps/cam", "colmap_sph/state/cam"),
-    *("stereo/normal_maps/N_0_0.png.photometric.bin", "colmap_sph/photometric/cam", "colmap_sph/lock"),
+    *(
+        "stereo/normal_maps/N_0_0.png.photometric.bin",
+        "colmap_sph/photometric/cam",
+        "colmap_sph/images.json",
+        "colmap_sph/originals.json",
+    ),
 )
 _PROJECT_PLACES = (
     *("images", "images/N_0_0.png", "images/cam", "images/cam/x.png", "sparse", "sparse/0", "sparse/0/images.bin"),

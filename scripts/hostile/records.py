@@ -5,10 +5,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xxhash
+from numpy.typing import NDArray
 
-from colmap_sph.pipeline.digests import digest
+from colmap_sph.project.state.array_file import Head, read_arrays, read_head, write_arrays
 from hostile.cases import Case, Stage, all_names, files_below, model_run, workspace_run
-from hostile.damage import damage_text, damage_value
+from hostile.damage import NUMBERS, damage_text, damage_value
 
 
 def make(stage: Stage) -> Case:
@@ -22,21 +24,21 @@ def make(stage: Stage) -> Case:
         dense = stage.copy_workspace(stage.grounds.adopted)
         arguments = workspace_run(dense)
         clean = stage.grounds.adopted
-    files = files_below(dense / "colmap_sph", "*.json", "*.npz")
+    files = files_below(dense / "colmap_sph", "*.json", "*.sph")
     chosen = stage.rng.choice(len(files), int(stage.rng.integers(1, 4)), replace=False)
     changed = [files[int(number)] for number in chosen]
     for path in changed:
-        (_change_container if path.suffix == ".npz" else _change_record)(stage, path)
-    # A record of the undistortion that says something else is of another project, for all that can be known.
-    is_marker = any(path.name == "undistortion.json" for path in changed)
-    more = ("--overwrite",) if is_marker else ()
+        (_change_container if path.suffix == ".sph" else _change_record)(stage, path)
+    # A record of the undistortion that says something else is of another project, for all that can be known; and a
+    # content that is a possible one, under its right checksum, is what was found.
+    is_believed = any(path.name == "undistortion.json" or path.suffix == ".sph" for path in changed)
     return Case(
         "record " + ", ".join(str(path.relative_to(dense)) for path in changed),
         arguments,
         dense,
         names=all_names(),
-        same_as=clean,
-        again=(*arguments, *more),
+        same_as=None if is_believed else clean,
+        again=() if is_believed else arguments,
         attempts=2,
     )
 
@@ -62,31 +64,49 @@ def _damaged(stage: Stage, value: Any) -> Any:
     if not isinstance(changed, dict):
         return changed
     try:
-        return changed | {"check": digest(changed)}
+        return changed | {"check": xxhash.xxh3_128_hexdigest(json.dumps(changed, sort_keys=True).encode())}
     except (TypeError, RecursionError):
         return changed | {"check": value["check"]}
 
 
 def _change_container(stage: Stage, path: Path) -> None:
-    with np.load(path) as arrays:
-        content = {name: arrays[name] for name in arrays.files}
-    name = str(stage.pick(*content))
-    array = content[name]
-    if name == "metadata":
-        try:
-            array = np.array(json.dumps(damage_value(json.loads(str(array)), stage.rng)))
-        except RecursionError:
-            array = np.array("[" * 100_000)
-    elif name != "key":
-        odd: tuple[Any, ...] = (
-            array[..., :-1],
-            array[None],
-            array.astype(np.float64),
-            array.astype(str),
-            np.zeros((0, 0), array.dtype),
-            np.full_like(array, np.iinfo(array.dtype).max if array.dtype.kind in "iu" else np.nan),
-            array.ravel(),
-            np.zeros(1 << 20, bool),
+    """Write a file of arrays with another text, number or array, and right checksums."""
+    head, arrays = _read_container(path)
+    texts = list(head.texts)
+    numbers = list(head.numbers)
+    what = str(stage.pick("text", "number", "array", "array", "arrays", "kind"))
+    kind = head.kind
+    if what == "text" and texts:
+        texts[int(stage.rng.integers(len(texts)))] = str(
+            stage.pick("", "x", "../x", "N_0_0.png", "\x1b[31m\n", "x" * 9999)
         )
-        array = odd[int(stage.rng.integers(len(odd)))]
-    np.savez(path, **(content | {name: array}))
+    elif what == "number" and numbers:
+        numbers[int(stage.rng.integers(len(numbers)))] = float(stage.pick(*NUMBERS))
+    elif what == "array":
+        place = int(stage.rng.integers(len(arrays)))
+        arrays[place] = stage.pick(*_odd_arrays(arrays[place]))
+    elif what == "arrays":
+        arrays = [*arrays, arrays[0]] if stage.chance(0.5) else arrays[1:]
+    else:
+        kind = str(stage.pick("pair", "estimate", "", "other"))
+    write_arrays(path, kind, head.key, arrays, texts=texts, numbers=numbers)
+
+
+def _read_container(path: Path) -> tuple[Head, list[NDArray[Any]]]:
+    head = read_head(path)
+    assert head is not None
+    return read_arrays(path, head.kind, lambda head: head.arrays)
+
+
+def _odd_arrays(array: NDArray[Any]) -> tuple[NDArray[Any], ...]:
+    most = np.iinfo(array.dtype).max if array.dtype.kind == "u" else np.nan
+    return (
+        array[..., :-1],
+        array[None],
+        array.ravel(),
+        array.astype("<f4"),
+        array.astype("<u1"),
+        np.zeros((1, 1), array.dtype),
+        np.full_like(array, most),
+        np.zeros(1 << 20, "<u1"),
+    )

@@ -40,7 +40,7 @@ def judge(case: Case, outcome: Outcome, grounds: Grounds, before: Snapshot, afte
         found += _of_log(case.workspace)
         if outcome.code in (0, 5):
             found += _of_results(case, outcome, grounds)
-    if outcome.code == 0 and case.same_as is not None and case.workspace is not None:
+    if outcome.code == 0 and case.same_at_once and case.same_as is not None and case.workspace is not None:
         word = "incomplete, yet code 0" if _has_warned(outcome) else "quietly wrong"
         found += [Finding(word, facts) for facts in differences(case.workspace, case.same_as)]
     for check in case.checks:

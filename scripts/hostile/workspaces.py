@@ -47,11 +47,17 @@ def make_damaged(stage: Stage) -> Case:
     arguments = model_run(dense.parent) if by_model else workspace_run(dense)
     ours = [path for part in _OURS for path in files_below(dense / part)]
     ours += files_below(dense, "fused*", "cloud.json", "report.json")
-    theirs = files_below(dense / "images") + files_below(dense / "sparse") + files_below(dense / "stereo", "*.cfg")
+    # What COLMAP has undistorted for this program is as much its own.
+    images = files_below(dense / "images")
+    ours += images if by_model else []
+    theirs = files_below(dense / "sparse") + files_below(dense / "stereo", "*.cfg") + ([] if by_model else images)
     is_ours = stage.chance(0.8)
     files = ours if is_ours else theirs
     path = files[int(stage.rng.integers(len(files)))]
     word = _damage(stage, path, files)
+    # Maps of which no record tells might be another program's.
+    is_lost = (word.endswith("removed") and "colmap_sph/state" in str(path)) or path.name == "cloud.json"
+    more = ("--overwrite",) if is_lost else ("--verify",)
     # What the user has done to the rights of files, or put in their place, is for him to undo.
     is_his = word in ("forbidden", "in a read-only folder", "a folder")
     return Case(
@@ -60,8 +66,10 @@ def make_damaged(stage: Stage) -> Case:
         dense,
         names=all_names(),
         # What is not ours is an input: it may be refused, or be another one.
+        # Of what is up to date no byte is read, unless that is asked for.
         same_as=clean if is_ours and not is_his else None,
-        again=arguments if is_ours and not is_his else (),
+        same_at_once=not word.startswith("flipped"),
+        again=(*arguments, *more) if is_ours and not is_his else (),
         attempts=2,
         as_user=word in ("forbidden", "in a read-only folder"),
     )
