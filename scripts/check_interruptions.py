@@ -89,19 +89,15 @@ class Disturbance:
         The first operation that was disturbed; None: the run had ended before.
     first, second : Outcome
         Of the run, and of the one that followed.
-    remade : int
-        Files of finished work that the second run wrote again; after an error, which may have been one of looking
-        at them, none are counted.
-    different : str
-        What is not as in a run left alone.
+    wrong : str
+        What is then not as in a run left alone; and after a signal, what was finished and has been made again.
     """
 
     words: str
     hit: Operation | None
     first: Outcome
     second: Outcome
-    remade: int
-    different: str
+    wrong: str
 
     @property
     def is_right(self) -> bool:
@@ -109,7 +105,7 @@ class Disturbance:
         quiet = "Traceback" not in self.first.stderr + self.second.stderr
         honest = self.first.code in (0, 2, 3, 4, PARTIAL_EXIT_CODE, 6, 143, None) and not self.first.timed_out
         died = self.first.signal in (0, signal.SIGKILL, signal.SIGTERM)
-        finished = self.second.code in (0, PARTIAL_EXIT_CODE) and not self.remade and not self.different
+        finished = self.second.code in (0, PARTIAL_EXIT_CODE) and not self.wrong
         return quiet and honest and died and finished
 
 
@@ -125,7 +121,7 @@ def main(check: Check) -> int:
             f"{number:4d}  {disturbance.words}: {hit}; {_end(disturbance.first)}, then {_end(disturbance.second)}"
         )
         if not disturbance.is_right:
-            print(f"      WRONG: {disturbance.remade} files made again. {disturbance.different}")
+            print(f"      WRONG: {disturbance.wrong}")
             print(f"      {disturbance.first}\n      {disturbance.second}", flush=True)
         sys.stdout.flush()
         done.append(disturbance)
@@ -257,10 +253,11 @@ def _disturb_one(way: Way, stage: str, fault: Fault, output: Path, *, only_main:
     finished = finished_files(workspace)
     second = run(["run", *way.again, str(workspace)], Surroundings(_surroundings(output / "second"), seconds=3600))
     end_group(around)
-    remade = files_made_again(finished) if fault.stop else 0
+    remade = files_made_again(finished) if fault.stop else []
     wrong = [*differences(workspace, way.whole), *leftovers(workspace)]
     hit = next(iter(control.operations), None)
-    return Disturbance(f"{way.name}, {stage}, {fault}", hit, first, second, remade, "; ".join(wrong))
+    wrong += [f"{len(remade)} files made again, such as {remade[0].relative_to(workspace)}"] if remade else []
+    return Disturbance(f"{way.name}, {stage}, {fault}", hit, first, second, "; ".join(wrong))
 
 
 def finished_files(workspace: Path) -> dict[Path, int]:
@@ -275,7 +272,8 @@ def finished_files(workspace: Path) -> dict[Path, int]:
             files += [workspace / "stereo" / folder / f"{name}.bin" for folder in ("depth_maps", "normal_maps")]
     if _vouches(state / "cloud.json"):
         files += [workspace / "fused.ply", workspace / "fused.ply.vis"]
-    return {path: path.stat().st_mtime_ns for path in files}
+    # What a record tells of may have been removed after it.
+    return {path: path.stat().st_mtime_ns for path in files if path.exists()}
 
 
 def _vouches(record: Path) -> bool:
@@ -283,9 +281,9 @@ def _vouches(record: Path) -> bool:
     return record.exists() and b'"state": "done"' in record.read_bytes()
 
 
-def files_made_again(finished: dict[Path, int]) -> int:
-    """Number of files that are not there any more, or were written since their time stamps were taken."""
-    return sum(not path.exists() or path.stat().st_mtime_ns != stamp for path, stamp in finished.items())
+def files_made_again(finished: dict[Path, int]) -> list[Path]:
+    """The files that are not there any more, or were written since their time stamps were taken."""
+    return [path for path, stamp in finished.items() if not path.exists() or path.stat().st_mtime_ns != stamp]
 
 
 def leftovers(workspace: Path) -> list[str]:

@@ -103,11 +103,11 @@ def test_the_check_of_interruptions_finds_faults(tmp_path: Path) -> None:
     (disturbed / "colmap_sph/state/b.jpg.geometric.json").write_bytes(b'{"state": "making"}')
     finished = script.finished_files(disturbed)
     assert len(finished) == 6
-    assert script.files_made_again(finished) == 0
+    assert script.files_made_again(finished) == []
     assert script.differences(disturbed, whole) == script.leftovers(disturbed) == []
     os.utime(disturbed / "colmap_sph/pairs/1-2", ns=(5, 5))
     (disturbed / "stereo/depth_maps/cam/a.jpg.geometric.bin").unlink()
-    assert script.files_made_again(finished) == 2
+    assert len(script.files_made_again(finished)) == 2
     (disturbed / "stereo/normal_maps/cam/a.jpg.geometric.bin").write_bytes(b"2")
     (disturbed / "fused.ply.vis").write_bytes(b"2")
     assert script.differences(disturbed, whole)[0].startswith("3 results differ")

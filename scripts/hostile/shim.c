@@ -31,7 +31,7 @@ struct control {
     uint32_t action; /* what is done to the operations from `first` to `last` */
     uint64_t first, last;
     int32_t value;   /* errno, or a signal's number */
-    int32_t process; /* that gets the signal; 0: all of the group that the operation's process is in */
+    int32_t process; /* that gets the signal; negative: its group, and that of the operation's process */
     _Atomic uint64_t counted, hit;
     char prefix[ROOM], log[ROOM];
 };
@@ -108,6 +108,7 @@ static int is_spoiled(enum kind kind, const char *path) {
     atomic_fetch_add(&control->hit, 1);
     if (control->action == STOP) {
         syscall(SYS_kill, control->process, control->value);
+        if (control->process < 0) syscall(SYS_kill, 0, control->value);
         return 0;
     }
     errno = control->value;

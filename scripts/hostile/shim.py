@@ -87,7 +87,7 @@ class Control:
     fault : Fault, optional
         None: all operations are counted and noted, none is spoilt.
     only_main : bool
-        A signal goes to the run's first process alone, not to those that it has started.
+        A signal goes to the run's first process alone, not to those that it has started, too.
     """
 
     def __init__(self, path: Path, watched: Path, fault: Fault | None, *, only_main: bool = False) -> None:
@@ -110,10 +110,11 @@ class Control:
 
     def aim_at(self, process: int) -> None:
         """Name the run's first process, which leads its group."""
-        if not self._only_main:
-            return  # the shim sends a signal to its own group
+        target = process if self._only_main else -process
         with self.path.open("r+b") as file, mmap.mmap(file.fileno(), 0) as memory:
-            memory[_Block.process.offset : _Block.process.offset + 4] = process.to_bytes(4, sys.byteorder)
+            memory[_Block.process.offset : _Block.process.offset + 4] = target.to_bytes(
+                4, sys.byteorder, signed=True
+            )
 
     @property
     def operations(self) -> list[Operation]:
@@ -148,4 +149,6 @@ def _start_again(folder: Path, library: Path) -> NoReturn:
     source = Path(__file__).with_suffix(".c")
     command = ["cc", "-shared", "-fPIC", "-O1", "-U_FORTIFY_SOURCE", "-o", str(library), str(source), "-ldl"]
     subprocess.run(command, check=True)
-    os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | {"LD_PRELOAD": str(library)})
+    # Without threads of linear algebra, as a process with threads cannot be forked.
+    variables = os.environ | {"LD_PRELOAD": str(library), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    os.execve(sys.executable, [sys.executable, *sys.argv], variables)
