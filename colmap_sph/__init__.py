@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.reconstruct import run_project as run_project
     from colmap_sph.pipeline.report import Progress as Progress
     from colmap_sph.pipeline.report import RunReport as RunReport
-    from colmap_sph.project.images import read_grey as read_grey
+    from colmap_sph.project.images.reading import read_grey as read_grey
     from colmap_sph.project.map_files import read_depth_map as read_depth_map
     from colmap_sph.project.map_files import read_normal_map as read_normal_map
     from colmap_sph.project.map_files import write_depth_map as write_depth_map
@@ -79,7 +79,7 @@ _MODULE_OF = {
     "fit_normals": "stereo.normals",
     "match_pair": "stereo.matching",
     "read_depth_map": "project.map_files",
-    "read_grey": "project.images",
+    "read_grey": "project.images.reading",
     "read_normal_map": "project.map_files",
     "read_scene": "project.scene_reader",
     "reconstruct": "pipeline.reconstruct",

@@ -1,21 +1,85 @@
 """The program's entry: the command line, once it is loaded, which takes a second or so."""
 
-import os
 import sys
+from types import TracebackType
+
+from colmap_sph.app.standard_streams import prepare_process, silence
+from colmap_sph.errors import OutOfMemoryError, OutputError, printable, reason_of
+
+# What loaders and libraries say where the system refuses memory, threads or open files.
+_REFUSALS = (
+    "allocate memory",
+    "out of memory",
+    "map segment",
+    "start new thread",
+    "too many open files",
+    "temporarily unavailable",
+)
 
 
 def main() -> int:
     """Run the command line; an interruption while it loads ends without a traceback, too."""
+    problem = prepare_process()
+    if problem is not None:
+        print(f"error: {problem}", file=sys.stderr)
+        return OutOfMemoryError.exit_code
+    sys.excepthook = _print_traceback
     try:
-        from colmap_sph.app import cli
-
-        return cli.main()
+        return _command()
     except BrokenPipeError:  # whoever reads the output has closed it, as `| head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        silence(1)
         return 141
     except KeyboardInterrupt:
+        if sys.stderr.isatty():  # which shows ^C
+            print(file=sys.stderr)
         print("interrupted", file=sys.stderr)
         return 130
+    except Exception as error:
+        reason = _refusal(error)
+        if reason is None:
+            raise
+        print(
+            f"error: The system refuses what the program needs to load ({reason}); end other programs, or allow "
+            "more (ulimit -a).",
+            file=sys.stderr,
+        )
+        return OutOfMemoryError.exit_code
+
+
+def _command() -> int:
+    from colmap_sph.app import cli
+
+    try:
+        code = cli.main()
+    except SystemExit as stop:  # the parser, after help or a mistake
+        code = stop.code if isinstance(stop.code, int) else 2
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        silence(1)
+        print(f"error: The standard output cannot be written ({reason_of(error)}).", file=sys.stderr)
+        return OutputError.exit_code
+    return code
+
+
+def _refusal(error: BaseException) -> str | None:
+    """Say how the system has refused memory, threads or open files while libraries were loaded, if it has."""
+    cause = error.__cause__ or error.__context__
+    deeper = None if cause is None else _refusal(cause)
+    reason = printable(reason_of(error))
+    is_one = isinstance(error, (ImportError, OSError, RuntimeError)) and any(
+        each in reason.lower() for each in _REFUSALS
+    )
+    return deeper or (reason if is_one or isinstance(error, MemoryError) else None)
+
+
+def _print_traceback(kind: type[BaseException], error: BaseException, trace: TracebackType | None) -> None:
+    import traceback
+
+    for line in "".join(traceback.format_exception(kind, error, trace)).splitlines():
+        print(printable(line), file=sys.stderr)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,15 @@ for these. A message names the file or option and says what to do.
 """
 
 import re
+import unicodedata
 from collections.abc import Callable
+
+# Categories of characters that move the cursor, reorder or hide text, or are no characters at all.
+_UNPRINTABLE = frozenset({"Cc", "Cf", "Cn", "Co", "Cs", "Zl", "Zp"})
+# Of other categories, but without width or ink: two names that differ in them look alike.
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+)
 
 
 class ColmapSphError(Exception):
@@ -85,3 +93,24 @@ def reason_of(error: BaseException | None) -> str:
     """
     words = getattr(error, "strerror", None) or " ".join(str(error).split())
     return words or type(error).__name__
+
+
+def printable(text: object) -> str:
+    r"""Text for a terminal or a log: one line, without characters that steer a terminal or cannot be seen.
+
+    Names of files come from strangers. A line break in them would forge a line of the log, an escape sequence
+    retitle or rewrite the terminal. Such characters are written as in Python's strings; letters of all languages
+    stay.
+
+    Examples
+    --------
+    >>> print(printable("Köln 東京\x1b]0;title\x07\u202egpj.exe"))
+    Köln 東京\x1b]0;title\x07\u202egpj.exe
+    """
+    return "".join(_visible(character) for character in str(text))
+
+
+def _visible(character: str) -> str:
+    if unicodedata.category(character) in _UNPRINTABLE or _INVISIBLE.match(character):
+        return character.encode("unicode_escape").decode("ascii")
+    return character

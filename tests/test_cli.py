@@ -177,7 +177,7 @@ def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # The closing summary.
     words = " ".join(output.split())
     for name in IMAGES:
-        assert f"{name} │ {report['coverage'][name]:.1%}" in words
+        assert f"{name} {report['coverage'][name]:.1%}" in words
     assert "images 3 with depth maps, mean coverage" in words
     assert "pairs 3 matched (tracks)" in words
     assert f"{report['points']:,} points in" in words
@@ -309,7 +309,25 @@ def test_names_that_look_like_markup(small: Path, capsys: pytest.CaptureFixture[
     code, output = command(capsys, "run", "--model", "sparse/0", *FAST)
     assert code == 5
     assert f"image skipped: [red]{IMAGES[1]}: " in output
-    assert f"│ [red]{IMAGES[0]} │" in output
+    assert f"\n[red]{IMAGES[0]} " in output
+
+
+def test_names_that_would_steer_the_terminal(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One is there, one is missing; neither reaches terminal or log as it is."""
+    names = ["\\[/]\x1b]0;title\x07\u202ea.jpg", "[/]\x1b[2Jb.jpg"]
+    model = pycolmap.Reconstruction(small / "sparse/0")
+    for image in model.images.values():
+        if image.name in IMAGES[:2]:
+            name = names[IMAGES.index(image.name)]
+            (small / "images" / image.name).rename(small / "images" / name.replace("/", "_"))
+            image.name = name.replace("/", "_") if name == names[0] else name
+    model.write(small / "sparse/0")
+    code, output = command(capsys, "run", "--model", "sparse/0", *FAST)
+    assert code == 5
+    assert "\n\\[_]\\x1b]0;title\\x07\\u202ea.jpg " in output
+    assert "image skipped: [/]\\x1b[2Jb.jpg: " in output
+    log = (small / "dense/colmap_sph/log.txt").read_text(encoding="utf-8")
+    assert (output + log).replace("\n", "").isprintable()
 
 
 # ---- bad input ---------------------------------------------------------------------------------------------

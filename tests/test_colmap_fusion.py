@@ -87,6 +87,12 @@ def test_options_reach_colmap(workspace, tmp_path):
         cv2.imwrite(str(masks / f"{name}.png.png"), mask)
     masked = fuse_by_colmap(workspace, replace(OURS, mask_path=masks).for_colmap(), threads=1)
     assert 0.3 * every < masked < 0.7 * every
+    for name in "abcdef":
+        (masks / f"{name}.png.png").rename(masks / f"{name}.png")
+    assert fuse_by_colmap(workspace, replace(OURS, mask_path=masks).for_colmap(), threads=1) == masked
+    (masks / "c.png").write_bytes((masks / "c.png").read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"c\.png is damaged"):
+        fuse_by_colmap(workspace, replace(OURS, mask_path=masks).for_colmap(), threads=1)
 
 
 def test_photometric_maps(workspace):

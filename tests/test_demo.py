@@ -57,7 +57,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
         for word in ("N_0_0.jpg", "coverage", "<= 1 GSD", "fused.ply", "acc 1 GSD", "comp 1 GSD"):
             assert word in output
     log = (tmp_path / "demo/dense/colmap_sph/log.txt").read_text()
-    assert log.count("DemoCommand(") == 1
+    assert log.count("DemoCommand(") == 2
     assert "Match pairs" in log
 
 
@@ -71,8 +71,57 @@ def test_the_result_can_be_repeated(tmp_path: Path) -> None:
 
 
 def test_other_files_are_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "dense").mkdir()
-    (tmp_path / "dense" / "fused.ply").write_text("mine")
+    """A folder called `truth`, which demos make, too, is none of their records."""
+    for name in ("dense/fused.ply", "truth/mine.txt"):
+        (tmp_path / name).parent.mkdir()
+        (tmp_path / name).write_text("mine")
     with pytest.raises(OutputError, match="already holds other files"):
         run_demo(tmp_path, block=TINY)
-    assert (tmp_path / "dense" / "fused.ply").read_text() == "mine"
+    assert (tmp_path / "dense/fused.ply").read_text() == "mine"
+    assert (tmp_path / "truth/mine.txt").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["dense", "truth"]
+
+
+def test_files_beside_a_demo_stay(tmp_path: Path) -> None:
+    run_demo(tmp_path, options=TWO_PAIRS, block=TINY)
+    cloud = (tmp_path / "dense/fused.ply").read_bytes()
+    mine = [
+        tmp_path / name for name in ("mine", "images/mine.jpg", "truth/mine.npz", "dense/mine", "sparse/1/mine")
+    ]
+    for path in mine:
+        path.parent.mkdir(exist_ok=True)
+        path.write_text("mine")
+    (tmp_path / "dense/fused.ply").write_bytes(b"")
+    run_demo(tmp_path, options=TWO_PAIRS, block=TINY)
+    assert (tmp_path / "dense/fused.ply").read_bytes() == cloud
+    assert [path.read_text() for path in mine] == ["mine"] * 5
+
+
+def test_a_file_that_no_record_of_a_demo_names_is_not_replaced(tmp_path: Path) -> None:
+    (tmp_path / "colmap_sph_demo.json").write_text('{"files": ["images/N_0_0.jpg"]}')
+    (tmp_path / "images").mkdir()
+    for name in ("N_0_0.jpg", "N_0_1.jpg"):
+        (tmp_path / "images" / name).write_text("mine")
+    with pytest.raises(OutputError, match=r"N_0_1\.jpg was not made by an earlier demo"):
+        run_demo(tmp_path, block=TINY)
+    assert (tmp_path / "images/N_0_0.jpg").read_text() == "mine"
+
+
+@pytest.mark.parametrize("record", [b"", b"{}", b'{"files": 3}', b"[]", b"\xff", b"[" * 100_000])
+def test_a_damaged_record_of_a_demo_allows_nothing(record: bytes, tmp_path: Path) -> None:
+    (tmp_path / "colmap_sph_demo.json").write_bytes(record)
+    with pytest.raises(OutputError, match="already holds other files"):
+        run_demo(tmp_path, block=TINY)
+
+
+@pytest.mark.parametrize("place", ["images", "sparse", "truth", "truth/sub", "dense/stereo"])
+def test_a_demo_follows_no_link_out_of_its_folder(place: str, tmp_path: Path) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    link = tmp_path / "demo" / place
+    link.parent.mkdir(parents=True)
+    (tmp_path / "demo/colmap_sph_demo.json").write_text('{"files": []}')
+    link.symlink_to(elsewhere)
+    with pytest.raises(OutputError, match=f"{place} is a link to {elsewhere}"):
+        run_demo(tmp_path / "demo", block=TINY)
+    assert not list(elsewhere.iterdir())

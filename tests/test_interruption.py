@@ -332,3 +332,19 @@ def test_files_that_may_not_grow(uninterrupted: Path, tmp_path: Path) -> None:
     assert not list(dense.glob("stereo/normal_maps/*.bin"))
     complete("--model", model, "--output", dense)
     assert results(dense) == results(uninterrupted)
+
+
+def test_a_model_that_may_not_grow(tmp_path: Path) -> None:
+    """COLMAP does not notice that the system cuts off its model: no fault of the one that it was made from."""
+    render_four_images(tmp_path)
+    dense = tmp_path / "dense"
+    command = [sys.executable, "-P", "-m", "colmap_sph", "run", "--model", str(tmp_path / "sparse/0")]
+
+    def limit() -> None:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_480, 20_480))
+
+    done = subprocess.run(command, capture_output=True, text=True, preexec_fn=limit)
+    assert done.returncode == 3, done.stderr
+    assert "Traceback" not in done.stderr
+    assert "ulimit -f" in done.stderr.splitlines()[-1]
+    assert not (dense / "sparse").exists()

@@ -16,12 +16,13 @@ from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 import colmap_sph
 from colmap_sph.app import cli
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE
+from colmap_sph.errors import InputError
 from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.masks import read_mask, undistort_mask
 from colmap_sph.project.undistortion import UndistortionOptions
-from colmap_sph.project.workspace import Workspace
+from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.partners.pairs import PairOptions
 from colmap_sph.synthetic import Camera, DemoBlock
 
@@ -148,6 +149,69 @@ def test_any_png_is_a_mask(tmp_path: Path, kind: str) -> None:
     assert read_mask(tmp_path / "none.png", 6, 4) is None
 
 
+@pytest.mark.parametrize("image", ["a/b.jpg", "a/b.png", "a/b", "a.c/b"])
+def test_a_mask_is_found_where_colmap_finds_it(tmp_path: Path, image: str) -> None:
+    """``b.jpg.png`` comes before ``b.png``."""
+    usual = tmp_path / f"{image}.png"
+    usual.parent.mkdir(parents=True)
+    other = usual.parent / "b.png"
+    assert mask_path(tmp_path, image) == usual
+    other.touch()
+    has_ending = "." in Path(image).name
+    assert mask_path(tmp_path, image) == (other if has_ending else usual)
+    usual.touch()
+    assert mask_path(tmp_path, image) == usual
+
+
+def test_masks_of_either_name(tmp_path: Path) -> None:
+    """And in the workspace they have the name that all of COLMAP's programs know."""
+    sparse = make_project(tmp_path)
+    write_masks(tmp_path / "masks", NAMES)
+    usual = prepare(sparse, tmp_path / "usual", masks=tmp_path / "masks")
+    for name in NAMES:
+        (tmp_path / "masks" / f"{name}.png").rename(tmp_path / "masks" / name)
+    other = prepare(sparse, tmp_path / "other", masks=tmp_path / "masks")
+    for name in NAMES:
+        path = other.masks_dir / f"{name}.png"
+        np.testing.assert_array_equal(read_picture(path), read_picture(usual.masks_dir / f"{name}.png"))
+
+
+def test_masks_that_are_not_used_are_named(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    sparse = make_project(tmp_path)
+    write_masks(tmp_path / "masks", NAMES)
+    prepare(sparse, tmp_path / "one", masks=tmp_path / "masks")
+    assert not caplog.records
+    (tmp_path / "masks" / f"{NAMES[0]}.png").rename(tmp_path / "masks" / "a_mask.png")
+    (tmp_path / "masks" / f"{NAMES[2]}.png").rename(tmp_path / "masks" / Path(NAMES[2]).name)
+    (tmp_path / "masks" / ".DS_Store").touch()
+    prepare(sparse, tmp_path / "two", masks=tmp_path / "masks")
+    unused, bare = (record.getMessage() for record in caplog.records)
+    assert unused.startswith(f"2 files in {tmp_path / 'masks'} (a_mask.png, c.png) belong to no image")
+    assert bare == f"No mask in {tmp_path / 'masks'} for 2 images (a.png, cam/c.png): they are used whole"
+
+
+def test_masks_beside_their_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """The images are no masks of other images."""
+    sparse = make_project(tmp_path)
+    write_masks(tmp_path / "images", NAMES)
+    prepare(sparse, tmp_path / "dense", masks=tmp_path / "images")
+    assert not caplog.records
+
+
+def test_a_damaged_mask_is_named(tmp_path: Path) -> None:
+    """Half of one would ignore the other half."""
+    path = tmp_path / "mask.png"
+    cv2.imwrite(str(path), blobs(0))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(InputError, match=r"mask\.png is damaged .*; mend or remove it"):
+        read_mask(path, WIDTH, HEIGHT)
+    path.write_bytes(cv2.imencode(".png", np.zeros((5000, 6000), np.uint8))[1].tobytes())
+    with pytest.raises(InputError, match=f"6000 x 5000 pixels, but its image {WIDTH} x {HEIGHT}"):
+        read_mask(path, WIDTH, HEIGHT)
+
+
 # ---- a run -------------------------------------------------------------------------------------------------
 
 
@@ -230,7 +294,7 @@ def spoil_nothing(folder: Path) -> None:
 
 def spoil_names(folder: Path) -> None:
     for path in folder.iterdir():
-        path.rename(path.with_name(path.name.replace(".jpg.png", ".png")))
+        path.rename(path.with_name(path.name.replace(".jpg.png", "_mask.png")))
 
 
 def spoil_size(folder: Path) -> None:
@@ -253,8 +317,8 @@ def spoil_kind(folder: Path) -> None:
         (spoil_nothing, "does not exist; check --masks"),
         (spoil_names, f"that of {NADIR[0]} must be "),
         (spoil_size, "has 240 x 320 pixels, but its image 320 x 240"),
-        (spoil_content, f"{NADIR[1]}.png cannot be read as an image"),
-        (spoil_kind, f"{NADIR[1]}.png cannot be read as an image"),
+        (spoil_content, f"{NADIR[1]}.png is damaged or no image"),
+        (spoil_kind, f"{NADIR[1]}.png is not a regular file"),
     ],
 )
 def test_masks_that_cannot_be_used(

@@ -1,17 +1,29 @@
 """Disparity maps on disk: what is read is what was written, and damage is said in one sentence."""
 
-import json
+import os
 import re
+import tracemalloc
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from colmap_sph.errors import InputError, OutputError
-from colmap_sph.pipeline.stages.pair_files import read_pair, write_pair
+from colmap_sph.errors import DamageError, InputError, OutputError
+from colmap_sph.pipeline.stages.pair_files import (
+    is_estimate_there,
+    is_pair_there,
+    read_estimate,
+    read_pair,
+    write_estimate,
+    write_pair,
+)
+from colmap_sph.project.state import array_file
+from colmap_sph.project.state.array_file import Head, read_head, write_arrays
+from colmap_sph.scene import View
+from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
 
 HEIGHT, WIDTH = 6, 9
@@ -60,8 +72,8 @@ def random_disparity(low: float, high: float) -> np.ndarray:
 )
 def test_round_trip(tmp_path: Path, low: float, high: float, step: float) -> None:
     written = make_pair(random_disparity(low, high))
-    write_pair(tmp_path / "pair.npz", written)
-    read = read_pair(tmp_path / "pair.npz")
+    write_pair(tmp_path / "pair.sph", written)
+    read = read_pair(tmp_path / "pair.sph")
     assert read.disparity.dtype == np.float32
     np.testing.assert_array_equal(np.isnan(read.disparity), np.isnan(written.disparity))
     # Half a step, and the rounding of float32 at such numbers.
@@ -72,82 +84,194 @@ def test_round_trip(tmp_path: Path, low: float, high: float, step: float) -> Non
         kept, original = getattr(read.geometry, field.name), getattr(written.geometry, field.name)
         assert np.array_equal(kept, original), field.name
         assert type(kept) is type(original), field.name
-    assert [path.name for path in tmp_path.iterdir()] == ["pair.npz"]
+    assert [path.name for path in tmp_path.iterdir()] == ["pair.sph"]
 
 
 def test_pair_without_any_disparity(tmp_path: Path) -> None:
     empty = np.full((HEIGHT, WIDTH), np.nan)
     empty[2, 3] = np.inf
-    write_pair(tmp_path / "pair.npz", make_pair(empty))
-    assert np.isnan(read_pair(tmp_path / "pair.npz").disparity).all()
+    write_pair(tmp_path / "pair.sph", make_pair(empty))
+    assert np.isnan(read_pair(tmp_path / "pair.sph").disparity).all()
 
 
-@pytest.mark.parametrize("damage", ["missing", "empty", "cut off", "garbage", "flipped bits", "other content"])
+@pytest.mark.parametrize("damage", ["missing", "empty", "cut off", "longer", "garbage", "flipped bits", "archive"])
 def test_damaged_file(tmp_path: Path, damage: str) -> None:
-    path = tmp_path / "pair.npz"
-    write_pair(path, make_pair(random_disparity(0, 50)))
+    path = tmp_path / "pair.sph"
+    write_pair(path, make_pair(random_disparity(0, 50)), "key")
     data = path.read_bytes()
     if damage == "missing":
         path.unlink()
-    elif damage == "other content":
-        np.savez(path, depth=np.zeros(3))
+    elif damage == "archive":
+        with path.open("wb") as file:
+            np.savez(file, depth=np.zeros(3))
     else:
         middle = bytes(byte ^ 0x5A for byte in data[len(data) // 3 : 2 * len(data) // 3])
         path.write_bytes(
             {
                 "empty": b"",
-                "cut off": data[: len(data) // 2],
-                "garbage": b"not a zip archive",
+                "cut off": data[:-1],
+                "longer": data + b"1",
+                "garbage": b"not of this program",
                 "flipped bits": data[: len(data) // 3] + middle + data[2 * len(data) // 3 :],
             }[damage]
         )
+    assert not is_there(path)
     with pytest.raises(InputError, match=re.escape(str(path))):
-        read_pair(path)
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda metadata: "nonsense",
-        lambda metadata: "[]",
-        lambda metadata: "{}",
-        lambda metadata: "[" * 100_000,
-        lambda metadata: json.dumps(metadata | {"scale": [1.0]}),
-        lambda metadata: json.dumps(metadata | {"scale": [None, 1.0]}),
-        lambda metadata: json.dumps(metadata | {"geometry": []}),
-        lambda metadata: json.dumps(metadata | {"geometry": metadata["geometry"] | {"more": 1}}),
-        lambda metadata: json.dumps(metadata | {"geometry": metadata["geometry"] | {"rectified_from_world": "x"}}),
-    ],
-)
-def test_metadata_of_no_pair_is_refused_and_removed(tmp_path: Path, change: Callable[[Any], str]) -> None:
-    path = tmp_path / "pair.npz"
-    write_pair(path, make_pair(random_disparity(0, 50)))
-    with np.load(path) as data:
-        content = dict(data)
-    np.savez(path, **(content | {"metadata": change(json.loads(str(content["metadata"])))}))
-    with pytest.raises(InputError, match="does not describe a pair"):
         read_pair(path)
     assert not path.exists()
 
 
+def is_there(path: Path) -> bool:
+    pair = make_pair(np.zeros((HEIGHT, WIDTH)))
+    return is_pair_there(path, "key", pair.left, pair.right, pair.geometry)
+
+
+def test_a_pair_is_there_under_its_key_with_its_geometry(tmp_path: Path) -> None:
+    path = tmp_path / "pair.sph"
+    pair = make_pair(random_disparity(0, 50))
+    write_pair(path, pair, "key")
+    names = (pair.left, pair.right)
+    assert is_pair_there(path, "key", *names, pair.geometry)
+    assert not is_pair_there(path, "other", *names, pair.geometry)
+    assert not is_pair_there(path, "key", *names[::-1], pair.geometry)
+    for field in fields(RectifiedPair):
+        value = getattr(pair.geometry, field.name)
+        other: dict[str, Any] = {field.name: "frame" if field.name == "surface" else value + 1}
+        assert not is_pair_there(path, "key", *names, replace(pair.geometry, **other)), field.name
+
+
+@pytest.mark.parametrize("what", ["pipe", "device", "link", "folder"])
+def test_only_regular_files_are_read(tmp_path: Path, what: str) -> None:
+    """A pipe would hang, a device never end; a link may lead anywhere."""
+    path = tmp_path / "pair.sph"
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    else:
+        write_pair(tmp_path / "elsewhere", make_pair(random_disparity(0, 50)), "key")
+        path.symlink_to("/dev/zero" if what == "device" else tmp_path / "elsewhere")
+    assert not is_there(path)
+    with pytest.raises(InputError, match=re.escape(str(path))):
+        read_pair(path)
+
+
+def peak_of(work: Callable[[], object]) -> int:
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def refuse(path: Path) -> None:
+    assert not is_there(path)
+    with pytest.raises(DamageError, match="was removed, run again"):
+        read_pair(path)
+    assert not path.exists()
+
+
+def test_every_byte_of_the_head_is_checked_before_anything_is_allocated(tmp_path: Path) -> None:
+    path = tmp_path / "pair.sph"
+    write_pair(path, make_pair(random_disparity(0, 50)), "key")
+    data = path.read_bytes()
+    head = len(data) - 2 * HEIGHT * WIDTH
+    assert head < 500
+    for place in range(head):
+        for bits in (0x01, 0x80, 0xFF):
+            path.write_bytes(data[:place] + bytes([data[place] ^ bits]) + data[place + 1 :])
+            assert peak_of(lambda: refuse(path)) < 200_000, place
+
+
+def numbers_with(changes: dict[int, float]) -> list[float]:
+    """Scale, rotation and the other numbers of the geometry, some of them changed."""
+    geometry = vars(make_pair(np.zeros((HEIGHT, WIDTH))).geometry)
+    others = [value for value in geometry.values() if isinstance(value, (int, float))]
+    numbers = [0.0, 1 / 64, *geometry["rectified_from_world"].ravel(), *map(float, others)]
+    for place, value in changes.items():
+        numbers[place] = value
+    return numbers
+
+
+def written(path: Path, *, kind: str = "pair", codes: np.ndarray | None = None, **changes: Any) -> None:
+    """Write a file with checksums that hold, whatever it says."""
+    pair = make_pair(np.zeros((HEIGHT, WIDTH)))
+    texts = [pair.left, pair.right, pair.geometry.surface]
+    content: dict[str, Any] = {"texts": texts, "numbers": numbers_with({})}
+    codes = np.zeros((HEIGHT, WIDTH), np.uint16) if codes is None else codes
+    write_arrays(path, kind, "key", [codes], **(content | changes))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"kind": "estimate"},
+        {"kind": ""},
+        {"texts": []},
+        {"texts": ["a", "b", "cylinder"]},
+        {"texts": ["a", "b", "frame", "c"]},
+        {"numbers": []},
+        {"numbers": numbers_with({0: np.nan})},
+        {"numbers": numbers_with({1: 0.0})},
+        {"numbers": numbers_with({1: -1.0})},
+        {"numbers": numbers_with({11: np.inf})},
+        {"numbers": numbers_with({17: HEIGHT + 1.0})},
+        {"numbers": numbers_with({18: 1e300})},
+        {"numbers": numbers_with({18: -WIDTH})},
+        {"codes": np.zeros((HEIGHT, WIDTH), np.float32)},
+        {"codes": np.zeros((WIDTH, HEIGHT), np.uint16)},
+        {"codes": np.zeros((HEIGHT, WIDTH, 2), np.uint16)},
+        {"codes": np.zeros((0, WIDTH), np.uint16)},
+    ],
+)
+def test_content_of_no_pair_is_refused(tmp_path: Path, content: dict[str, Any]) -> None:
+    """Checksums hold, as in a file that someone made to do harm."""
+    path = tmp_path / "pair.sph"
+    written(path)
+    assert np.isnan(read_pair(path).disparity).all()
+    written(path, **content)
+    refuse(path)
+
+
+def test_arrays_of_another_size_are_not_allocated(tmp_path: Path) -> None:
+    """A file of 4 GB, all holes, whose head is right."""
+    path = tmp_path / "estimate.sph"
+    view = View(1, "a.jpg", 9, 6, np.eye(3), np.eye(3), np.zeros(3), np.zeros(0, np.int64))
+    zeros = np.zeros((6, 9), np.float32)
+    estimate = DepthEstimate(zeros, zeros, zeros.astype(np.uint8))
+    write_estimate(path, estimate, "key")
+    assert is_estimate_there(path, "key", view)
+    assert not is_estimate_there(path, "other", view)
+    assert read_estimate(path, view).support.shape == (6, 9)
+    with path.open("r+b") as file:
+        bomb = [(np.dtype(kind), (20000, 20000)) for kind in ("<f4", "<f4", "<u1")]
+        head = Head("estimate", "key", (), (), tuple(bomb), bytes(16))
+        size = file.write(array_file._packed(head))
+        file.truncate(size + 9 * 20000**2)
+    assert read_head(path) is not None
+    assert not is_estimate_there(path, "key", view)
+
+    def read() -> None:
+        with pytest.raises(DamageError, match="of the size expected"):
+            read_estimate(path, view)
+
+    assert peak_of(read) < 200_000
+
+
 def test_any_single_damaged_byte_is_harmless(tmp_path: Path) -> None:
-    """A flipped byte anywhere either leaves the content as it was or raises an `InputError`."""
-    path = tmp_path / "pair.npz"
+    """A flipped byte anywhere raises an `InputError`."""
+    path = tmp_path / "pair.sph"
     write_pair(path, make_pair(random_disparity(0, 50)))
     data = path.read_bytes()
-    before = read_pair(path)
-    for place in range(0, len(data), 7):
+    for place in range(len(data)):
         path.write_bytes(data[:place] + bytes([data[place] ^ 0xFF]) + data[place + 1 :])
-        try:
-            after = read_pair(path)
-        except InputError:
-            continue
-        np.testing.assert_array_equal(after.disparity, before.disparity)
-        assert after.geometry.baseline == before.geometry.baseline
+        with pytest.raises(DamageError):
+            read_pair(path)
 
 
 def test_unwritable_file(tmp_path: Path) -> None:
-    (tmp_path / "pair.npz").mkdir()
+    (tmp_path / "pair.sph").mkdir()
     with pytest.raises(OutputError, match="pair"):
-        write_pair(tmp_path / "pair.npz", make_pair(random_disparity(0, 50)))
-    assert [path.name for path in tmp_path.iterdir()] == ["pair.npz"]
+        write_pair(tmp_path / "pair.sph", make_pair(random_disparity(0, 50)))
+    assert [path.name for path in tmp_path.iterdir()] == ["pair.sph"]

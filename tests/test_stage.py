@@ -20,6 +20,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.reconstruct import with_good_images
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
@@ -51,7 +52,7 @@ def context_of(project: Path, dense: Path) -> Context:
     """A run whose workspace is prepared."""
     workspace = prepare(project / "sparse/0", dense)
     scene = anchored(read_scene(workspace.sparse_dir))
-    return Context(workspace, scene, OPTIONS, Keys(workspace, OPTIONS))
+    return with_good_images(Context(workspace, scene, OPTIONS, Keys(workspace, OPTIONS)), execute)
 
 
 def made(dense: Path) -> dict[str, bytes]:

@@ -23,8 +23,8 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
-from colmap_sph.pipeline.reconstruct import check_workspace_images
-from colmap_sph.project.images import image_problem, read_grey
+from colmap_sph.pipeline.reconstruct import with_good_images
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
@@ -458,7 +458,7 @@ def test_workspace_of_colmap_is_opened(tmp_path: Path, caplog: pytest.LogCapture
     scene = read_scene(workspace.sparse_dir)  # an OPENCV camera without distortion
     workspace.image_path("a.png").unlink()
     context = Context(workspace, scene, RunOptions(), Keys(workspace, RunOptions()))
-    assert sorted(check_workspace_images(context, execute)) == NAMES[1:]
+    assert [view.name for view in with_good_images(context, execute).scene.views] == NAMES[1:]
     assert "a.png is missing" in caplog.text
 
 
@@ -473,53 +473,3 @@ def test_what_is_no_workspace_is_told(tmp_path: Path) -> None:
     (tmp_path / "sparse").mkdir()
     with pytest.raises(InputError, match="No COLMAP model"):
         open_workspace(Project(workspace=tmp_path))
-
-
-@pytest.mark.parametrize("extension", ["jpg", "png", "tif", "bmp"])
-def test_image_check_by_format(tmp_path: Path, extension: str) -> None:
-    path = tmp_path / f"image.{extension}"
-    pixels = np.random.default_rng(0).integers(0, 255, (40, 50, 3), dtype=np.uint8)
-    cv2.imwrite(str(path), pixels)
-    assert image_problem(path, 50, 40) is None
-    assert image_problem(path, 40, 50) == "has 50 x 40 pixels, but its camera 40 x 50"
-    data = path.read_bytes()
-    for length in (1, 3, 12, len(data) // 2, len(data) - 20):
-        path.write_bytes(data[:length])
-        assert image_problem(path, 50, 40) == "is damaged or cut off"
-
-
-def test_grey_values_of_lossless_files_keep_their_fractions(tmp_path: Path) -> None:
-    blue, green, red = colours = np.random.default_rng(0).integers(0, 256, (3, 300, 50), dtype=np.uint8)
-    for extension in ("png", "tif"):
-        path = tmp_path / f"image.{extension}"
-        cv2.imwrite(str(path), np.moveaxis(colours, 0, -1))
-        # The luma of ITU-R BT.601.
-        np.testing.assert_allclose(read_grey(path), 0.299 * red + 0.587 * green + 0.114 * blue, atol=1e-3)
-    path.unlink()
-    with pytest.raises(InputError, match=r"image\.tif cannot be read"):
-        read_grey(path)
-
-
-def test_grey_values_of_jpeg_files_are_those_stored(tmp_path: Path) -> None:
-    """A grey file comes back as it was written: whole numbers, up to JPEG's own loss."""
-    path = tmp_path / "image.JPG"
-    row, column = np.indices((40, 50))
-    grey = (row + 2 * column).astype(np.uint8)
-    cv2.imwrite(str(path), grey, [cv2.IMWRITE_JPEG_QUALITY, 100])
-    read = read_grey(path)
-    assert read.dtype == np.uint8
-    np.testing.assert_allclose(read.astype(int), grey, atol=1)
-
-
-def test_image_check_with_preview_and_trailer(tmp_path: Path) -> None:
-    encode = {"image": (40, 50), "preview": (8, 10)}
-    files = {
-        name: bytes(cv2.imencode(".jpg", np.full((*size, 3), 90, np.uint8))[1]) for name, size in encode.items()
-    }
-    app1 = b"\xff\xe1" + (len(files["preview"]) + 2).to_bytes(2, "big") + files["preview"]
-    with_preview = files["image"][:2] + app1 + files["image"][2:]
-    path = tmp_path / "image.jpg"
-    path.write_bytes(with_preview + bytes(1000))
-    assert image_problem(path, 50, 40) is None
-    path.write_bytes(with_preview[:-20])
-    assert image_problem(path, 50, 40) == "is damaged or cut off"

@@ -6,9 +6,9 @@
 #
 # models.txt names one sparse model per line; the results go to dense/ beside each sparse/. `sacct -j JOB` tells
 # which tasks failed or ran out of time; submit those again with --array=3,7, and they go on where they stopped. A
-# project that finished without some of its images counts as done, with a warning in the task's log. A task uses the
-# cores that it is given below; give `--memory` where it may use less than its node has free. `colmap_sph` must be on
-# the PATH: submit with its environment active.
+# project that finished without some of its images counts as done, with a warning in the task's log. A task keeps to
+# the cores and the memory that it is given below. `colmap_sph` must be on the PATH: submit with its environment
+# active.
 #SBATCH --job-name=colmap_sph
 #SBATCH --nodes=1
 #SBATCH --ntasks=1

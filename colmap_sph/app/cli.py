@@ -8,17 +8,17 @@ from pathlib import Path
 
 import cv2
 import tyro
-from rich.console import Console
 
 import colmap_sph
 from colmap_sph.app.demo import run_demo
-from colmap_sph.app.display import Display, console_logging, escaped
+from colmap_sph.app.display import Display
 from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, in_full
-from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError, reason_of
+from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
+from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError, reason_of
 from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.workers import is_memory_error
@@ -42,85 +42,102 @@ Command = RunCommand | DemoCommand | EvaluateCommand
 
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the `colmap_sph` command; returns the exit code."""
-    console = Console(stderr=True)
+    terminal = Terminal()
     arguments = sys.argv[1:] if arguments is None else arguments
+    # OpenCV and its readers print names of files as they are; what is wrong with a file, our own messages say.
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    with warnings_shown(terminal):
+        try:
+            return _answer(arguments, terminal)
+        except ColmapSphError as error:
+            return _print_error(error, terminal)
+        except (MemoryError, cv2.error, RuntimeError) as error:
+            if not is_memory_error(error):
+                raise
+            return _print_error(OutOfMemoryError(), terminal)
+        except OSError as error:
+            if error.errno is None or isinstance(error, BrokenPipeError):
+                raise
+            what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
+            return _print_error(
+                OutputError(f"{what} ({reason_of(error)}); check space and permissions."), terminal
+            )
+
+
+def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
     if arguments and arguments[0] in ("--version", "-V"):
-        print(f"colmap_sph {colmap_sph.__version__}")
+        print_result(f"colmap_sph {colmap_sph.__version__}")
         return 0
     asks_for_all = not {"--help-all", "--help_all"}.isdisjoint(arguments)
     if arguments[:1] == ["run"] and (asks_for_all or not {"-h", "--help"}.isdisjoint(arguments)):
-        print(help_text(everything=asks_for_all), flush=True)
+        print_result(help_text(everything=asks_for_all))
         return 0
     command = _parsed(arguments)
 
     def last_words(_: Interrupted) -> None:
         logger.info("Interrupted")
-        console.show_cursor()
-        _print_interrupted(command, console)
+        _print_interrupted(command, terminal)
 
-    with console_logging(console):
-        try:
-            with stop_on_signals(last_words):
-                return _do(command, console)
-        except Interrupted as stop:
-            _print_interrupted(command, console)
-            return stop.exit_code
-        except ColmapSphError as error:
-            return _print_error(error, console)
-        except (MemoryError, cv2.error) as error:
-            if not is_memory_error(error):
-                raise
-            return _print_error(OutOfMemoryError(), console)
-        except OSError as error:
-            if error.errno is None or isinstance(error, BrokenPipeError):
-                raise
-            what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
-            return _print_error(OutputError(f"{what} ({reason_of(error)}); check space and permissions."), console)
+    try:
+        with stop_on_signals(last_words):
+            return _do(command, terminal)
+    except Interrupted as stop:
+        _print_interrupted(command, terminal)
+        return stop.exit_code
 
 
 def _parsed(arguments: Sequence[str]) -> Command:
     if arguments[:1] == ["run"]:
         arguments = ["run", *in_full(arguments[1:])]
-    command: Command = tyro.extras.subcommand_cli_from_dict(
-        # `run` alone has flags without a value, among its own options.
-        {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
-        prog="colmap_sph",
-        description="Dense reconstruction for COLMAP without a GPU.",
-        args=arguments,
-        config=(tyro.conf.AvoidSubcommands,),
-    )
+    with standard_output():
+        command: Command = tyro.extras.subcommand_cli_from_dict(
+            # `run` alone has flags without a value, among its own options.
+            {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
+            prog="colmap_sph",
+            description="Dense reconstruction for COLMAP without a GPU.",
+            args=arguments,
+            config=(tyro.conf.AvoidSubcommands,),
+        )
     return command
 
 
-def _do(command: Command, console: Console) -> int:
+def _do(command: Command, terminal: Terminal) -> int:
+    try:
+        Path.cwd()
+    except OSError as error:
+        raise InputError(f"The current folder cannot be used ({reason_of(error)}); change to another.") from error
     if isinstance(command, RunCommand):
-        return run_command(command, console)
+        return run_command(command, terminal)
     if isinstance(command, DemoCommand):
-        return demo_command(command, console)
-    return evaluate_command(command, console)
+        return demo_command(command, terminal)
+    return evaluate_command(command, terminal)
 
 
-def demo_command(command: DemoCommand, console: Console) -> int:
+def demo_command(command: DemoCommand, terminal: Terminal) -> int:
     """`colmap_sph demo`."""
     options = RunOptions(threads=command.threads)
     options.check()
-    with workspace_log(Workspace(command.output / "dense"), header(command)), Display(console) as display:
+    with workspace_log(Workspace(command.output / "dense"), header(command)), Display(terminal) as display:
         result = run_demo(command.output, options=options, progress=display)
-    print_summary(result.report, result.workspace, console)
-    console.print("\n[bold]Against exact depth[/], in pixels on the ground (GSD)", highlight=False)
-    console.print(format_depth_maps(result.depth_maps), highlight=False, soft_wrap=True)
-    console.print(format_clouds([result.cloud]), highlight=False, soft_wrap=True)
+    print_summary(result.report, result.workspace, terminal)
+    terminal.say("")
+    terminal.say("in pixels on the ground (GSD)", label="Against exact depth,", style="bold")
+    terminal.say_lines(format_depth_maps(result.depth_maps))
+    terminal.say_lines(format_clouds([result.cloud]))
     return 0
 
 
-def _print_error(error: ColmapSphError, console: Console) -> int:
+def _print_error(error: ColmapSphError, terminal: Terminal) -> int:
     if isinstance(error, OptionError):
         error = error.spelled(flag_of)
-    console.print(f"[bold red]error:[/] {escaped(error)}", highlight=False, soft_wrap=True)
+    terminal.settle()
+    terminal.say(error, label="error:", style="bold red")
     return error.exit_code
 
 
-def _print_interrupted(command: Command, console: Console) -> None:
-    remedy = "; what is finished is kept, run the same command again to go on"
-    words = remedy if isinstance(command, RunCommand) else ""
-    console.print(f"[bold red]interrupted[/]{words}", highlight=False, soft_wrap=True)
+def _print_interrupted(command: Command, terminal: Terminal) -> None:
+    words = (
+        "what is finished is kept, run the same command again to go on" if isinstance(command, RunCommand) else ""
+    )
+    terminal.after_interruption()
+    terminal.say(words, label="interrupted;" if words else "interrupted", style="bold red")

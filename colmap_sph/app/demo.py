@@ -1,6 +1,6 @@
 """The built-in example: render a block, reconstruct it, compare it with its exact depth."""
 
-import shutil
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,9 +21,16 @@ from colmap_sph.evaluation import (
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import run
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.project.claim import check_links, check_ways_out
+from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES
+from colmap_sph.project.undistortion.marker import check_ours
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.synthetic import BlockOptions, Camera, DemoBlock, make_demo_block
+from colmap_sph.synthetic import BlockOptions, Camera, DemoBlock, demo_cameras, make_demo_block
+
+_RECORD = "colmap_sph_demo.json"
+"""Names the files that a demo makes beside its dense workspace: another may replace them."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +66,8 @@ def run_demo(
     Parameters
     ----------
     output : Path
-        Folder for images, model, exact depth and dense workspace; an earlier demo in it is replaced.
+        Folder for images, model, exact depth and dense workspace; an earlier demo in it is replaced, and no other
+        file.
     options : RunOptions, optional
     block : BlockOptions, optional
     progress : Progress, optional
@@ -76,7 +84,9 @@ def run_demo(
     options = options or RunOptions()
     progress = Silent() if progress is None else progress
     shown = progress
-    _make_room(output)
+    block = block or BlockOptions()
+    block.check()
+    _make_room(output, block)
 
     def rendered(done: int, total: int) -> None:
         if done == 1:
@@ -85,33 +95,58 @@ def run_demo(
 
     demo = make_demo_block(output, block, threads=options.num_threads, progress=rendered)
     report = run(
-        demo.sparse_dir, images=demo.images_dir, output=output / "dense", options=options, progress=progress
+        demo.sparse_dir,
+        images=demo.images_dir,
+        output=output / "dense",
+        options=options,
+        progress=progress,
+        overwrite=True,
     )
     workspace = Workspace(output / "dense")
     progress.start("compare with truth", 2)
-    depth_maps = score_depth_maps(demo, workspace)
+    depth_maps = _score_demo_maps(demo, workspace)
     progress.advance()
     cloud = _score_cloud(demo, workspace)
     progress.advance()
     return DemoResult(workspace, report, depth_maps, cloud)
 
 
-def _make_room(output: Path) -> None:
-    """Remove an earlier demo's dense workspace; refuse a folder of any other content."""
-    if not output.exists():
-        return
+def _make_room(output: Path, block: BlockOptions) -> None:
+    """Make sure that only an earlier demo's files will be replaced, and record those of this one."""
+    names = demo_cameras(block)
+    parts = [f"images/{name}" for name in names] + [f"truth/{name}.npz" for name in names]
+    parts += [f"sparse/0/{stem}.bin" for stem in (*MODEL_FILES, *RIG_FILES)]
+    dense = Workspace(output / "dense")
+    check_ways_out(output, (output / name for name in ("images", "sparse", "truth", _RECORD)))
+    check_links(dense, is_given=False)
     try:
-        if any(output.iterdir()) and not (output / "truth").is_dir():
-            raise OutputError(f"{output} already holds other files; choose another --output for the demo.")
-        if (output / "dense").exists():
-            shutil.rmtree(output / "dense")
+        is_empty = not output.exists() or not any(output.iterdir())
     except OSError as error:
         raise OutputError(
             f"The folder {output} cannot be used ({reason_of(error)}); choose another --output."
         ) from error
+    made = set() if is_empty else _recorded_files(output / _RECORD)
+    foreign = next((part for part in parts if part not in made and (output / part).exists()), None)
+    if foreign is not None:
+        raise OutputError(f"{output / foreign} was not made by an earlier demo; move it away.")
+    check_ours(dense)
+    make_dir(output)
+    with atomic_file(output / _RECORD) as file:
+        file.write(json.dumps({"files": sorted({*parts, *made})}, indent=1).encode())
 
 
-def score_depth_maps(demo: DemoBlock, workspace: Workspace) -> dict[str, DepthMapScores]:
+def _recorded_files(record: Path) -> set[str]:
+    """Files that an earlier demo made beside its record; `OutputError` where there is none."""
+    try:
+        files = json.loads(record.read_bytes())["files"]
+        return {str(name) for name in files}
+    except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        raise OutputError(
+            f"{record.parent} already holds other files than those of a demo; choose another --output."
+        ) from error
+
+
+def _score_demo_maps(demo: DemoBlock, workspace: Workspace) -> dict[str, DepthMapScores]:
     """Compare the geometric maps of a demo block's images with exact depth and normals."""
     scores = {}
     for name, camera in zip(demo.names, demo.cameras, strict=True):

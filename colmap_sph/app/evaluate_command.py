@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 import tyro
 from numpy.typing import NDArray
-from rich.console import Console
 
+from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError, reason_of
 from colmap_sph.evaluation import (
     CloudScores,
@@ -94,7 +94,7 @@ class EvaluateCommand:
             raise OutputError(f"{self.json} cannot be written: its folder does not exist; create it first.")
 
 
-def evaluate_command(command: EvaluateCommand, console: Console) -> int:
+def evaluate_command(command: EvaluateCommand, terminal: Terminal) -> int:
     """`colmap_sph evaluate`: tables on the standard output, JSON where asked for."""
     command.check()
     views: list[DepthView] = []
@@ -103,32 +103,32 @@ def evaluate_command(command: EvaluateCommand, console: Console) -> int:
         views = exact_depth_views(command.reference, model, command.depth_scale)
     depth_maps: dict[str, DepthMapScores] = {}
     if command.workspace is not None:
-        with console.status(f"depth maps of {command.workspace}"):
+        with terminal.status(f"depth maps of {command.workspace}"):
             workspace = Workspace(command.workspace)
             depth_maps = score_depth_maps(workspace, views, kind=command.map_kind, gsd=command.options.gsd)
-    clouds = _score_clouds(command, views, console)
+    clouds = _score_clouds(command, views, terminal)
     blocks = [format_clouds(clouds)] if clouds else []
     if depth_maps:
         gsd = "depth / focal length" if command.options.gsd is None else f"{command.options.gsd:g} m"
         title = f"{command.map_kind} depth maps of {command.workspace}; GSD = {gsd}"
         blocks.append(f"{title}\n\n{format_depth_maps(depth_maps)}")
-    print("\n\n".join(blocks))
     if command.json is not None:
         write_json(command.json, as_plain_values(command, clouds, depth_maps))
+    print_result("\n\n".join(blocks))
     return 0
 
 
-def _score_clouds(command: EvaluateCommand, views: list[DepthView], console: Console) -> list[CloudScores]:
+def _score_clouds(command: EvaluateCommand, views: list[DepthView], terminal: Terminal) -> list[CloudScores]:
     if not command.clouds:
         return []
-    with console.status("reference") as status:
+    with terminal.status("reference"):
         truth = views or read_geometry(command.reference)
         reference: Reference = make_reference(truth, command.options)
-        scores = []
-        for path in command.clouds:
-            status.update(str(path))
+    scores = []
+    for path in command.clouds:
+        with terminal.status(path):
             scores.append(evaluate_cloud(read_geometry(path), reference, command.options))
-        return scores
+    return scores
 
 
 def as_plain_values(

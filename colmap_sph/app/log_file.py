@@ -1,23 +1,53 @@
 """The log file of a workspace: everything the package logs, from the moment the workspace exists."""
 
+import errno
+import io
 import logging
+import os
+import stat
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
-from colmap_sph.errors import OutputError, reason_of
+from colmap_sph.errors import OutputError, printable, reason_of
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
 
+class _OneLine(logging.Formatter):
+    """One line for each record, whatever names are in it; the lines of a traceback are indented."""
+
+    def __init__(self) -> None:
+        super().__init__("%(asctime)s %(levelname)s %(name)s: %(message)s")
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """Put a record into one line."""
+        return printable(super().formatMessage(record))
+
+    def formatException(self, info: Any) -> str:
+        """Indent a traceback: no name in it may look like a record."""
+        return "\n".join(f"  {printable(line)}" for line in super().formatException(info).splitlines())
+
+
 class _LogFile(logging.FileHandler):
     """A file whose disk may fill up: that is said once, and the run does not end for its log."""
 
-    def __init__(self, path: Path, encoding: str) -> None:
-        super().__init__(path, encoding=encoding)
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, encoding="utf-8", errors="backslashreplace")
+        self.setFormatter(_OneLine())
         self._has_failed = False
+
+    def _open(self) -> io.TextIOWrapper:
+        """Open a file, but no link, and without waiting for the reader of a pipe."""
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
+        descriptor = os.open(self.baseFilename, flags, 0o666)
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            os.close(descriptor)
+            raise OSError(errno.EINVAL, "it is no ordinary file")
+        return open(descriptor, "a", encoding=self.encoding, errors=self.errors)  # noqa: PTH123
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Instead of a traceback on the terminal."""
@@ -58,12 +88,11 @@ class _WorkspaceLog(logging.Handler):
     def _open(self) -> logging.FileHandler:
         path = self._workspace.log_path
         try:
-            file = _LogFile(path, encoding="utf-8")
+            file = _LogFile(path)
         except OSError as error:
             raise OutputError(
                 f"{path} cannot be written ({reason_of(error)}); check space and permissions."
             ) from error
-        file.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         for record in self._early:
             file.emit(record)
         return file

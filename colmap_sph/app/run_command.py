@@ -1,5 +1,6 @@
 """`colmap_sph run`: its options, its help, the plan of a dry run, and the closing summary."""
 
+import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -11,10 +12,11 @@ from rich.table import Table
 from rich.text import Text
 
 import colmap_sph
-from colmap_sph.app.display import Display, escaped
+from colmap_sph.app.display import Display, duration
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.option_list import Option, option_groups
 from colmap_sph.app.spelling import EVERYDAY
+from colmap_sph.app.terminal import Terminal
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
 from colmap_sph.pipeline.reconstruct import check_input, run_project
@@ -49,20 +51,20 @@ class RunCommand:
     """Look at every byte of earlier results first, and make again what is damaged."""
 
 
-def run_command(command: RunCommand, console: Console) -> int:
+def run_command(command: RunCommand, terminal: Terminal) -> int:
     """`colmap_sph run`."""
     project = command.project
     options = command.options
     check_input(project, options)
     workspace = Workspace(project.root)
     if command.dry_run:
-        print_plan(make_plan(project, options, overwrite=command.overwrite), workspace, console)
+        print_plan(make_plan(project, options, overwrite=command.overwrite), workspace, terminal)
         return 0
-    with workspace_log(workspace, header(command)), Display(console) as display:
+    with workspace_log(workspace, header(command)), Display(terminal) as display:
         report = run_project(
             project, options, progress=display, overwrite=command.overwrite, verify=command.verify
         )
-    print_summary(report, workspace, console)
+    print_summary(report, workspace, terminal)
     return PARTIAL_EXIT_CODE if report.skipped_images else 0
 
 
@@ -76,10 +78,9 @@ def header(command: object) -> str:
 
 def help_text(*, everything: bool) -> str:
     """The everyday options of `run` for one screen, or all of them."""
-    console = Console()
-    with console.capture() as captured:
-        _print_help(console, everything=everything)
-    return captured.get().rstrip()
+    text = io.StringIO()
+    _print_help(Console(file=text), everything=everything)
+    return text.getvalue().rstrip()
 
 
 def _print_help(console: Console, *, everything: bool) -> None:
@@ -113,7 +114,7 @@ def _print_options(options: Sequence[Option], console: Console) -> None:
 # ---- plan and summary --------------------------------------------------------------------------------------
 
 
-def print_plan(plan: Plan, workspace: Workspace, console: Console) -> None:
+def print_plan(plan: Plan, workspace: Workspace, terminal: Terminal) -> None:
     """Print what a run would do and need.
 
     Parameters
@@ -121,36 +122,26 @@ def print_plan(plan: Plan, workspace: Workspace, console: Console) -> None:
     plan : Plan
     workspace : Workspace
         To which nothing was written.
-    console : Console
+    terminal : Terminal
     """
-    facts = Table.grid(padding=(0, 2))
-    facts.add_row("undistort", "to do" if plan.undistort else "done")
+    facts = [("undistort", "to do" if plan.undistort else "done")]
     for what, number, done in (
         ("pairs", plan.pairs, plan.pairs_done),
         ("images", plan.images, plan.images_done),
         ("cloud", 1, int(not plan.fuse)),
     ):
-        facts.add_row(what, f"{number - done} to do, {done} done")
-    facts.add_row("time", f"about {_duration(plan.seconds)}")
-    facts.add_row("memory", f"about {decimal(round(plan.memory))}")
-    facts.add_row("disk", f"about {decimal(round(plan.disk))} more, of {decimal(plan.free_disk)} free")
-    console.print(facts, highlight=False)
-    console.print(
+        facts.append((what, f"{number - done} to do, {done} done"))
+    facts.append(("time", f"about {duration(plan.seconds)}"))
+    facts.append(("memory", f"about {decimal(round(plan.memory))}"))
+    facts.append(("disk", f"about {decimal(round(plan.disk))} more, of {decimal(plan.free_disk)} free"))
+    terminal.facts(facts)
+    terminal.say(
         "Time, memory and disk are estimates from the numbers of pixels; the time is that of a 2.5 GHz server. "
-        f"Nothing was written to {escaped(workspace.root)}.",
-        highlight=False,
-        soft_wrap=True,
+        f"Nothing was written to {workspace.root}."
     )
 
 
-def _duration(seconds: float) -> str:
-    """Such as "40 s", "12 min" or "3.5 h"."""
-    if seconds < 100:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
-
-
-def print_summary(report: RunReport, workspace: Workspace, console: Console) -> None:
+def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
     """Print the closing summary of a run.
 
     Parameters
@@ -158,29 +149,25 @@ def print_summary(report: RunReport, workspace: Workspace, console: Console) -> 
     report : RunReport
     workspace : Workspace
         With the results.
-    console : Console
+    terminal : Terminal
     """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
-    table = Table("image", "coverage", title="Depth maps", title_justify="left")
-    for name, share in sorted(listed[:_MAX_LISTED_IMAGES]):
-        table.add_row(escaped(name), f"{share:.1%}")
-    if len(listed) > _MAX_LISTED_IMAGES:
-        table.caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images"
-    console.print(table)
+    rows = [(name, f"{share:.1%}") for name, share in sorted(listed[:_MAX_LISTED_IMAGES])]
+    caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images" if len(listed) > len(rows) else ""
+    terminal.table("Depth maps", ["image", "coverage"], rows, caption)
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
-    facts = Table.grid(padding=(0, 2))
-    facts.add_row("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")
-    facts.add_row("pairs", f"{report.pairs} matched ({report.pair_source})")
-    facts.add_row("cloud", f"{report.points:,} points in {escaped(workspace.fused_path)}")
+    facts = [("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")]
+    facts.append(("pairs", f"{report.pairs} matched ({report.pair_source})"))
+    facts.append(("cloud", f"{report.points:,} points in {workspace.fused_path}"))
     if any(report.reused.values()):
         kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
-        facts.add_row("up to date", kept)
+        facts.append(("up to date", kept))
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
-    facts.add_row("seconds", f"{sum(report.seconds.values()):.1f} ({times})")
-    facts.add_row("peak memory", f"{report.peak_memory / 2**30:.2f} GiB")
-    console.print(facts, highlight=False)
+    facts.append(("seconds", f"{sum(report.seconds.values()):.1f} ({times})"))
+    facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
+    terminal.facts(facts)
     for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
         for name, reason in skipped.items():
-            console.print(f"[yellow]{what} skipped:[/] {escaped(name)}: {escaped(reason)}", soft_wrap=True)
+            terminal.say(f"{name}: {reason}", label=f"{what} skipped:", style="yellow")
     if report.advice:
-        console.print(f"[yellow]few points:[/] {escaped(report.advice)}", soft_wrap=True)
+        terminal.say(report.advice, label="few points:", style="yellow")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.errors import NoResultError, OutputError, reason_of
+from colmap_sph.errors import NoResultError, OutputError, printable, reason_of
 from colmap_sph.evaluation.cloud_scores import CloudScores
 from colmap_sph.evaluation.depth_maps import DepthMapScores
 
@@ -24,9 +24,8 @@ def format_clouds(scores: Sequence[CloudScores]) -> str:
         header += [f"acc {label}", f"comp {label}", f"F {label}"]
     rows = [header, *(_cloud_row(cloud) for cloud in scores)]
     first = scores[0]
-    lines = [
-        f"reference: {first.reference}, {first.reference_count:,} samples; shares counted as {first.definition}"
-    ]
+    samples = f"{first.reference_count:,} samples; shares counted as {first.definition}"
+    lines = [f"reference: {printable(first.reference)}, {samples}"]
     if first.cloud_to_reference.cap is not None:
         lines.append(f"distances above {first.cloud_to_reference.cap:g} m count as that")
     return "\n".join([*lines, "", _aligned(rows), "", *(_registration_line(cloud) for cloud in scores)])
@@ -117,7 +116,7 @@ def _cloud_row(scores: CloudScores) -> list[str]:
 
 def _registration_line(scores: CloudScores) -> str:
     registration = scores.registration
-    name = Path(scores.cloud).name
+    name = printable(Path(scores.cloud).name)
     if registration is None:
         return f"{name}: not registered"
     shift = ", ".join(f"{value:.3f}" for value in registration.shift)
@@ -139,6 +138,7 @@ def _percent(share: float) -> str:
 
 def _aligned(rows: Sequence[Sequence[str]]) -> str:
     """Columns to the right, the first to the left."""
+    rows = [[printable(cell) for cell in row] for row in rows]
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = []
     for row in rows:

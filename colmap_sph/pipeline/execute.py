@@ -46,8 +46,9 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
             results = _one_by_one(work, stage) if stage.whole else _by_threads(work, stage)
         stage.close(results)
     made, reused = stage.count(results)
-    context.report.made[stage.name] = made
-    context.report.reused[stage.name] = reused
+    if made or reused:
+        context.report.made[stage.name] = made
+        context.report.reused[stage.name] = reused
     if reused:
         logger.info("%s: %d were up to date", stage.name.capitalize(), reused)
     return results

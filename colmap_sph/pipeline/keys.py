@@ -73,7 +73,7 @@ class Keys:
     def _key(self, kind: str, *parts: object) -> str:
         return digest(kind, self._programs.get(kind), self.fresh, *parts)
 
-    def undistorted(self, image: str, camera: tuple[object, ...], mask: Path | None) -> str:
+    def undistorted(self, image: str, camera: tuple[object, ...], values: object, mask: Path | None) -> str:
         """Of an undistorted image.
 
         Parameters
@@ -82,11 +82,13 @@ class Keys:
             Digest of the content of the original.
         camera : tuple
             All that its camera is.
+        values : ValueRange or None
+            What becomes black and white.
         mask : Path or None
             Of the original, where there is one.
         """
         mask_digest = None if mask is None or self.fresh else file_digest(mask)
-        return self._key("undistorted", image, camera, mask_digest, self._options.undistortion)
+        return self._key("undistorted", image, camera, values, mask_digest, self._options.undistortion)
 
     def pair(self, left: View, right: View, geometry: RectifiedPair) -> str:
         """Of a disparity map.

@@ -4,16 +4,23 @@ import re
 import resource
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from contextlib import contextmanager, suppress
+
+import psutil
 
 from colmap_sph.errors import OptionError
+from colmap_sph.pipeline import control_groups
 
 _UNITS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 # Of the memory that is free when a run starts, what it takes by itself.
 _SAFE_SHARE = 0.7
 # What the allocators and the interpreter keep beyond the arrays that are counted.
 _SLACK = 1.15
+# What a run tries to use of a machine whose memory others have taken: it swaps.
+_LEAST = 256 << 20
+# Taken for what is free, or in use, where the system does not say.
+_UNKNOWN_FREE = 4 << 30
+_UNKNOWN_USED = 200 << 20
 
 
 def parse_memory(text: str) -> int:
@@ -22,16 +29,22 @@ def parse_memory(text: str) -> int:
     Raises
     ------
     OptionError
-        Not an amount.
+        Not an amount, or nothing.
     """
     if not text:
         return 0
-    match = re.fullmatch(r"\s*(\d+(?:\.\d*)?)\s*([KMGT]?)(i?B)?\s*", text, re.IGNORECASE)
+    match = re.fullmatch(r"\s*(\d{1,15}(?:\.\d*)?)\s*([KMGT]?)(i?B)?\s*", text, re.IGNORECASE)
     if not match:
-        raise OptionError(f"memory must be an amount such as 6GiB or 1500MB, not {text!r}.", "memory")
+        shown = text if len(text) <= 40 else f"{text[:40]}…"
+        raise OptionError(f"memory must be an amount such as 6GiB or 1500MB, not {shown!r}.", "memory")
     number, unit, suffix = match.groups()
     base = 1000 if suffix is not None and suffix.upper() == "B" else 1024
-    return int(float(number) * base ** _UNITS[unit.upper()])
+    amount = int(float(number) * base ** _UNITS[unit.upper()])
+    if amount == 0:
+        raise OptionError(
+            f"memory must be more than {text!r}; leave it out for a safe share of what is free.", "memory"
+        )
+    return amount
 
 
 def format_memory(amount: float) -> str:
@@ -41,31 +54,34 @@ def format_memory(amount: float) -> str:
 
 
 def budget(wanted: int) -> int:
-    """Bytes a run may use: what is `wanted`, or (0) a safe share of what the machine has free."""
+    """Bytes a run may use: what is `wanted`, or (0) a safe share of what this process has free."""
     return wanted or int(_SAFE_SHARE * _free()) + resident()
 
 
 def resident() -> int:
     """Bytes of memory this process has in use."""
-    try:
-        return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize()
-    except (OSError, ValueError, IndexError):
-        return 200 << 20
+    with suppress(OSError, psutil.Error):
+        return int(psutil.Process().memory_info().rss)
+    return _UNKNOWN_USED
 
 
 def _free() -> int:
-    """Bytes free on the machine and in this process's control group."""
-    free = [4 << 30]
-    try:
-        text = Path("/proc/meminfo").read_text()
-        free = [int(line.split()[1]) * 1024 for line in text.splitlines() if line.startswith("MemAvailable:")]
-        group = Path("/sys/fs/cgroup")
-        limit, used = ((group / f"memory.{name}").read_text().strip() for name in ("max", "current"))
-        if limit != "max":
-            free.append(int(limit) - int(used))
-    except (OSError, ValueError):
-        pass
-    return max(min(free, default=4 << 30), 256 << 20)
+    """Bytes free on the machine, in this process's control groups, and under its own limits."""
+    free = _UNKNOWN_FREE
+    with suppress(OSError, psutil.Error):
+        free = max(int(psutil.virtual_memory().available), _LEAST)
+    limits = (control_groups.free_memory(), *_free_under_limits())
+    return max(min([free, *(limit for limit in limits if limit is not None)]), 0)
+
+
+def _free_under_limits() -> Iterator[int]:
+    """Bytes left under ``ulimit -v`` and ``ulimit -d``."""
+    with suppress(OSError, psutil.Error):
+        used = psutil.Process().memory_info()
+        for kind, amount in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, used.data)):
+            limit, _ = resource.getrlimit(kind)
+            if limit != resource.RLIM_INFINITY:
+                yield limit - amount
 
 
 class MemoryGate:
@@ -101,8 +117,8 @@ class MemoryGate:
         needed = int(_SLACK * amount)
         if needed > self.free:
             raise OptionError(
-                f"--memory {format_memory(self._total)} is too little for {what}; "
-                f"{format_memory((self._outside + needed) * 1.05)} would do."
+                f"{format_memory(self._total)} of memory (--memory, or a share of what is free) is too little for "
+                f"{what}; {format_memory((self._outside + needed) * 1.05)} would do."
             )
         with self._changed:
             self._changed.wait_for(lambda: self._reserved + needed <= self.free)

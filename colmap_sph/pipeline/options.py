@@ -4,6 +4,7 @@ import os
 from dataclasses import dataclass, field, fields, is_dataclass
 
 from colmap_sph.errors import OptionError
+from colmap_sph.pipeline.control_groups import processors
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.stereo.confirm import ConfirmOptions
@@ -18,8 +19,9 @@ from colmap_sph.stereo.vote import VoteOptions
 
 
 def num_cores() -> int:
-    """Cores that this process may use, which can be fewer than the machine has."""
-    return len(os.sched_getaffinity(0))
+    """Cores that this process may use, which can be fewer than the machine has: their time may be limited, too."""
+    cores = len(os.sched_getaffinity(0))
+    return min(cores, processors() or cores)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
 
 import logging
 from collections.abc import Hashable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from heapq import nlargest
 from typing import TypeVar
 
@@ -19,13 +19,13 @@ from colmap_sph.pipeline.options import RunOptions, num_cores
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import (
     check_input,
-    check_workspace_images,
     choose_pairs,
     go_through_stages,
     wanted_scene,
+    with_good_images,
 )
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
 from colmap_sph.project.files import free_space
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -132,13 +132,11 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         to_make = {name for name, result in undistorted.items() if result.made}
         foreseen = preparation.scene(undistorted)
     scene = anchored(read_scene(dense.sparse_dir) if foreseen is None else foreseen)
-    there = scene.only(scene.index_of.keys() - to_make)
-    context = Context(dense, there, options, Keys(dense, options, fresh=overwrite))
-    images = check_workspace_images(context, survey) if there.views else {}
-    scene = scene.only({*images, *to_make})
-    selection = choose_pairs(dense if foreseen is None else None, scene, options, project.database())
-    keys = Keys(dense, options, keys_of(images), fresh=overwrite)
-    context = Context(dense, wanted_scene(scene, selection), options, keys)
+    keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
+    to_come = scene.index_of if foreseen is not None else to_make
+    context = with_good_images(Context(dense, scene, options, keys), survey, to_come=to_come)
+    selection = choose_pairs(dense if foreseen is None else None, context.scene, options, project.database())
+    context = replace(context, scene=wanted_scene(context.scene, selection))
     foreign = foreign_files(context.places, overwrite=overwrite)
     if foreign:
         logger.warning("Would get another name, as this program did not make it: %s", named(foreign))

@@ -15,10 +15,11 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.stages.check_images import CheckStage
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.undistort import UndistortStage
 from colmap_sph.project.files import scratch_folder
+from colmap_sph.project.images.depth import common_ranges, describe_ranges
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, has_model, image_names
@@ -103,6 +104,9 @@ class Preparation:
         self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
         self.names = tuple(image_names(self._originals.model))
+        originals = self._originals
+        if originals.mask_dir is not None:
+            check_masks(originals.mask_dir, cameras_of_images(originals.model), originals.image_dir)
         self._context = Context(
             self.workspace,
             NO_SCENE,
@@ -111,8 +115,6 @@ class Preparation:
             progress or Silent(),
             report or RunReport(),
         )
-        if self._originals.mask_dir is not None:
-            check_masks(self._originals.mask_dir, cameras_of_images(self._originals.model))
 
     def run(self, executor: "Executor") -> None:
         """Make the workspace.
@@ -126,17 +128,14 @@ class Preparation:
         self.begin(images)
         self.finish(self.undistort(executor, images))
 
-    def check(self, executor: "Executor") -> dict[str, str]:
-        """Go through the first stage: check the original images; return digests of the contents of good ones."""
+    def check(self, executor: "Executor") -> dict[str, Result]:
+        """Go through the first stage: check the original images; return the results of the good ones."""
         originals = self._originals
         cameras = cameras_of_images(originals.model)
         sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
         where = f"{originals.image_dir} is usable; check --images."
-        return keys_of(
-            executor(
-                CheckStage(self._context, sizes, originals.image_path, "originals", where, verify=self._verify)
-            )
-        )
+        stage = CheckStage(self._context, sizes, originals.image_path, "originals", where, verify=self._verify)
+        return executor(stage)
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""
@@ -152,9 +151,18 @@ class Preparation:
             write_marker(self.workspace, self._marker)
         self._found = found
 
-    def undistort(self, executor: "Executor", images: Mapping[str, str]) -> dict[str, Result]:
+    def undistort(self, executor: "Executor", images: Mapping[str, Result]) -> dict[str, Result]:
         """Go through the second stage: undistort the images that `check` found good; return their results."""
-        return executor(UndistortStage(self._context, self._originals, images))
+        samples = {
+            name: result.facts.sample
+            for name, result in images.items()
+            if isinstance(result.facts, ImageFacts) and result.facts.sample is not None
+        }
+        ranges = common_ranges(samples.values())
+        for sentence in describe_ranges(ranges):
+            logger.info(sentence)
+        values = {name: ranges[sample.kind] for name, sample in samples.items()}
+        return executor(UndistortStage(self._context, self._originals, keys_of(images), values))
 
     def finish(self, results: Mapping[str, Result]) -> None:
         """Give the workspace its model, where that is not there for these images."""

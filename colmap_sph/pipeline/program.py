@@ -12,6 +12,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+import simplejpeg
 
 from colmap_sph import _native
 from colmap_sph.pipeline.digests import digest, file_digest
@@ -30,7 +32,8 @@ def program_digest(module: str) -> str:
         Such as "colmap_sph.stereo.matching".
     """
     files = {name: file_digest(_source_of(name)) for name in reached_modules(module)}
-    return digest(files, file_digest(Path(_native.__file__)), [cv2.__version__, np.__version__, COLMAP_VERSION])
+    versions = [cv2.__version__, np.__version__, COLMAP_VERSION, oiio.__version__, simplejpeg.__version__]
+    return digest(files, file_digest(Path(_native.__file__)), versions)
 
 
 def reached_modules(module: str) -> list[str]:

@@ -9,7 +9,7 @@ import json
 import logging
 import resource
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -28,7 +28,7 @@ from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.pipeline.workers import one_opencv_thread
-from colmap_sph.project.claim import claimed
+from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
@@ -144,6 +144,7 @@ def check_input(project: Project, options: RunOptions) -> None:
     """Raise `ColmapSphError` for what is wrong before anything is touched."""
     options.check()
     project.check()
+    check_links(Workspace(project.root), is_given=project.workspace is not None)
     if project.model is None and options.undistortion != UndistortionOptions():
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
 
@@ -185,15 +186,15 @@ def reconstruct(
     with one_opencv_thread():
         scene = anchored(read_scene(workspace.sparse_dir))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
-        images = check_workspace_images(context, execute, verify=verify)
-        scene = scene.only(images)
+        context = with_good_images(context, execute, verify=verify)
+        scene = context.scene
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
             selection = choose_pairs(workspace, scene, options, database)
             report.pair_source = selection.source
             progress.advance()
         scene = wanted_scene(scene, selection)
-        context = replace(context, scene=scene, keys=Keys(workspace, options, keys_of(images)))
+        context = replace(context, scene=scene)
         take_places(context.places, overwrite=overwrite)
         if verify:
             _verify(context)
@@ -242,12 +243,35 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     executor(fuse_stage(context, pair_keys, maps))
 
 
-def check_workspace_images(context: Context, executor: Executor, *, verify: bool = False) -> dict[str, Result]:
-    """Check the undistorted images of a scene, with `verify` all anew; return the results of the good ones."""
+def with_good_images(
+    context: Context, executor: Executor, *, verify: bool = False, to_come: Collection[str] = ()
+) -> Context:
+    """Check the undistorted images, and return a context with the good ones alone, whose contents its keys know.
+
+    Parameters
+    ----------
+    context : Context
+    executor : callable
+    verify : bool
+        Whether what is known of them from earlier runs does not count.
+    to_come : collection of str
+        Images that are not there yet, or will be made anew: they are taken for good.
+
+    Returns
+    -------
+    Context
+    """
     workspace = context.workspace
-    sizes = {view.name: (view.width, view.height) for view in context.scene.views}
+    there = [view for view in context.scene.views if view.name not in to_come]
+    sizes = {view.name: (view.width, view.height) for view in there}
     where = f"{workspace.images_dir} is usable."
-    return executor(CheckStage(context, sizes, workspace.image_path, "images", where, verify=verify))
+    images: dict[str, str] = {}
+    if there:
+        images = keys_of(
+            executor(CheckStage(context, sizes, workspace.image_path, "images", where, verify=verify))
+        )
+    keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
+    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys)
 
 
 def choose_pairs(

@@ -71,7 +71,10 @@ def for_all(
 
 
 def is_memory_error(error: BaseException) -> bool:
-    """Whether an error says that memory was refused, by Python or by OpenCV."""
+    """Whether an error says that memory or a thread was refused, by Python or by OpenCV."""
+    if isinstance(error, RuntimeError):
+        # Python's own words, and those of C++'s libraries: no memory for its stack, or a limit on threads
+        return "start new thread" in str(error) or "temporarily unavailable" in str(error)
     return isinstance(error, MemoryError) or (isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem)
 
 

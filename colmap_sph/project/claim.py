@@ -1,10 +1,11 @@
-"""One run at a time in a workspace; and what a killed one left half-written there is removed."""
+"""A workspace for one run alone: no link in it leads out, no other run is at work, nothing half-written left."""
 
 import fcntl
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from pathlib import Path
 
 from colmap_sph.errors import OutputError
 from colmap_sph.project.files import make_dir, remove_temporary_files
@@ -36,6 +37,61 @@ def claimed(workspace: Workspace) -> Iterator[None]:
         for path in created:
             with suppress(OSError):  # not empty
                 path.rmdir()
+
+
+def check_links(workspace: Workspace, *, is_given: bool) -> None:
+    """Raise `OutputError` where a link would have a run write or delete outside of the workspace.
+
+    The workspace itself may be reached through links, and links from one place in it to another are as good as
+    folders.
+
+    Parameters
+    ----------
+    workspace : Workspace
+        Need not exist.
+    is_given : bool
+        Whether its images, model and masks are the user's, which are only read and may be anywhere.
+    """
+    written = [workspace.state_dir, workspace.stereo_dir, *workspace.cloud_paths]
+    if not is_given:
+        written += [workspace.images_dir, workspace.sparse_dir, workspace.masks_dir]
+    # Both are removed as a whole before anything is written there, and have links of our own inside.
+    remade = {workspace.local_dir, workspace.fusion_scratch_dir}
+    check_ways_out(workspace.root, written, unlinked=remade)
+
+
+def check_ways_out(root: Path, places: Iterable[Path], *, unlinked: Collection[Path] = ()) -> None:
+    """Raise `OutputError` where a link at one of the places, or in the folders there, leads out of a folder.
+
+    Parameters
+    ----------
+    root : Path
+        The folder.
+    places : iterable of Path
+        Files and folders in it; need not exist.
+    unlinked : collection of Path
+        Folders that must not be links at all, and are not looked into.
+    """
+    top = Path(os.path.realpath(root))
+    waiting = list(places)
+    seen: set[Path] = set()
+    while waiting:
+        path = waiting.pop()
+        target = Path(os.path.realpath(path))
+        if path.is_symlink() and (path in unlinked or not target.is_relative_to(top)):
+            raise OutputError(
+                f"{path} is a link to {target}, where this program would write and delete; put a folder or file "
+                "of its own in its place, or choose another --output."
+            )
+        if path not in unlinked and target not in seen:
+            seen.add(target)
+            waiting += _folders_and_links(path)
+
+
+def _folders_and_links(folder: Path) -> list[Path]:
+    with suppress(OSError), os.scandir(folder) as entries:
+        return [Path(each.path) for each in entries if each.is_symlink() or each.is_dir(follow_symlinks=False)]
+    return []
 
 
 def _lock(descriptor: int, workspace: Workspace) -> None:

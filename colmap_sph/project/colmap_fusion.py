@@ -7,6 +7,7 @@ back afterwards.
 import errno
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,11 +16,12 @@ import pycolmap
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.cloud_files import check_places, link_workspace, move_cloud_into_place
 from colmap_sph.project.colmap_library import quiet_colmap
-from colmap_sph.project.files import scratch_folder
+from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.map_coordinates import local_origin
 from colmap_sph.project.map_files import check_map
+from colmap_sph.project.masks import read_mask
 from colmap_sph.project.sparse_model import cameras_of_images, load_model
-from colmap_sph.project.workspace import MapKind, Workspace
+from colmap_sph.project.workspace import MapKind, Workspace, mask_path
 from colmap_sph.scene import POINT
 
 _PLY_END = b"end_header\n"
@@ -78,6 +80,9 @@ def fuse_by_colmap(
                 link_workspace(workspace, linked, origin, scratch)
                 source = scratch
             made = Workspace(scratch)
+            if colmap_options.mask_path != Path():
+                _link_masks(Path(colmap_options.mask_path), cameras_of_images(model), made.masks_dir)
+                colmap_options.mask_path = made.masks_dir
             with quiet_colmap():
                 cloud = pycolmap.stereo_fusion(
                     made.fused_path, source, input_type=kind, options=colmap_options, output_type="PLY"
@@ -98,6 +103,16 @@ def _colmap_options(options: Mapping[str, Any], threads: int) -> pycolmap.Stereo
         setattr(colmap_options, name, value)
     colmap_options.num_threads = threads
     return colmap_options
+
+
+def _link_masks(folder: Path, cameras: Mapping[str, pycolmap.Camera], links: Path) -> None:
+    """Check the masks of images, and let COLMAP's fusion find them; it takes damaged ones without a word."""
+    for name, camera in cameras.items():
+        mask = mask_path(folder, name)
+        if read_mask(mask, camera.width, camera.height) is not None:
+            link = links / f"{name}.png"
+            make_dir(link.parent)
+            link.symlink_to(mask.resolve())
 
 
 def _check_written(made: Workspace, num_points: int) -> None:

@@ -21,7 +21,7 @@ _TEMPORARY_NAME = ".{process}-{thread}.tmp"
 _TEMPORARY = re.compile(r"\.\d+-\d+\.tmp")
 # What a file system answers that cannot sync at all: there is nothing to wait for then.
 _NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
-_READ_BYTES = 1 << 20
+_READ_BYTES = 1 << 17
 
 
 def make_dir(folder: Path) -> None:
@@ -78,7 +78,8 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
     name = _TEMPORARY_NAME.format(process=os.getpid(), thread=threading.get_ident())
     temporary = path.parent / name
     try:
-        with temporary.open("wb") as file:
+        temporary.unlink(missing_ok=True)  # of a process with the same number that was killed
+        with temporary.open("xb") as file:  # a new file, never one that a link leads to
             yield NewFile(file)
             file.flush()
             if sync:

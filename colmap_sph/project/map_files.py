@@ -20,7 +20,7 @@ _MAX_HEADER = 30
 # Of the square of a normal's length.
 _UNIT_TOLERANCE = 0.01
 # Values of a plane that are looked at together: what stays in the processor's cache.
-_BAND_VALUES = 1 << 15
+_BAND_VALUES = 1 << 16
 _HEADER = re.compile(rb"(\d{1,9})&(\d{1,9})&(\d{1,9})&")
 
 
@@ -185,17 +185,22 @@ def find_flaw(depth: NDArray[np.float32], normals: NDArray[np.float32]) -> str |
     str or None
         None where depths are finite, and normals unit vectors or zero.
     """
+    # Neither NaN nor infinity gets past both; a sum of them all could overflow.
+    if not np.isfinite([depth.min(), depth.max()]).all():
+        return "a depth that is not finite"
     step = max(_BAND_VALUES // depth.shape[1], 1)
-    for first in range(0, depth.shape[0], step):
-        rows = slice(first, first + step)
-        if not np.isfinite(depth[rows]).all():
-            return "a depth that is not finite"
-        x, y, z = normals[:, rows]
-        # What is too large to be squared becomes infinite, and is found so.
-        with np.errstate(over="ignore", invalid="ignore"):
-            squared = x * x + y * y + z * z
-        # In this form, as no comparison with NaN holds.
-        is_unit = np.abs(squared - 1) <= _UNIT_TOLERANCE
-        if not (is_unit | (squared == 0)).all():
-            return "a normal that is not of unit length"
+    # What is too large to be squared becomes infinite, and is found so.
+    with np.errstate(over="ignore", invalid="ignore"):
+        for first in range(0, depth.shape[0], step):
+            x, y, z = normals[:, first : first + step]
+            squared = x * x
+            squared += y * y
+            squared += z * z
+            none = squared == 0
+            is_short = np.count_nonzero(squared >= 1 - _UNIT_TOLERANCE) + np.count_nonzero(none) < squared.size
+            # In this form, as no comparison with NaN holds, and the largest of some with NaN is NaN.
+            is_long = not squared.max() <= 1 + _UNIT_TOLERANCE
+            # The square of a tiny number is 0, too.
+            if is_short or is_long or any(plane[none].any() for plane in (x, y, z)):
+                return "a normal that is not of unit length"
     return None

@@ -1,10 +1,12 @@
 """Masks: parts of images that take no part, such as sky, water, whatever moves, or the vehicle itself.
 
-As for COLMAP's feature extraction, the mask of ``a/b.jpg`` is ``a/b.jpg.png`` in the folder of masks; it has the
-size of its image and is black where the image is to be ignored. An image without a mask is used whole.
+As for COLMAP's feature extraction, the mask of ``a/b.jpg`` is ``a/b.jpg.png`` in the folder of masks, or
+``a/b.png``; it has the size of its image and is black where the image is to be ignored. An image without a mask is
+used whole.
 """
 
-from collections.abc import Mapping
+import logging
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -14,7 +16,15 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.images.decoding import read_pixels
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.workspace import mask_path
+
+logger = logging.getLogger(__name__)
+
+# So many names are told of more that are as odd.
+_NAMES_TOLD = 3
+_NO_MASKS = {"Thumbs.db", "desktop.ini"}
 
 
 def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8] | None:
@@ -38,26 +48,28 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8] | None:
     """
     if not path.exists():
         return None
-    flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
-    mask = cv2.imread(str(path), flags) if path.is_file() else None
-    if mask is None:
-        raise InputError(f"The mask {path} cannot be read as an image; mend or remove it.")
-    if mask.shape != (height, width):
-        raise InputError(
-            f"The mask {path} has {mask.shape[1]} x {mask.shape[0]} pixels, but its image {width} x {height}; "
-            "mend or remove it."
-        )
-    return np.where(mask > 0, np.uint8(255), np.uint8(0))
+    problem = image_problem(path, width, height)
+    if problem is not None:
+        raise InputError(f"The mask {path} {problem.replace('its camera', 'its image')}; mend or remove it.")
+    return np.where((read_pixels(path) != 0).any(axis=2), np.uint8(255), np.uint8(0))
 
 
-def check_masks(folder: Path, cameras: Mapping[str, pycolmap.Camera]) -> list[str]:
+def check_masks(
+    folder: Path, cameras: Mapping[str, pycolmap.Camera], image_dir: Path, others: Iterable[str] = ()
+) -> list[str]:
     """Make sure that a folder's masks can be used; return the names of the images that have one.
+
+    Masks of no image, and images without one among others that have one, are reported by a warning.
 
     Parameters
     ----------
     folder : Path
     cameras : mapping of str to pycolmap.Camera
         That of each image, by its name.
+    image_dir : Path
+        Where the images are: it may be the same folder.
+    others : iterable of str
+        Further images, which are left out; their masks are not looked at.
 
     Raises
     ------
@@ -75,7 +87,42 @@ def check_masks(folder: Path, cameras: Mapping[str, pycolmap.Camera]) -> list[st
     if not masked:
         name = min(cameras)
         raise InputError(f"{folder} holds no mask for any image; that of {name} must be {folder / name}.png.")
+    warn_of_unused_masks(folder, [*cameras, *others], image_dir)
+    bare = sorted(set(cameras) - set(masked))
+    if bare:
+        they_are = "it is" if len(bare) == 1 else "they are"
+        logger.warning("No mask in %s for %s: %s used whole", folder, _told(bare, "image"), they_are)
     return masked
+
+
+def warn_of_unused_masks(folder: Path, names: Iterable[str], image_dir: Path) -> None:
+    """Report files in a folder of masks that belong to none of the images `names`."""
+    names = list(names)
+    known = {mask_path(folder, name) for name in names}
+    if folder.resolve() == image_dir.resolve():
+        known |= {folder / name for name in names}
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path not in known)
+    unused = [
+        str(path.relative_to(folder))
+        for path in files
+        if not path.name.startswith(".") and path.name not in _NO_MASKS
+    ]
+    if unused:
+        belong = "belongs" if len(unused) == 1 else "belong"
+        logger.warning(
+            "%s %s to no image: masks are called as their images, with .png after or in place of the ending",
+            _told(unused, "file", f" in {folder}"),
+            belong,
+        )
+
+
+def _told(names: list[str], kind: str, place: str = "") -> str:
+    """Some names, and how many there are."""
+    if len(names) == 1:
+        return f"the {kind} {names[0]}{place}"
+    some = ", ".join(names[:_NAMES_TOLD])
+    more = ", …" if len(names) > _NAMES_TOLD else ""
+    return f"{len(names)} {kind}s{place} ({some}{more})"
 
 
 def undistort_mask(

@@ -20,8 +20,8 @@ class Project:
     images: Path | None = None
     """Original images. Default: the folder `images` beside or above the model."""
     masks: Path | None = None
-    """Masks: NAME.png for image NAME with its folders, black = ignored. Of the original images, or with
-    --workspace of the undistorted ones."""
+    """Masks: a.jpg.png or a.png for image a.jpg, with its folders; black = ignored. Of the original images, or
+    with --workspace of the undistorted ones."""
     output: Path | None = None
     """Dense workspace to create. Default: the folder `dense` beside the model's `sparse`."""
     workspace: Path | None = None
@@ -104,7 +104,7 @@ def open_workspace(project: Project) -> Workspace:
     refuse_unfinished(workspace)
     model = load_model(workspace.sparse_dir)
     if project.masks is not None or workspace.masks_dir.is_dir():
-        check_masks(workspace.masks_dir, cameras_of_images(model))
+        check_masks(workspace.masks_dir, cameras_of_images(model), workspace.images_dir)
     return workspace
 
 

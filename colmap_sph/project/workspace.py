@@ -147,6 +147,10 @@ class Workspace:
         """Mask of undistorted image `name`; need not exist."""
         return mask_path(self.masks_dir, name)
 
+    def made_mask_path(self, name: str) -> Path:
+        """Where an undistorted mask of image `name` is written."""
+        return self.root / "masks" / f"{checked_name(name)}.png"
+
     def depth_map_path(self, name: str, kind: MapKind) -> Path:
         """Depth map of image `name`."""
         return self.stereo_dir / "depth_maps" / f"{checked_name(name)}.{kind}.bin"
@@ -177,8 +181,13 @@ class Workspace:
 
 
 def mask_path(folder: Path, name: str) -> Path:
-    """Where COLMAP looks for the mask of image `name` in a folder of masks."""
-    return folder / f"{checked_name(name)}.png"
+    """Where COLMAP finds the mask of image `name` in a folder of masks: ``a.jpg.png``, or else ``a.png``.
+
+    Where there is none, the first of them.
+    """
+    usual = folder / f"{checked_name(name)}.png"
+    other = folder / PurePosixPath(name).with_suffix(".png")
+    return other if PurePosixPath(name).suffix and other.exists() and not usual.exists() else usual
 
 
 def checked_name(name: str) -> str:

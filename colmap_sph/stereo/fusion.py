@@ -45,7 +45,7 @@ class FusionOptions:
     check_num_images: int = 50
     """Overlapping images to look for agreement in; our own looks in no more than 64."""
     mask_path: Path | None = None
-    """Folder of NAME.png masks in undistorted geometry, black = excluded."""
+    """Folder of masks in undistorted geometry, named as those of --masks, black = excluded."""
     max_num_pixels: int = 10000
     """Most pixels to merge into one point (COLMAP's only)."""
     max_traversal_depth: int = 100

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.pipeline.stages.pair_files import read_estimate
-from colmap_sph.project.images import read_grey, read_undistorted
+from colmap_sph.project.images.reading import read_colours, read_grey
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import MapKind, Workspace
@@ -73,7 +73,7 @@ class Demo:
 
     def picture(self, name: str) -> NDArray[np.uint8]:
         """(H, W, 3) red, green, blue."""
-        bgr = read_undistorted(self.workspace.image_path(name), cv2.IMREAD_COLOR)
+        bgr = read_colours(self.workspace.image_path(name))
         return np.ascontiguousarray(bgr[..., ::-1])
 
     def truth(self, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -7,7 +7,7 @@ its digest, and decoded only if that is new.
 import json
 import logging
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,8 @@ from colmap_sph.pipeline.digests import file_digest
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.project.files import atomic_file, make_dir
-from colmap_sph.project.images import image_problem
+from colmap_sph.project.images.depth import ValueSample, sample_values
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.state.records import read_json
 
 if TYPE_CHECKING:
@@ -41,21 +42,29 @@ class ImageFile:
     size: Size
 
 
-def check_image(task: ImageFile) -> Facts:
+@dataclass(frozen=True)
+class ImageFacts(Facts):
+    """What is known of an image: a sample of its values, if it has more than 8 bits."""
+
+    sample: ValueSample | None = None
+
+
+def check_image(task: ImageFile) -> ImageFacts:
     """Decode an image; `InputError` where it is missing, damaged or of another size."""
     problem = image_problem(task.path, *task.size)
     if problem is not None:
         raise InputError(f"{task.path} {problem}")
-    return Facts()
+    return ImageFacts(sample=sample_values(task.path))
 
 
 @dataclass(frozen=True)
 class Known:
-    """Of an image that was found good: its size, the digest of its content, and when that was read."""
+    """Of an image that was found good: its size, the digest of its content, when that was read, and its sample."""
 
     size: Size
     digest: str
     stamp: tuple[int, ...]
+    sample: ValueSample | None = None
 
 
 class CheckStage(Stage[str, ImageFile]):
@@ -110,10 +119,12 @@ class CheckStage(Stage[str, ImageFile]):
         is_read = known is not None and known.stamp == stamp
         digest = known.digest if known is not None and is_read else file_digest(image.path)
         self._seen[item] = Known(image.size, digest, stamp)
-        is_good = known is not None and (known.digest, known.size) == (digest, image.size)
+        facts = None
+        if known is not None and (known.digest, known.size) == (digest, image.size):
+            facts = ImageFacts(sample=known.sample)
         pixels = image.size[0] * image.size[1]
         cost = Cost(_SECONDS * pixels / 1e6, _DECODE_BYTES * pixels, 0.0)
-        return Job(digest, Facts() if is_good else None, cost, image)
+        return Job(digest, facts, cost, image)
 
     def skip(self, item: str, reason: str) -> None:
         """See `Stage.skip`."""
@@ -124,11 +135,19 @@ class CheckStage(Stage[str, ImageFile]):
         """Keep what is known of the good images."""
         if not results:
             raise InputError(f"None of the {len(self.items)} images in {self._where}")
-        good = {name: self._seen[name] for name in results}
+        good = {
+            name: replace(self._seen[name], sample=result.facts.sample)
+            for name, result in results.items()
+            if isinstance(result.facts, ImageFacts)
+        }
         if good != self._known:
             make_dir(self._file.parent)
             with atomic_file(self._file) as file:
                 file.write(json.dumps({name: asdict(known) for name, known in good.items()}, indent=0).encode())
+
+    def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
+        """None: it makes no files."""
+        return 0, 0
 
 
 def _stamp_of(path: Path) -> tuple[int, ...]:

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,7 +16,7 @@ from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
-from colmap_sph.project.images import read_undistorted
+from colmap_sph.project.images.reading import read_whole_grey
 from colmap_sph.scene import View
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
@@ -85,7 +84,7 @@ def _estimate(file: EstimateFile) -> DepthEstimate:
 
 
 def _image(file: EstimateFile) -> NDArray[np.uint8]:
-    return _images.get(file_stamp(file.image), lambda: read_undistorted(file.image, cv2.IMREAD_GRAYSCALE))
+    return _images.get(file_stamp(file.image), lambda: read_whole_grey(file.image))
 
 
 class ConfirmStage(Stage[str, ConfirmTask]):

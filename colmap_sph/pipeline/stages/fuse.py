@@ -36,6 +36,7 @@ from colmap_sph.project.cloud_files import (
 )
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
 from colmap_sph.project.files import scratch_folder
+from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
@@ -194,6 +195,7 @@ class FuseStage(Stage[str, FuseTask]):
             return
         check_places(self.context.workspace)
         begin_cloud(self.context)
+        _warn_of_masks(self.context)
         with scratch_folder(self._scratch):
             yield
 
@@ -248,6 +250,14 @@ def _sources_of(context: "Context", name: str, index: int) -> MapSources:
         maps.digests(),
         maps.record,
     )
+
+
+def _warn_of_masks(context: "Context") -> None:
+    """Report masks that fusion will not use."""
+    folder = context.options.fusion.mask_path
+    if folder is not None:
+        names = [view.name for view in context.scene.views]
+        warn_of_unused_masks(folder, names, context.workspace.images_dir)
 
 
 def _partners_in_fusion(
@@ -306,6 +316,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
                 reason = self.context.report.skipped_images[self._names[0]]
                 raise NoResultError(f"No image could be fused ({reason})")
             begin_cloud(self.context)
+            _warn_of_masks(self.context)
             self._warn_of_memory()
         list_fused_images(self.context, self._sound)
         yield

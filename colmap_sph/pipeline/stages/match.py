@@ -17,7 +17,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import is_pair_there, write_pair
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.images import grey_bytes, read_grey
+from colmap_sph.project.images.reading import grey_bytes, read_grey
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX
 from colmap_sph.project.state.ownership import remove_array_files
@@ -41,7 +41,7 @@ _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …
 _MATCH_BYTES = 44.0
 # … while an image is read and rectified: per pixel of its own, and per left rectified pixel of both.
-_READ_BYTES = 9.0
+_READ_BYTES = 11.0
 _RECTIFIED_BYTES = 10.0
 # Rectified pixels of a large pair per pixel of its images, with a margin for what arrays do not count.
 _RECTIFIED_SHARE = 1.4

@@ -58,6 +58,7 @@ def is_pair_there(path: Path, key: str, left: str, right: str, geometry: Rectifi
     return (
         head is not None
         and (head.kind, head.key, head.texts) == (_PAIR, key, _texts_of(left, right, geometry))
+        and _has_scale(head)
         and head.numbers[2:] == tuple(_numbers_of(geometry))
         and head.arrays == (_codes_type(geometry),)
     )
@@ -112,6 +113,11 @@ def _codes_type(geometry: RectifiedPair) -> ArrayType:
     return np.dtype("<u2"), (geometry.height, geometry.left_width)
 
 
+def _has_scale(head: Head) -> bool:
+    """Whether there are a least disparity and a step above 0."""
+    return len(head.numbers) > 1 and bool(np.isfinite(head.numbers[:2]).all()) and head.numbers[1] > 0
+
+
 def _texts_of(left: str, right: str, geometry: RectifiedPair) -> tuple[str, ...]:
     return left, right, geometry.surface
 
@@ -127,7 +133,7 @@ def _geometry_of(head: Head) -> RectifiedPair:
     """The geometry in the head of a pair's file; `ValueError` where there is none."""
     if len(head.texts) != 3 or head.texts[2] not in get_args(Surface) or len(head.numbers) != 11 + len(_NUMBERS):
         raise ValueError("it does not describe a pair")
-    if not np.isfinite(head.numbers).all() or head.numbers[1] <= 0:
+    if not np.isfinite(head.numbers).all() or not _has_scale(head):
         raise ValueError("it does not describe a pair")
     rotation = np.array(head.numbers[2:11]).reshape(3, 3)
     values: dict[str, float] = dict(zip(_NUMBERS, head.numbers[11:], strict=True))

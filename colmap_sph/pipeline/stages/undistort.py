@@ -12,9 +12,10 @@ from typing import TYPE_CHECKING
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
-from colmap_sph.project.cameras import plain_camera, undistorted_camera
+from colmap_sph.project.cameras import plain_camera
 from colmap_sph.project.files import make_dir, remove, scratch_folder, sync_file, sync_folder, whole_digest
-from colmap_sph.project.images import image_problem
+from colmap_sph.project.images.depth import ValueRange
+from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
 from colmap_sph.project.state.ownership import undistorted_place
 from colmap_sph.project.state.records import altered_files, begin, read_record, vouch, vouched_facts
@@ -44,8 +45,6 @@ class UndistortTask:
     Attributes
     ----------
     image : ImageToUndistort
-    is_changed : bool
-        Whether the undistorted image will differ from the original one.
     target, mask_target : Path
         The undistorted image in the workspace, and its mask.
     record : Path
@@ -53,7 +52,6 @@ class UndistortTask:
     """
 
     image: ImageToUndistort
-    is_changed: bool
     target: Path
     mask_target: Path
     record: Path
@@ -65,7 +63,7 @@ def make_undistorted_image(task: UndistortTask) -> Facts:
     image = task.image
     make_dir(image.mask_folder)
     try:
-        if task.is_changed:
+        if image.is_colmaps:
             _child(image.folder.parent).call(undistort, image, str(task.target))
         else:
             undistort(image)
@@ -120,15 +118,24 @@ class UndistortStage(Stage[str, UndistortTask]):
     originals : Originals
     digests : mapping of str to str
         Digest of the content of each original image that is good.
+    values : mapping of str to ValueRange
+        What becomes black and white, of each of them that has more than 8 bits.
     """
 
     name = "undistort"
     make = staticmethod(make_undistorted_image)
 
-    def __init__(self, context: "Context", originals: Originals, digests: Mapping[str, str]) -> None:
+    def __init__(
+        self,
+        context: "Context",
+        originals: Originals,
+        digests: Mapping[str, str],
+        values: Mapping[str, ValueRange],
+    ) -> None:
         super().__init__(context, sorted(digests))
         self._originals = originals
         self._digests = digests
+        self._values = values
         self._cameras = cameras_of_images(originals.model)
         self._numbers = {name: number for number, name in enumerate(self.items)}
 
@@ -138,22 +145,22 @@ class UndistortStage(Stage[str, UndistortTask]):
         workspace = context.workspace
         options = context.options.undistortion
         camera = plain_camera(self._cameras[item])
+        values = self._values.get(item)
         mask = self._originals.mask_of(item)
         # Of its own for each image, as its name may be another's without the folders.
         scratch = workspace.undistortion_scratch_dir / str(self._numbers[item])
         image = ImageToUndistort(
-            self._originals.image_path(item), mask, camera, options, scratch, scratch / "masks"
+            self._originals.image_path(item), values, mask, camera, options, scratch, scratch / "masks"
         )
         camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params))
-        key = context.keys.undistorted(self._digests[item], camera_parts, mask)
+        key = context.keys.undistorted(self._digests[item], camera_parts, values, mask)
         target = workspace.image_path(item)
         record = undistorted_place(workspace, item).record
-        files = [target] if mask is None else [target, workspace.mask_path(item)]
+        files = [target] if mask is None else [target, workspace.made_mask_path(item)]
         task = UndistortTask(
             image,
-            undistorted_camera(camera, options.for_colmap()) is not None,
             target,
-            workspace.mask_path(item),
+            workspace.made_mask_path(item),
             record,
             key,
         )
@@ -168,7 +175,7 @@ class UndistortStage(Stage[str, UndistortTask]):
         is_made = record is not None and (record.key, record.state) == (task.key, "done")
         if not is_made or not all(path.is_file() for path in files):
             return False
-        camera = undistorted_camera(task.image.camera, task.image.options.for_colmap()) or task.image.camera
+        camera = task.image.undistorted_camera
         return image_problem(task.target, camera.width, camera.height) is None
 
     @contextmanager

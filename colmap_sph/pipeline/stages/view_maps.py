@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import DamageError, InputError
-from colmap_sph.project.images import read_undistorted
+from colmap_sph.project.images.reading import read_colours
 from colmap_sph.project.map_files import check_map, find_flaw, read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.state.records import invalidate
@@ -55,7 +54,7 @@ def read_view_maps(sources: MapSources) -> ViewMaps:
     """
     view = sources.view
     depth, normals = read_sound_maps(sources)
-    image = read_undistorted(sources.image, cv2.IMREAD_COLOR)
+    image = read_colours(sources.image)
     shape = (view.height, view.width)
     if image.shape[:2] != shape:
         raise InputError(f"The image {sources.image} is not of its camera's {shape[1]} x {shape[0]} pixels.")

@@ -38,6 +38,7 @@ _LENGTH = struct.Struct("<H")
 _ARRAY = struct.Struct("<B3I")
 _TYPES = tuple(np.dtype(name) for name in ("<u1", "<u2", "<f4"))
 _MAX_HEAD = 1 << 15
+_READ_BYTES = 1 << 17
 
 ArrayType = tuple[np.dtype[Any], tuple[int, ...]]
 """Type of the elements, and up to three sizes."""
@@ -160,6 +161,20 @@ def read_head(path: Path) -> Head | None:
             return _read_head(file)
     except (OSError, ValueError):
         return None
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file is one of ours, and every byte as it was written; reads it piece by piece."""
+    try:
+        with open_regular(path, follow=False) as file:
+            head = _read_head(file)
+            file.seek(head.size)
+            state = xxhash.xxh3_128()
+            while block := file.read(_READ_BYTES):
+                state.update(block)
+            return state.digest() == head.digest
+    except (OSError, ValueError):
+        return False
 
 
 def is_array_file(path: Path) -> bool:

@@ -13,7 +13,7 @@ from typing import get_args
 from colmap_sph.errors import InputError
 from colmap_sph.project.cloud_files import remove_local_workspace
 from colmap_sph.project.files import remove, set_aside, whole_digest
-from colmap_sph.project.state.array_file import OLD_SUFFIX, SUFFIX, is_array_file, read_arrays, read_head
+from colmap_sph.project.state.array_file import OLD_SUFFIX, SUFFIX, is_array_file, is_whole
 from colmap_sph.project.state.records import (
     altered_files,
     begin,
@@ -60,7 +60,7 @@ def fusion_cfg_place(workspace: Workspace) -> Place:
 
 def undistorted_place(workspace: Workspace, name: str) -> Place:
     """An undistorted image, and its mask where it has one."""
-    files = (workspace.image_path(name), workspace.mask_path(name))
+    files = (workspace.image_path(name), workspace.made_mask_path(name))
     return Place(workspace.records_dir / f"{name}{_UNDISTORTED}", files)
 
 
@@ -247,29 +247,22 @@ def damaged_files(result: Place | Path) -> list[Path]:
         A file that is damaged cannot be removed, or its record not be written.
     """
     if isinstance(result, Path):
-        return [result] if _is_damaged_array(result) else []
+        if is_whole(result):
+            return []
+        remove(result)
+        return [result]
     known = read_record(result.record)
     if known is None or known.state != "done":
         return []
     # What is missing is made again without more ado.
     there = [(path, digest) for path, digest in zip(result.files, known.digests, strict=False) if path.exists()]
-    damaged = [path for path, digest in there if not _is_whole(path, digest)]
+    damaged = [path for path, digest in there if not _has_digest(path, digest)]
     if damaged:
         invalidate(result.record, "doubtful")
     return damaged
 
 
-def _is_whole(path: Path, digest: str) -> bool:
+def _has_digest(path: Path, digest: str) -> bool:
     with suppress(InputError):  # the disk cannot read it
         return whole_digest(path) == digest
     return False
-
-
-def _is_damaged_array(path: Path) -> bool:
-    head = read_head(path)
-    with suppress(InputError):
-        if head is not None:
-            read_arrays(path, head.kind, lambda head: head.arrays)
-            return False
-    remove(path)
-    return True

@@ -8,7 +8,10 @@ import pycolmap
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import undistorted_camera
 from colmap_sph.project.colmap_library import quiet_colmap
-from colmap_sph.project.images import image_problem
+from colmap_sph.project.images.depth import ValueRange
+from colmap_sph.project.images.orientation import copy_without_orientation
+from colmap_sph.project.images.reading import image_problem
+from colmap_sph.project.images.undistorting import undistort_deep, write_undistorted
 from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.undistortion.options import UndistortionOptions
 
@@ -21,10 +24,12 @@ class ImageToUndistort:
     ----------
     source : Path
         Original image, which is whole and of its camera's size.
+    values : ValueRange or None
+        What becomes black and white, of an image of more than 8 bits.
     mask : Path or None
         Its mask, if there is one.
     camera : pycolmap.Camera
-        Of the original image.
+        Of the original image; see `cameras.plain_camera`.
     options : UndistortionOptions
     folder : Path
         Where the undistorted image is written, under the name of `source` without its folders.
@@ -33,6 +38,7 @@ class ImageToUndistort:
     """
 
     source: Path
+    values: ValueRange | None
     mask: Path | None
     camera: pycolmap.Camera
     options: UndistortionOptions
@@ -49,32 +55,46 @@ class ImageToUndistort:
         """Its mask."""
         return self.mask_folder / f"{self.source.name}.png"
 
+    @property
+    def undistorted_camera(self) -> pycolmap.Camera:
+        """Camera of the undistorted image."""
+        return undistorted_camera(self.camera, self.options.for_colmap()) or self.camera
+
+    @property
+    def is_colmaps(self) -> bool:
+        """Whether COLMAP reads, undistorts and writes it: not where it is only copied, or has more than 8 bits."""
+        return self.values is None and undistorted_camera(self.camera, self.options.for_colmap()) is not None
+
 
 def undistort(task: ImageToUndistort) -> None:
-    """Undistort an image and its mask, both by COLMAP.
+    """Undistort an image and its mask.
 
     Raises
     ------
     InputError
-        COLMAP cannot read the image or write the result, or the mask does not fit.
+        The image cannot be read, or the mask does not fit.
+    OutputError
+        A file cannot be written.
     """
-    camera = undistorted_camera(task.camera, task.options.for_colmap())
-    if camera is None:
-        task.image_path.write_bytes(task.source.read_bytes())
+    options = task.options.for_colmap()
+    camera = task.undistorted_camera
+    if task.values is not None:
+        undistort_deep(task.source, task.camera, options, task.image_path, task.values)
+    elif task.is_colmaps:
+        _undistort_by_colmap(task)
     else:
-        with quiet_colmap():
-            _undistort(task)
-        problem = image_problem(task.image_path, camera.width, camera.height)
-        if problem:
-            raise InputError(f"{task.source} could not be undistorted: the result {problem}.")
+        copy_without_orientation(task.source, task.image_path)
+    problem = image_problem(task.image_path, camera.width, camera.height)
+    if problem is not None:
+        raise InputError(f"{task.source} could not be undistorted: the result {problem}.")
     if task.mask is not None:
-        undistort_mask(task.mask, task.camera, task.options.for_colmap(), task.mask_path)
+        undistort_mask(task.mask, task.camera, options, task.mask_path)
 
 
-def _undistort(task: ImageToUndistort) -> None:
-    original = pycolmap.Bitmap.read(task.source, as_rgb=True)
-    if original is None:
-        raise InputError(f"COLMAP cannot read {task.source}; convert it to JPEG or PNG.")
-    image, _ = pycolmap.undistort_image(task.options.for_colmap(), original, task.camera)
-    if not image.write(task.image_path):
-        raise InputError(f"COLMAP cannot write an image called {task.source.name}; rename it in the model, too.")
+def _undistort_by_colmap(task: ImageToUndistort) -> None:
+    with quiet_colmap():
+        original = pycolmap.Bitmap.read(task.source, as_rgb=True)
+        if original is None:
+            raise InputError(f"COLMAP cannot read {task.source}; convert it to JPEG or PNG.")
+        image, _ = pycolmap.undistort_image(task.options.for_colmap(), original, task.camera)
+        write_undistorted(image, task.source, task.image_path)

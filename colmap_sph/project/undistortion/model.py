@@ -134,9 +134,9 @@ def _load_written_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a model that COLMAP has just written, without noticing whether the disk took it."""
     try:
         return load_model(folder)
-    except InputError:
+    except InputError as error:
         raise_if_disk_is_full(folder)
-        raise
+        raise OutputError(f"The model written to {folder} is not whole; check space and permissions.") from error
 
 
 def raise_if_disk_is_full(folder: Path) -> None:

@@ -1,0 +1,203 @@
+"""Image files → pixels as COLMAP sees them: the raster as it is stored, with whatever tag to turn it.
+
+COLMAP reads with OpenImageIO, and takes an image that is damaged without a word. So do we, but for the words.
+JPEG, where OpenImageIO does not pass on what libjpeg warns of, is decoded by libjpeg itself, to the same bytes.
+"""
+
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+from numpy.typing import NDArray
+
+from colmap_sph.project.images import jpeg
+from colmap_sph.project.images.jpeg import DamagedError
+
+# The kinds that COLMAP's library surely reads; it has others, of which some end the process.
+_FORMATS = {"bmp", "dpx", "hdr", "jpeg", "openexr", "png", "pnm", "sgi", "targa", "tiff"}
+_PNG_START = b"\x89PNG\r\n\x1a\n"
+# Its first chunk: length, kind, width, height, bits, kind of colours, compression, filter, interlacing, checksum.
+_PNG_HEADER = struct.Struct(">I4sIIBB3xI")
+_PNG_GREY = (0, 4)
+# COLMAP leaves out the last channel of two or four: transparency.
+_COLOUR_CHANNELS = {1: 1, 2: 1, 3: 3, 4: 3}
+
+# Worker threads decode an image each.
+oiio.attribute("threads", 1)
+oiio.attribute("exr_threads", -1)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What an image file says of itself.
+
+    Attributes
+    ----------
+    width, height : int
+        Of the raster as it is stored.
+    channels : int
+        1 or 3: grey or colours, without transparency.
+    dtype : str
+        "uint8", "uint16", or "float32" for all else, where 0 is black and 1 is white.
+    """
+
+    width: int
+    height: int
+    channels: int
+    dtype: str
+
+    @property
+    def is_deep(self) -> bool:
+        """Whether it has more than 8 bits."""
+        return self.dtype != "uint8"
+
+
+def is_jpeg(path: Path) -> bool:
+    """Whether a file holds a JPEG image, whatever its name."""
+    return _starts_with(path, jpeg.START)
+
+
+def read_header(path: Path) -> Header:
+    """Read what an image file says of itself; nothing is decoded.
+
+    Raises
+    ------
+    DamagedError
+        It is no image that COLMAP reads.
+    OSError
+        It cannot be read.
+    """
+    if is_jpeg(path) and (found := jpeg.jpeg_size(path.read_bytes())) is not None:
+        width, height, space = found
+        return Header(width, height, 1 if space == "Gray" else 3, "uint8")
+    if _starts_with(path, _PNG_START):
+        return _png_header(path)
+    with _opened(path) as image:
+        return _header(image)
+
+
+def read_pixels(path: Path, *, deep: bool = True) -> NDArray[Any]:
+    """Read all pixels of an image.
+
+    Parameters
+    ----------
+    path : Path
+        A regular file, of a size that the caller has compared with what it should be.
+    deep : bool
+        At the depth of the file; otherwise cut to 8 bits, as COLMAP does.
+
+    Returns
+    -------
+    (H, W, 1 or 3) uint8, uint16 or float32 ndarray
+        Grey, or red, green and blue; as `Header.dtype` says.
+
+    Raises
+    ------
+    DamagedError
+        The decoder has something to say.
+    OSError
+        It cannot be read.
+    """
+    if is_jpeg(path):
+        data = path.read_bytes()
+        found = jpeg.jpeg_size(data)
+        if found is not None and found[2] in ("CMYK", "YCCK"):
+            jpeg.decode_jpeg(data, "CMYK")  # for its warnings: COLMAP's way to colours is OpenImageIO's
+        elif found is not None:
+            pixels = jpeg.decode_jpeg(data, "GRAY" if found[2] == "Gray" else "BGR")
+            return pixels[..., ::-1]
+    if _starts_with(path, _PNG_START):
+        _check_png(path.read_bytes())
+    with _opened(path) as image:
+        header = _header(image)
+        pixels = image.read_image(0, 0, 0, header.channels, header.dtype if deep else "uint8")
+        if pixels is None or image.has_error:
+            raise DamagedError(_in_short(image.geterror(), path))
+    return np.asarray(pixels).reshape(header.height, header.width, header.channels)
+
+
+def _starts_with(path: Path, start: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(start)) == start
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    # As COLMAP does.
+    config = oiio.ImageSpec()
+    config.attribute("oiio:reorient", 0)
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    try:
+        image = oiio.ImageInput.open(str(path), config)
+    except (UnicodeError, TypeError):
+        raise DamagedError("its name is not UTF-8") from None
+    if image is None:
+        raise DamagedError(_in_short(oiio.geterror(), path))
+    try:
+        yield image
+    finally:
+        image.close()
+
+
+def _header(image: Any) -> Header:
+    spec = image.spec()
+    if image.format_name() not in _FORMATS:
+        raise DamagedError(f"{image.format_name()} files are not read; convert it to PNG")
+    if spec.deep or spec.depth > 1 or spec.nchannels not in _COLOUR_CHANNELS:
+        raise DamagedError(f"images of {spec.nchannels} channels are not read; convert it to PNG")
+    stored = str(spec.format)
+    dtype = {"uint8": "uint8", "int8": "uint8", "uint16": "uint16"}.get(stored, "float32")
+    return Header(spec.width, spec.height, _COLOUR_CHANNELS[spec.nchannels], dtype)
+
+
+def _in_short(message: str, path: Path) -> str:
+    """The first line of a library's message, without the name of the file."""
+    lines = [line for line in message.replace(f'"{path}"', "").replace(str(path), "").splitlines() if line.strip()]
+    if not lines or "could not find a format reader" in lines[0]:
+        return "no known kind of image"
+    return " ".join(lines[0].split()).rstrip(".")
+
+
+def _png_header(path: Path) -> Header:
+    # Not by libpng, which writes what it finds wrong to the terminal.
+    with path.open("rb") as file:
+        data = file.read(len(_PNG_START) + _PNG_HEADER.size)
+    if len(data) < len(_PNG_START) + _PNG_HEADER.size:
+        raise DamagedError("the file is cut off")
+    length, kind, width, height, bits, colours, crc = _PNG_HEADER.unpack_from(data, len(_PNG_START))
+    if (length, kind) != (13, b"IHDR") or crc != zlib.crc32(data[12:-4]):
+        raise DamagedError("IHDR: CRC error")
+    return Header(width, height, 1 if colours in _PNG_GREY else 3, "uint16" if bits == 16 else "uint8")
+
+
+def _check_png(data: bytes) -> None:
+    """Raise `DamagedError` unless all chunks that matter are whole: libpng stops at the last pixel."""
+    for kind, start, end in png_chunks(data):
+        (crc,) = struct.unpack_from(">I", data, end - 4)
+        if kind[:1].isupper() and zlib.crc32(memoryview(data)[start + 4 : end - 4]) != crc:
+            raise DamagedError(f"{kind.decode('latin-1')}: CRC error")
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """Kind, begin and end of each chunk of a PNG file, length and checksum included.
+
+    Raises
+    ------
+    DamagedError
+        The file is cut off.
+    """
+    kind = b""
+    end = len(_PNG_START)
+    while kind != b"IEND":
+        start = end
+        kind = data[start + 4 : start + 8]
+        end = start + 12 + int.from_bytes(data[start : start + 4], "big")
+        if end > len(data) or len(kind) < 4:
+            raise DamagedError("the file is cut off")
+        yield kind, start, end

@@ -1,0 +1,125 @@
+"""Image files: are they there, whole, and of their camera's size; their grey values and their colours.
+
+What is wrong with a file must be known beforehand: COLMAP's undistortion ends the whole process at an image that
+is not of its camera's size, and turns a damaged one into a half-grey image without a word.
+"""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError, reason_of
+from colmap_sph.project.images import jpeg
+from colmap_sph.project.images.decoding import is_jpeg, read_header, read_pixels
+from colmap_sph.project.images.depth import narrow_range, stretched
+from colmap_sph.project.images.jpeg import DamagedError
+
+# Rows that are floating-point numbers at a time.
+_BAND_ROWS = 256
+# The luma of ITU-R BT.601, which JPEG stores.
+_LUMA = (0.299, 0.587, 0.114)
+
+
+def image_problem(path: Path, width: int, height: int) -> str | None:
+    """Say what is wrong with an image, as the end of a sentence, or return None.
+
+    Parameters
+    ----------
+    path : Path
+        Image file; it is decoded if its header is right.
+    width, height : int
+        Size of its camera in pixels, without regard to any EXIF orientation, which COLMAP ignores too.
+
+    Returns
+    -------
+    str or None
+        Such as ``"is missing"``; None for a good image.
+    """
+    try:
+        if not path.is_file():
+            return "is not a regular file" if path.exists() else "is missing"
+        header = read_header(path)
+        # Before anything is decoded: a small file can hold a huge image.
+        if (header.width, header.height) != (width, height):
+            return f"has {header.width} x {header.height} pixels, but its camera {width} x {height}"
+        read_pixels(path)
+    except OSError as error:
+        return f"cannot be read ({reason_of(error)})"
+    except DamagedError as error:
+        return f"is damaged or no image ({error})"
+    return None
+
+
+def grey_bytes(path: Path) -> int:
+    """Bytes per pixel of what `read_grey` gives."""
+    try:
+        return 1 if is_jpeg(path) else 4
+    except OSError:
+        return 4
+
+
+def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
+    """Read the grey values (0..255) of an undistorted image as exactly as its file holds them.
+
+    Parameters
+    ----------
+    path : Path
+
+    Returns
+    -------
+    (H, W) uint8 or float32 ndarray
+        JPEG stores whole grey values (uint8); those of other formats' colours and depths have fractions. Where an
+        image of more than 8 bits uses a small part of its range only, it is stretched.
+
+    Raises
+    ------
+    InputError
+        It is missing or damaged.
+    """
+    try:
+        if is_jpeg(path) and jpeg.jpeg_size(data := path.read_bytes()) is not None:
+            return jpeg.decode_jpeg(data, "GRAY")[..., 0]
+        pixels = read_pixels(path)
+    except (OSError, DamagedError) as error:
+        raise _unreadable(path, error) from error
+    values = narrow_range(pixels)
+    grey = np.empty(pixels.shape[:2], dtype=np.float32)
+    for first in range(0, len(grey), _BAND_ROWS):
+        rows = slice(first, first + _BAND_ROWS)
+        band = stretched(pixels[rows], values) * np.float32(255)
+        grey[rows] = band[..., 0] if band.shape[2] == 1 else cv2.transform(band, np.array([_LUMA], np.float32))
+    return grey
+
+
+def read_whole_grey(path: Path) -> NDArray[np.uint8]:
+    """The same as `read_grey`, in whole numbers: (H, W) uint8."""
+    grey = read_grey(path)
+    if grey.dtype == np.uint8:
+        return np.asarray(grey, np.uint8)
+    return np.rint(grey).astype(np.uint8)
+
+
+def read_colours(path: Path) -> NDArray[np.uint8]:
+    """Read the colours of an undistorted image: (H, W, 3) uint8, blue, green and red, as COLMAP sees them.
+
+    Raises
+    ------
+    InputError
+        It is missing or damaged.
+    """
+    try:
+        pixels = read_pixels(path, deep=False)
+    except (OSError, DamagedError) as error:
+        raise _unreadable(path, error) from error
+    colours = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
+    colours[:] = pixels[..., ::-1]
+    return colours
+
+
+def _unreadable(path: Path, error: Exception) -> InputError:
+    reason = reason_of(error) if isinstance(error, OSError) else error
+    return InputError(
+        f"{path} cannot be read as an image ({reason}); undistort it again or remove it from the model."
+    )
