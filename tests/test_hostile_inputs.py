@@ -25,14 +25,14 @@ def hostile() -> SimpleNamespace:
 
 
 def test_the_command_holds(tmp_path: Path) -> None:
-    """A case or two of each kind; the script itself takes thousands."""
+    """A case of each kind; the script itself takes thousands."""
     done = subprocess.run(
-        [sys.executable, SCRIPTS / "try_hostile_inputs.py", "--output", tmp_path / "out", "--cases", "15"],
+        [sys.executable, SCRIPTS / "try_hostile_inputs.py", "--output", tmp_path / "out", "--cases", "12"],
         capture_output=True,
         text=True,
         timeout=300,
     )
-    assert "15 cases, 0 failed" in done.stdout, done.stdout + done.stderr
+    assert "12 cases, 0 failed" in done.stdout, done.stdout + done.stderr
     assert done.returncode == 0
 
 

@@ -242,7 +242,7 @@ def _move_inside(dense: Path, change: str) -> tuple[str, ...]:
     elif change == "images inside":
         images = Path(shutil.move(images, dense / "input"))
     else:
-        shutil.copytree(images, dense / "masks")
+        shutil.copytree(images, dense / "masks", dirs_exist_ok=True)
         masks = ["--masks", str(dense / "masks")]
     arguments = ["run", "--model", str(model), "--images", str(images), "--output", str(dense), "--threads", "1"]
     return (*arguments, *masks)
