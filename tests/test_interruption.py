@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import keep_images
+from conftest import SCRIPTS, keep_images
 from projects import render_four_images
 
 from colmap_sph.app import cli
@@ -63,50 +63,78 @@ def wait_for(process: "subprocess.Popen[str]", pattern: str, folder: Path, numbe
 # ---- kills -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.usefixtures("scripts_on_path")
-def test_kills_cost_only_the_work_in_flight(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    script = importlib.import_module("check_interruptions")
-    keep_images(project, NAMES)
-    check = script.Check(project / "out", model=project / "sparse/0", kills=3, seed=3)
-    assert script.main(check) == 0
-    assert "3 kills, 0 files made again or different" in capsys.readouterr().out
-    assert len(maps(project / "out/whole")) == 4 * len(NAMES)
+def test_signals_between_file_operations(tmp_path: Path) -> None:
+    """In three ways to run; the script itself takes 60, and as many errors."""
+    done = subprocess.run(
+        [
+            sys.executable,
+            SCRIPTS / "check_interruptions.py",
+            "--output",
+            tmp_path / "out",
+            "--signals",
+            "3",
+            "--errors",
+            "0",
+        ],
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "3 signals: 3 finished, identical, nothing made again" in done.stdout
+    assert "not reached" not in done.stdout
 
 
 @pytest.mark.usefixtures("scripts_on_path")
-def test_the_check_of_kills_finds_faults(tmp_path: Path) -> None:
+def test_the_check_of_interruptions_finds_faults(tmp_path: Path) -> None:
     """Work that was done again, a map and a cloud that differ, a map that is missing, leftovers."""
     script = importlib.import_module("check_interruptions")
-    for root in ("killed", "whole"):
+    for root in ("disturbed", "whole"):
         for folder in ("depth_maps", "normal_maps"):
             path = tmp_path / root / "stereo" / folder / "cam" / "a.jpg.geometric.bin"
             path.parent.mkdir(parents=True)
             path.write_bytes(b"1")
         for name in ("fused.ply", "fused.ply.vis"):
             (tmp_path / root / name).write_bytes(b"1")
-    killed, whole = tmp_path / "killed", tmp_path / "whole"
-    files = {
-        "pairs/1-2.sph": "pairs",
-        "photometric/cam/a.jpg.sph": "votes",
-        "state/cam/a.jpg.geometric.json": None,
-        "cloud.json": None,
+    disturbed, whole = tmp_path / "disturbed", tmp_path / "whole"
+    for name in ("pairs/1-2", "photometric/cam/a.jpg", "state/cam/a.jpg.geometric.json", "cloud.json"):
+        (disturbed / "colmap_sph" / name).parent.mkdir(parents=True, exist_ok=True)
+        (disturbed / "colmap_sph" / name).write_bytes(b'{"state": "done"}')
+    (disturbed / "colmap_sph/state/b.jpg.geometric.json").write_bytes(b'{"state": "making"}')
+    finished = script.finished_files(disturbed)
+    assert len(finished) == 6
+    assert script.files_made_again(finished) == []
+    assert script.differences(disturbed, whole) == script.leftovers(disturbed) == []
+    os.utime(disturbed / "colmap_sph/pairs/1-2", ns=(5, 5))
+    (disturbed / "stereo/depth_maps/cam/a.jpg.geometric.bin").unlink()
+    assert len(script.files_made_again(finished)) == 2
+    (disturbed / "stereo/normal_maps/cam/a.jpg.geometric.bin").write_bytes(b"2")
+    (disturbed / "fused.ply.vis").write_bytes(b"2")
+    assert script.differences(disturbed, whole)[0].startswith("3 results differ")
+    (disturbed / "stereo/.1-2.tmp").touch()
+    (disturbed / "colmap_sph/fusion").mkdir()
+    assert script.leftovers(disturbed) == ["left behind: 1 .tmp, 1 fusion"]
+
+
+def test_stages_of_file_operations(scripts_on_path: None) -> None:
+    script = importlib.import_module("check_interruptions")
+    operation = script.Operation
+    operations = [
+        operation("write", "/colmap_sph/undistorting/images/a.jpg"),
+        operation("rename", "/images"),
+        operation("open", "/sparse/images.bin"),
+        operation("read", "/colmap_sph/pairs/1-2"),
+        operation("write", "/colmap_sph/pairs/.7.tmp"),
+        operation("write", "/colmap_sph/photometric/.7.tmp"),
+        operation("rename", "/fused.ply"),
+    ]
+    assert script.stages_of(operations) == {
+        "undistortion": [0, 1, 2, 3],
+        "publishing": [1, 2],
+        "matching": [4],
+        "depth": [5],
+        "fusion": [6],
     }
-    for name in files:
-        (killed / "colmap_sph" / name).parent.mkdir(parents=True, exist_ok=True)
-        (killed / "colmap_sph" / name).write_bytes(b'{"state": "done"}')
-    finished = script.finished_files(killed)
-    kill = script.judge(1.0, finished, killed, whole)
-    assert kill.finished == {"pairs": 1, "votes": 1, "maps": 2, "cloud": 2}
-    assert (kill.remade, kill.different) == (0, 0)
-    os.utime(killed / "colmap_sph/pairs/1-2.sph", ns=(5, 5))
-    (killed / "stereo/normal_maps/cam/a.jpg.geometric.bin").write_bytes(b"2")
-    (killed / "stereo/depth_maps/cam/a.jpg.geometric.bin").unlink()
-    (killed / "stereo/.1-2.tmp").touch()
-    (killed / "colmap_sph/fusion").mkdir()
-    (killed / "fused.ply.vis").write_bytes(b"2")
-    kill = script.judge(1.0, finished, killed, whole)
-    assert kill.remade == 4
-    assert kill.different == 5
 
 
 # ---- signals -----------------------------------------------------------------------------------------------
