@@ -191,7 +191,7 @@ def disturb(check: Check, ways: list[Way], output: Path) -> Iterator[Disturbance
 def stages_of(operations: list[Operation]) -> dict[str, list[int]]:
     """Places of the operations of each stage; publishing are those next to a renaming before matching."""
     starts = [
-        _first(operations, *marks) for marks in (("/pairs/",), ("/photometric/",), ("fused.ply", "/fusion/"))
+        _first(operations, *marks) for marks in (("/pairs/",), ("/photometric/",), ("fused.ply", "/.fusion.tmp/"))
     ]
     bounds = [0, *starts, len(operations)]
     names = ("undistortion", "matching", "depth", "fusion")
@@ -289,7 +289,9 @@ def files_made_again(finished: dict[Path, int]) -> list[Path]:
 def leftovers(workspace: Path) -> list[str]:
     """What a run that was ended has left behind, and the one after it has not removed; in one sentence if any."""
     found = [path for path in workspace.rglob("*") if path.name.endswith(".tmp")]
-    found += [path for name in ("fusion", "undistorting") for path in workspace.glob(f"colmap_sph/{name}")]
+    found += [
+        path for name in (".fusion.tmp", ".undistorting.tmp") for path in workspace.glob(f"colmap_sph/{name}")
+    ]
     kinds = Counter(path.suffix or path.name for path in found)
     return [f"left behind: {', '.join(f'{number} {kind}' for kind, number in kinds.items())}"] if found else []
 

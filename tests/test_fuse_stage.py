@@ -98,7 +98,7 @@ def test_the_cloud_is_the_plane(workspace):
     assert cloud["rgb"].std() > 20
     assert report.made["fuse"] == 1
     assert report.seconds["fuse"] > 0
-    assert not (workspace.state_dir / "fusion").exists()
+    assert not (workspace.fusion_scratch_dir).exists()
     assert fuse(workspace).made["fuse"] == 0
 
 
@@ -415,7 +415,7 @@ def test_all_images_fail(workspace):
     with pytest.raises(NoResultError, match=r"No image could be fused \(.*a\.png.*cannot be read"):
         fuse(workspace)
     assert not workspace.fused_path.exists()
-    assert not (workspace.state_dir / "fusion").exists()
+    assert not (workspace.fusion_scratch_dir).exists()
 
 
 def test_no_point(workspace):

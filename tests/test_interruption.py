@@ -112,7 +112,7 @@ def test_the_check_of_interruptions_finds_faults(tmp_path: Path) -> None:
     (disturbed / "fused.ply.vis").write_bytes(b"2")
     assert script.differences(disturbed, whole)[0].startswith("3 results differ")
     (disturbed / "stereo/.1-2.tmp").touch()
-    (disturbed / "colmap_sph/fusion").mkdir()
+    (disturbed / "colmap_sph/.fusion.tmp").mkdir()
     assert script.leftovers(disturbed) == ["left behind: 1 .tmp, 1 fusion"]
 
 
@@ -120,7 +120,7 @@ def test_stages_of_file_operations(scripts_on_path: None) -> None:
     script = importlib.import_module("check_interruptions")
     operation = script.Operation
     operations = [
-        operation("write", "/colmap_sph/undistorting/images/a.jpg"),
+        operation("write", "/colmap_sph/.undistorting.tmp/images/a.jpg"),
         operation("rename", "/images"),
         operation("open", "/sparse/images.bin"),
         operation("read", "/colmap_sph/pairs/1-2"),

@@ -63,7 +63,7 @@ WRITTEN = [
     "colmap_sph/pairs",
     "colmap_sph/photometric",
     "colmap_sph/state",
-    "colmap_sph/fusion",
+    "colmap_sph/.fusion.tmp",
     "colmap_sph/undistorting",
     "colmap_sph/local",
     "stereo",
@@ -112,7 +112,7 @@ def test_links_inside_of_the_workspace(made: Path, root: Path) -> None:
     dense = root / "dense"
     (dense / "stereo/depth_maps").rename(dense / "depth")
     (dense / "stereo/depth_maps").symlink_to("../depth")
-    for folder in ("local", "fusion"):
+    for folder in ("local", ".fusion.tmp"):
         (dense / "colmap_sph" / folder).mkdir(exist_ok=True)
         (dense / "colmap_sph" / folder / "images").symlink_to(root / "images")
     (root / "alias").symlink_to(dense)

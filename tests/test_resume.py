@@ -511,16 +511,16 @@ def test_leftovers_of_killed_runs_are_removed(finished: Finished) -> None:
         finished.dense / "stereo/depth_maps/.123-4567.tmp",
         finished.dense / "colmap_sph/.99-1.tmp",
         finished.dense / "colmap_sph/pairs/.99-140001.tmp",
-        finished.dense / "colmap_sph/fusion/fused.ply",
+        finished.dense / "colmap_sph/.fusion.tmp/fused.ply",
     ]
     mine = [finished.dense / "stereo/.mine.tmp", finished.dense / "stereo/depth_maps/1-2.tmp"]
-    (finished.dense / "colmap_sph/fusion").mkdir()
+    (finished.dense / "colmap_sph/.fusion.tmp").mkdir()
     for path in [*leftovers, *mine]:
         path.write_bytes(b"half")
     assert finished.rerun().made == NOTHING
     assert not any(path.exists() for path in leftovers)
     assert all(path.exists() for path in mine)
-    assert not (finished.dense / "colmap_sph/fusion").exists()
+    assert not (finished.dense / "colmap_sph/.fusion.tmp").exists()
 
 
 def test_two_runs_in_one_workspace(finished: Finished) -> None:

@@ -92,7 +92,7 @@ class Workspace:
     @property
     def undistortion_scratch_dir(self) -> Path:
         """While images are undistorted: what there is of the workspace so far."""
-        return self.state_dir / "undistorting"
+        return self.state_dir / ".undistorting.tmp"
 
     @property
     def pairs_dir(self) -> Path:
@@ -122,7 +122,7 @@ class Workspace:
     @property
     def fusion_scratch_dir(self) -> Path:
         """While maps are fused: parts of the cloud."""
-        return self.state_dir / "fusion"
+        return self.state_dir / ".fusion.tmp"
 
     @property
     def local_dir(self) -> Path:

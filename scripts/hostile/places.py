@@ -27,7 +27,7 @@ _PLACES = (
         "colmap_sph/undistortion.json",
         "colmap_sph/undistorting",
     ),
-    *("colmap_sph/fusion", "colmap_sph/local", "fused.ply", "fused.ply.vis", "stereo/patch-match.cfg"),
+    *("colmap_sph/.fusion.tmp", "colmap_sph/local", "fused.ply", "fused.ply.vis", "stereo/patch-match.cfg"),
     *("stereo/fusion.cfg", "sparse/images.bin", "sparse/cameras.bin", "sparse/points3D.bin", "sparse/rigs.bin"),
     *(
         "images/N_0_1.png",

@@ -61,6 +61,11 @@ class Marker:
         return bool(self.images) or self.version == 1
 
 
+def _old_scratch(workspace: Workspace) -> Path:
+    """Where earlier versions undistorted."""
+    return workspace.state_dir / "undistorting"
+
+
 @dataclass(frozen=True)
 class _OldMarker:
     """What is needed of a marker of version 1, whose `images` is a digest."""
@@ -73,7 +78,7 @@ class _OldMarker:
 def read_marker(workspace: Workspace) -> Marker | None:
     """Return the marker, or None where there is no readable one."""
     # Earlier versions had it in the scratch folder until all was in its place.
-    for path in (workspace.marker_path, workspace.undistortion_scratch_dir / workspace.marker_path.name):
+    for path in (workspace.marker_path, _old_scratch(workspace) / workspace.marker_path.name):
         marker = read_json(path, Marker, max_bytes=_MAX_BYTES)
         if marker is not None and marker.version == _VERSION:
             return marker
@@ -137,10 +142,10 @@ def refuse_unfinished(workspace: Workspace) -> None:
 def adopt(workspace: Workspace, marker: Marker) -> Marker:
     """Make the marker of an earlier version one of this, which names the model's files; return it.
 
-    COLMAP's scripts are removed.
+    COLMAP's scripts are removed, and what that version was undistorting.
     """
-    for name in _SCRIPTS:
-        remove(workspace.root / name)
+    for path in (*(workspace.root / name for name in _SCRIPTS), _old_scratch(workspace)):
+        remove(path)
     names = tuple(names_in_model(workspace))
     marker = replace(marker, images=names, files=_digests(workspace.sparse_dir), version=_VERSION)
     write_marker(workspace, marker)
