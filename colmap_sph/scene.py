@@ -5,6 +5,7 @@ a test or a renderer. Frames are COLMAP's: x right, y down, z forward, ``x_cam =
 the first pixel's centre is at (0.5, 0.5).
 """
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -40,6 +41,9 @@ class View:
         World to camera: ``x_cam = R x_world + t``; `t` in model units.
     point_indices : (n,) int64 ndarray
         Rows of `Scene.points` which this view observes, ascending, each once.
+    reprojection_error : float
+        Median distance in pixels between where the view observes sparse points, as the model says, and where they
+        project; NaN where that is not known.
     """
 
     image_id: int
@@ -50,6 +54,7 @@ class View:
     R: NDArray[np.float64]
     t: NDArray[np.float64]
     point_indices: NDArray[np.int64]
+    reprojection_error: float = math.nan
 
     @property
     def num_pixels(self) -> int:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from exact_maps import HEIGHT, NAMES, WIDTH, make_workspace
 from projects import FOUR_NAMES, read_picture, render_four_images
@@ -16,7 +17,7 @@ from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import RunReport
-from colmap_sph.pipeline.self_check import judge_agreement, refuse_disagreement
+from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, refuse_disagreement
 from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.scene_reader import read_scene
@@ -211,3 +212,21 @@ def test_one_wrong_image_is_named(project):
     report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
     assert wrong in report.doubts
     assert not any(name in report.doubts for name in FOUR_NAMES if name != wrong)
+
+
+def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):
+    """All focal lengths are wrong by a third: the maps may agree with each other all the same."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for camera in model.cameras.values():
+        camera.params = [0.7 * camera.params[0], 0.7 * camera.params[1], *camera.params[2:]]
+    wrong = project / "wrong"
+    wrong.mkdir()
+    model.write_binary(wrong)
+    report = RunReport()
+    judge_reprojection(report, read_scene(wrong))
+    assert all(name in report.doubts for name in FOUR_NAMES)
+    sound = RunReport()
+    scene = read_scene(project / "sparse/0")
+    assert max(view.reprojection_error for view in scene.views) < 1
+    judge_reprojection(sound, scene)
+    assert sound.doubts == ""

@@ -22,7 +22,7 @@ from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.self_check import judge_agreement, refuse_disagreement
+from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, refuse_disagreement
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
@@ -196,6 +196,7 @@ def reconstruct(
             report.pair_source = selection.source
             progress.advance()
         scene = wanted_scene(scene, selection)
+        judge_reprojection(report, scene)
         context = replace(context, scene=scene)
         take_places(context.places, overwrite=overwrite)
         if verify:

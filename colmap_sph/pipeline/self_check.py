@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Agreement
+from colmap_sph.scene import Scene
 
 logger = logging.getLogger(__name__)
 
@@ -18,6 +19,9 @@ _REFUSED_SHARE = 0.1
 _RIGHT_SHARE_OF_FOUND = 0.5
 # Fewer points say nothing of a run.
 _FEWEST = 30
+# Sparse points lie a pixel or so from their observations, be they ever so roughly adjusted.
+_FAR_PIXELS = 4.0
+_FAR_SHARE = 0.01
 _MAX_NAMED = 10
 
 
@@ -37,8 +41,34 @@ def judge_agreement(report: RunReport) -> None:
     elif total.tested >= _FEWEST and total.agreeing < _REFUSED_SHARE * total.tested:
         report.refusal = _refusal(total)
     elif doubted:
-        report.doubts = _doubts(doubted)
-        logger.warning("%s", report.doubts)
+        words = _doubts(doubted)
+        report.doubts = f"{report.doubts} {words}".strip()
+        logger.warning("%s", words)
+
+
+def judge_reprojection(report: RunReport, scene: Scene) -> None:
+    """Warn of images whose sparse points do not project to where the model says that they observe them.
+
+    Parameters
+    ----------
+    report : RunReport
+        Gets the doubts.
+    scene : Scene
+    """
+    far = {
+        view.name: view.reprojection_error
+        for view in scene.views
+        if view.reprojection_error > max(_FAR_PIXELS, _FAR_SHARE * max(view.width, view.height))
+    }
+    if far:
+        shown = [f"{name} ({error:.0f} px)" for name, error in sorted(far.items(), key=lambda item: -item[1])]
+        words = (
+            f"Sparse points do not project to where these images observe them: {_named(shown)}. Cameras, poses or "
+            "points of the model were changed apart from one another, and depth is wrong where cameras or poses are; "
+            "or the model's image coordinates are those of images of another size."
+        )
+        report.doubts = words
+        logger.warning("%s", words)
 
 
 def refuse_disagreement(report: RunReport) -> None:
@@ -62,10 +92,13 @@ def _refusal(total: Agreement) -> str:
 
 def _doubts(doubted: Mapping[str, float]) -> str:
     shares = sorted((share, name) for name, share in doubted.items())
-    named = ", ".join(f"{name} ({share:.0%})" for share, name in shares[:_MAX_NAMED])
-    if len(shares) > _MAX_NAMED:
-        named += f" and {len(shares) - _MAX_NAMED} more"
+    named = _named([f"{name} ({share:.0%})" for share, name in shares])
     return (
         f"Few of the sparse points that these images observe agree with their depth maps: {named}. Their poses, "
         "cameras or pixels may not be those of the model, or they could hardly be matched."
     )
+
+
+def _named(names: list[str]) -> str:
+    more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
+    return ", ".join(names[:_MAX_NAMED]) + more

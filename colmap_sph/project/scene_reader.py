@@ -1,6 +1,8 @@
 """COLMAP sparse model → frozen `Scene` of pinhole `View`s and sparse points; those whose images are good."""
 
 import logging
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +48,8 @@ def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
     if origin.any():
         logger.info("%s is in map coordinates; worked on relative to %s", sparse_dir, tuple(origin.tolist()))
     points, row_of = _read_points(model)
-    views = [_read_view(model, image_id, row_of, sparse_dir, origin) for image_id in model.reg_image_ids()]
+    points -= origin
+    views = [_read_view(model, i, points, row_of, sparse_dir, origin) for i in model.reg_image_ids()]
     usable = [view for view in views if _is_possible(view)]
     for view in views:
         if not _is_possible(view):
@@ -54,7 +57,7 @@ def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
     if not usable:
         raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
     views_by_name = tuple(sorted(usable, key=lambda view: view.name))
-    return Scene(views_by_name, points - origin, origin, image_ids=tuple(model.reg_image_ids()))
+    return Scene(views_by_name, points, origin, image_ids=tuple(model.reg_image_ids()))
 
 
 def _read_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], dict[int, int]]:
@@ -71,6 +74,7 @@ def _read_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], d
 def _read_view(
     model: pycolmap.Reconstruction,
     image_id: int,
+    points: NDArray[np.float64],
     row_of: dict[int, int],
     sparse_dir: Path,
     origin: NDArray[np.float64],
@@ -85,9 +89,9 @@ def _read_view(
     pose = np.array(image.cam_from_world().matrix(), dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):  # an impossible pose is told later
         translation = pose[:, 3] + pose[:, :3] @ origin
-    points2D = image.points2D
-    rows = {row_of.get(points2D[i].point3D_id, -1) for i in image.get_observation_point2D_idxs()} - {-1}
-    return View(
+    points2D = [image.points2D[i] for i in image.get_observation_point2D_idxs()]
+    rows = np.array([row_of.get(point.point3D_id, -1) for point in points2D], dtype=np.int64)
+    view = View(
         image_id=image_id,
         name=image.name,
         width=camera.width,
@@ -95,8 +99,20 @@ def _read_view(
         K=np.array(camera.calibration_matrix(), dtype=np.float64),
         R=np.ascontiguousarray(pose[:, :3]),
         t=translation,
-        point_indices=np.array(sorted(rows), dtype=np.int64),
+        point_indices=np.unique(rows[rows >= 0]),
     )
+    observed = np.array([point.xy for point in points2D]).reshape(-1, 2)[rows >= 0]
+    error = _reprojection_error(view, observed, points[rows[rows >= 0]])
+    return replace(view, reprojection_error=error)
+
+
+def _reprojection_error(view: View, observed: NDArray[np.float64], points: NDArray[np.float64]) -> float:
+    """Median distance in pixels between (n, 2) observed image coordinates and (n, 3) points; NaN without any."""
+    with np.errstate(all="ignore"):  # an impossible pose is told later
+        projected, _ = view.project(points)
+        distance = np.linalg.norm(projected - observed, axis=1)
+    known = distance[np.isfinite(distance)]
+    return float(np.median(known)) if len(known) else math.nan
 
 
 def _is_possible(view: View) -> bool:
