@@ -64,7 +64,7 @@ def judge_reprojection(report: RunReport, scene: Scene) -> None:
         shown = [f"{name} ({error:.0f} px)" for name, error in sorted(far.items(), key=lambda item: -item[1])]
         words = (
             f"Sparse points do not project to where these images observe them: {_named(shown)}. Cameras, poses or "
-            "points of the model were changed apart from one another, and depth is wrong where cameras or poses are; "
+            "points of the model were changed apart from each other, and depth is wrong where cameras or poses are; "
             "or the model's image coordinates are those of images of another size."
         )
         report.doubts = words
