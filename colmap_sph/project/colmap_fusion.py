@@ -119,7 +119,7 @@ def _check_written(made: Workspace, num_points: int) -> None:
 
 
 def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
-    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, which are whole, as their maps."""
+    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, whole, and whole maps of it."""
     try:
         names = workspace.fusion_cfg_path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
