@@ -334,7 +334,7 @@ def noisy_maps(seed):
     ],
     ids=["default", "narrow", "wide"],
 )
-@pytest.mark.parametrize(("seed", "stations"), [(0, None), (1, None), (1, [0, 1, 1]), (1, [1, 1, 2])])
+@pytest.mark.parametrize(("seed", "stations"), [(0, None), (1, None), (1, [0, 1, 2]), (1, [1, 1, 2])])
 def test_fusion_is_the_oracles(seed, stations, options):
     maps = noisy_maps(seed)
     num_found = 0

@@ -136,7 +136,7 @@ def _check_written(made: Workspace, num_points: int) -> None:
 
 
 def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
-    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, whole as their maps."""
+    """Return the model; `InputError` unless it has every image of ``fusion.cfg``, whole, and whole maps of it."""
     names = read_lines(workspace.fusion_cfg_path, "list the images in it")
     model = load_model(workspace.sparse_dir)
     cameras = cameras_of_images(model)

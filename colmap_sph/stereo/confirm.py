@@ -151,7 +151,9 @@ def _compare(
 
 def _add_as_one(station: _Sums, sums: _Sums) -> None:
     """Add what the views of one station say as if it were one: what most of them say, with their mean weight."""
-    agrees = 2 * station.agreeing.astype(np.int16) > station.observing
+    # Of two, one is enough: where one of them is wrongly placed, the other has its say.
+    one_of_two = (station.agreeing > 0) & (station.observing == 2)
+    agrees = one_of_two | (2 * station.agreeing.astype(np.int16) > station.observing)
     contradicts = station.contradicting > station.agreeing
     for verdict, counts in (
         (station.observing > 0, sums.observing),
