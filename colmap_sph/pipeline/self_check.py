@@ -15,8 +15,9 @@ logger = logging.getLogger(__name__)
 _DOUBTED_SHARE = 0.15
 # ... and all of them below this one.
 _REFUSED_SHARE = 0.1
-# Where so large a share of the points with a depth agrees, it may also be that hardly any was matched.
+# Where so large a share of the points with a depth agrees, and of all, hardly any was matched, but what was is right.
 _RIGHT_SHARE_OF_FOUND = 0.5
+_LEAST_SHARE = 0.05
 # Fewer points say nothing of a run.
 _FEWEST = 30
 # Sparse points lie a pixel or so from their observations, be they ever so roughly adjusted.
@@ -39,11 +40,13 @@ def judge_agreement(report: RunReport) -> None:
     if not total.tested:
         logger.info("There are no sparse points to check the depth maps against")
     elif total.tested >= _FEWEST and total.agreeing < _REFUSED_SHARE * total.tested:
-        report.refusal = _refusal(total)
+        is_right = total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found
+        if is_right and total.agreeing >= _LEAST_SHARE * total.tested:
+            _doubt(report, _hardly_matched(total))
+        else:
+            report.refusal = _refusal(total)
     elif doubted:
-        words = _doubts(doubted)
-        report.doubts = f"{report.doubts} {words}".strip()
-        logger.warning("%s", words)
+        _doubt(report, _doubts(doubted))
 
 
 def judge_reprojection(report: RunReport, scene: Scene) -> None:
@@ -64,11 +67,10 @@ def judge_reprojection(report: RunReport, scene: Scene) -> None:
         shown = [f"{name} ({error:.0f} px)" for name, error in sorted(far.items(), key=lambda item: -item[1])]
         words = (
             f"Sparse points do not project to where these images observe them: {_named(shown)}. Cameras, poses or "
-            "points of the model were changed apart from each other, and depth is wrong where cameras or poses are; "
+            "points were changed apart from each other, and depth is wrong where cameras or poses are; "
             "or the model's image coordinates are those of images of another size."
         )
-        report.doubts = words
-        logger.warning("%s", words)
+        _doubt(report, words)
 
 
 def refuse_disagreement(report: RunReport) -> None:
@@ -77,16 +79,24 @@ def refuse_disagreement(report: RunReport) -> None:
         raise NoResultError(report.refusal)
 
 
+def _doubt(report: RunReport, words: str) -> None:
+    report.doubts = f"{report.doubts} {words}".strip()
+    logger.warning("%s", words)
+
+
 def _refusal(total: Agreement) -> str:
-    causes = (
-        "these images do not belong to the poses and cameras of the model (exchanged, turned, mirrored, cropped, "
-        "or of another model)"
-    )
-    if total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found > 0:
-        causes += ", or hardly anything of them could be matched with these options"
     return (
         f"Only {total.agreeing / total.tested:.1%} of the sparse points agree with the depth maps of the images "
-        f"that observe them: {causes}; check --images. What was made is left on disk."
+        "that observe them: these images do not belong to the poses and cameras of the model (exchanged, turned, "
+        "mirrored, cropped, or of another model), or hardly anything of them could be matched; check --images. What "
+        "was made is left on disk."
+    )
+
+
+def _hardly_matched(total: Agreement) -> str:
+    return (
+        f"Hardly anything of the images could be matched: only {total.found / total.tested:.1%} of the sparse "
+        f"points that they observe have a depth, of which {total.agreeing / total.found:.0%} agree."
     )
 
 
