@@ -138,7 +138,7 @@ def test_hardly_any_agreement_is_no_result():
     # Where little is matched few points have a depth, but these agree.
     few = reported({"a.jpg": Agreement(100, 6, 5)})
     assert few.refusal == ""
-    assert "only 6.0% of the sparse points that they observe have a depth, of which 83% agree" in few.doubts
+    assert "only 6.0% of the sparse points that the images observe have a depth, of which 83% agree" in few.doubts
     # Too few to tell.
     refuse_disagreement(reported({"a.jpg": Agreement(10, 5, 0)}))
 

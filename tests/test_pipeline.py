@@ -120,7 +120,16 @@ def test_the_report_is_right(block: DemoBlock, finished: FinishedRun) -> None:
     assert workspace.fused_path.with_name("fused.ply.vis").is_file()
     assert workspace.fusion_cfg_path.read_text().split() == sorted(block.names)
     assert report.advice == ""
-    stages = ["undistort", "select pairs", "match pairs", "vote on depth", "confirm depth", "fuse"]
+    stages = [
+        "check originals",
+        "undistort",
+        "check images",
+        "select pairs",
+        "match pairs",
+        "vote on depth",
+        "confirm depth",
+        "fuse",
+    ]
     assert list(report.seconds) == stages
     assert 50 << 20 < report.peak_memory < 8 << 30
     written = json.loads((workspace.state_dir / "report.json").read_text())
@@ -326,7 +335,7 @@ def test_one_unreadable_image_is_skipped(project: Path, caplog: pytest.LogCaptur
         assert list(report.skipped_images) == [NADIR[0]]
         assert report.images == 3
         assert sorted(report.coverage) == NADIR[1:]
-    assert any(NADIR[0] in message and "cut off" in message for message in caplog.messages)
+    assert any(NADIR[0] in message and "is damaged" in message for message in caplog.messages)
 
 
 def test_one_unreadable_image_of_a_workspace_is_skipped(project: Path) -> None:

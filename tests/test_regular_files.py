@@ -68,7 +68,7 @@ def test_a_regular_file_is_read_and_nothing_else(tmp_path: Path) -> None:
         ("sparse/images.bin", 2, "images.bin cannot be read (it is not a regular file)"),
         ("stereo/patch-match.cfg", 2, "patch-match.cfg cannot be read (it is not a regular file)"),
         (f"images/{NAMES[0]}", 5, "a.png is "),
-        (f"masks/{NAMES[0]}.png", 2, "a.png.png cannot be read"),
+        (f"masks/{NAMES[0]}.png", 2, "a.png.png is not a regular file"),
         ("colmap_sph/log.txt", 3, "log.txt cannot be written: it is not a regular file"),
         # What this program made is made again.
         ("stereo/fusion.cfg", 0, ""),
@@ -108,7 +108,7 @@ def test_pipes_in_a_workspace(
     ("place", "code", "words"),
     [
         (f"images/{NAMES[0]}", 0, "a.png is "),
-        (f"masks/{NAMES[0]}.png", 2, "a.png.png cannot be read"),
+        (f"masks/{NAMES[0]}.png", 2, "a.png.png is not a regular file"),
         ("database.db", 0, ""),
         ("dense/colmap_sph/undistortion.json", 0, ""),
     ],

@@ -247,13 +247,15 @@ def test_users_own_files_in_a_workspace_stay(tmp_path: Path, caplog: pytest.LogC
     caplog.clear()
     prepare(sparse, workspace.root, overwrite=True)
     # What has to make room is named, and kept beside the new one.
-    moved = workspace.image_path("a.png")
-    assert f"{moved} is not what this program wrote there; it is now a.png.backup" in caplog.text
-    assert moved.with_name("a.png.backup").read_bytes() == theirs.pop(moved)
     model = workspace.sparse_dir / "points3D.bin"
+    assert f"{model} is not what this program wrote there; it is now points3D.bin.backup" in caplog.text
     assert model.with_name("points3D.bin.backup").read_bytes() == theirs.pop(model)
     assert {path: path.read_bytes() for path in theirs} == theirs
     assert len(read_scene(workspace.sparse_dir).points) == 20
+    prepare(sparse, workspace.root, UndistortionOptions(48), overwrite=True)
+    moved = workspace.image_path("a.png")
+    assert moved.with_name("a.png.backup").read_bytes() == theirs[moved]
+    assert read_scene(workspace.sparse_dir).views[0].width == 48
 
 
 @pytest.mark.parametrize("what", ["model", "images", "masks"])

@@ -179,13 +179,14 @@ class Survey:
             try:
                 job = stage.job(item)
             except ColmapSphError as error:
-                logger.info("%s: %s", stage.label(item), error)
+                stage.skip(item, str(error))
                 continue
             if job.done is not None:
                 results[item] = Result(job.key, made=False, facts=job.done)
             else:
                 results[item] = Result(job.key, made=True, facts=Facts(coverage=1.0))
                 costs.append(job.cost)
+        stage.tell_problems()
         made, there = stage.count(results)
         self.stages.append(
             StagePlan(

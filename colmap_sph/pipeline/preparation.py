@@ -181,6 +181,7 @@ class Preparation:
         if found is not None and list(found.images) == names and has_model(self.workspace.sparse_dir):
             logger.info("The undistorted images in %s are up to date", self.workspace.root)
             return
+        self.workspace.create_stereo_dirs(names)
         scratch = self.workspace.undistortion_scratch_dir
         with scratch_folder(scratch):
             made = self._undistort_model(scratch, names)

@@ -134,6 +134,7 @@ def run_project(
         return reconstruct(
             dense,
             options,
+            expected=preparation.names,
             progress=progress,
             report=report,
             database=project.database(),
@@ -158,6 +159,7 @@ def reconstruct(
     progress: Progress | None = None,
     report: RunReport | None = None,
     database: Path | None = None,
+    expected: Collection[str] = (),
     overwrite: bool = False,
     verify: bool = False,
 ) -> RunReport:
@@ -172,6 +174,8 @@ def reconstruct(
         What is known of the run so far.
     database : Path, optional
         COLMAP's database, whose verified matches serve where the model has no tracks.
+    expected : collection of str
+        Names of images that are reported as skipped where the workspace's model does not have them.
     overwrite : bool
         Files that this program did not make, where maps and cloud go, get another name; without it they are
         refused.
@@ -188,6 +192,8 @@ def reconstruct(
     with one_opencv_thread():
         scene = anchored(read_scene(workspace.sparse_dir))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
+        for name in sorted({*expected} - scene.index_of.keys()):
+            report.skipped_images.setdefault(name, "the model has no possible pose or calibration of it")
         context = with_good_images(context, execute, verify=verify)
         scene = context.scene
         workspace.create_stereo_dirs(scene.index_of)

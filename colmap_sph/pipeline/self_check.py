@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 _DOUBTED_SHARE = 0.15
 # ... and all of them below this one.
 _REFUSED_SHARE = 0.1
-# Where so large a share of the points with a depth agrees, and of all, hardly any was matched, but what was is right.
+# Where so large a share of the points with a depth agrees, and of all, little was matched, but what was is right.
 _RIGHT_SHARE_OF_FOUND = 0.5
 _LEAST_SHARE = 0.05
 # Fewer points say nothing of a run.
@@ -88,15 +88,15 @@ def _refusal(total: Agreement) -> str:
     return (
         f"Only {total.agreeing / total.tested:.1%} of the sparse points agree with the depth maps of the images "
         "that observe them: these images do not belong to the poses and cameras of the model (exchanged, turned, "
-        "mirrored, cropped, or of another model), or hardly anything of them could be matched; check --images. What "
-        "was made is left on disk."
+        "mirrored, cropped, or of another model), or hardly anything could be matched; check --images. What was "
+        "made is left on disk."
     )
 
 
 def _hardly_matched(total: Agreement) -> str:
     return (
-        f"Hardly anything of the images could be matched: only {total.found / total.tested:.1%} of the sparse "
-        f"points that they observe have a depth, of which {total.agreeing / total.found:.0%} agree."
+        f"Hardly anything could be matched: only {total.found / total.tested:.1%} of the sparse points that the "
+        f"images observe have a depth, of which {total.agreeing / total.found:.0%} agree."
     )
 
 

@@ -125,8 +125,9 @@ class CheckStage(Stage[str, ImageFile]):
     def job(self, item: str) -> Job[ImageFile]:
         """See `Stage.job`."""
         image = ImageFile(self._places.path(item), self._sizes[item])
-        if not image.path.is_file():
-            raise InputError(f"{image.path} is missing")
+        problem = image_problem(image.path, *image.size, decode=False)
+        if problem is not None:
+            raise InputError(f"{image.path} {problem}")
         stamp = _stamp_of(image.path)
         known = self._known.get(item)
         is_read = known is not None and known.stamp == stamp
@@ -146,14 +147,7 @@ class CheckStage(Stage[str, ImageFile]):
 
     def close(self, results: Mapping[str, Result]) -> None:
         """Tell what is wrong with bad images, and keep what is known of the good ones."""
-        places = self._places
-        problems = {
-            name: image_problem(places.path(name), *self._sizes[name]) or problem
-            for name, problem in sorted(self._bad.items())
-        }
-        tell_problems(
-            places.model_dir, places.folder, problems, len(self.items), undistorted=places.what == "images"
-        )
+        self.tell_problems()
         good = {
             name: replace(self._seen[name], sample=result.facts.sample)
             for name, result in results.items()
@@ -163,6 +157,17 @@ class CheckStage(Stage[str, ImageFile]):
             make_dir(self._file.parent)
             with atomic_file(self._file) as file:
                 file.write(json.dumps({name: asdict(known) for name, known in good.items()}, indent=0).encode())
+
+    def tell_problems(self) -> None:
+        """Tell what is wrong with bad images; `InputError` where there is no other."""
+        places = self._places
+        problems = {
+            name: image_problem(places.path(name), *self._sizes[name]) or problem
+            for name, problem in sorted(self._bad.items())
+        }
+        tell_problems(
+            places.model_dir, places.folder, problems, len(self.items), undistorted=places.what == "images"
+        )
 
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
         """None: it makes no files."""

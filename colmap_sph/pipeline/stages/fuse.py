@@ -25,6 +25,7 @@ from colmap_sph.pipeline.stages.cloud import (
     vouch_for_cloud,
 )
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.fusion_partners import partners_in_fusion
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_sound_maps, read_view_maps
 from colmap_sph.project.cloud_files import (
@@ -39,10 +40,8 @@ from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace, mask_path
-from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.partners.pairing import Pair, partners_of
-from colmap_sph.stereo.partners.pairs import overlapping_views
-from colmap_sph.stereo.partners.stations import OWN_STATION, Stations, by_station
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -62,9 +61,6 @@ _FUSE_BYTES = 60.0
 # Bytes in COLMAP's fusion: per pixel of all images together; and for a moment, per width times squared height.
 _COLMAP_BYTES = 80.0
 _COLMAP_MASK_BYTES = 0.1
-
-# Images that share most points are looked at for those of different stations, as often as images to fuse.
-_CANDIDATES = 4
 
 _maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 
@@ -158,7 +154,7 @@ class FuseStage(Stage[str, FuseTask]):
 
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
         super().__init__(context, list(maps))
-        self._partners = _partners_in_fusion(context, pair_keys, self.items)
+        self._partners = partners_in_fusion(context, pair_keys, self.items)
         self._key = context.keys.cloud({name: maps[name].key for name in maps}, self._partners, context.scene)
         self._known = known_cloud(context, self._key)
         self._is_there = self._known is not None
@@ -292,34 +288,6 @@ def _warn_of_masks(context: "Context") -> None:
     if folder is not None:
         names = [view.name for view in context.scene.views]
         warn_of_unused_masks(folder, names, context.workspace.images_dir)
-
-
-def _partners_in_fusion(
-    context: "Context", pair_keys: Mapping[Pair, str], names: Sequence[str]
-) -> dict[str, tuple[list[str], list[int]]]:
-    """For each image to fuse the others that may see the same: those that share most points, and its pairs'.
-
-    With them come the numbers of their stations, which ascend.
-    """
-    most = min(context.options.fusion.check_num_images, MAX_PARTNERS)
-    overlapping = overlapping_views(context.scene, _CANDIDATES * most)
-    matched = partners_of(pair_keys)  # a pair that the user asked for may share no point
-    fused = set(names)
-    partners = {}
-    for name in names:
-        others = [o for o in dict.fromkeys([*overlapping[name], *matched.get(name, [])]) if o in fused]
-        partners[name] = _some_of_each_station(context.stations, name, others, most)
-    return partners
-
-
-def _some_of_each_station(
-    stations: Stations, name: str, others: list[str], most: int
-) -> tuple[list[str], list[int]]:
-    """At most so many images, the first of each station before the rest, in the order of their stations."""
-    numbers = stations.numbers(name, others)
-    firsts = {number: k for k, number in reversed(list(enumerate(numbers))) if number != OWN_STATION}
-    chosen = list(dict.fromkeys([*sorted(firsts.values()), *range(len(others))]))[:most]
-    return by_station([others[k] for k in sorted(chosen)], [numbers[k] for k in sorted(chosen)])
 
 
 class ColmapFuseStage(Stage[str, ColmapFuseTask]):

@@ -127,6 +127,9 @@ class Stage(ABC, Generic[Item, Task]):
     def close(self, results: Mapping[Item, Result]) -> None:
         """Report the results, and raise `NoResultError` where there is nothing to go on with."""
 
+    def tell_problems(self) -> None:
+        """Raise for what is wrong with the items that failed, once all are known; also in a dry run."""
+
     def count(self, results: Mapping[Item, Result]) -> tuple[int, int]:
         """How many results this run made, and how many were there."""
         made = sum(result.made for result in results.values())

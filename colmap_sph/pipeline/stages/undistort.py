@@ -178,7 +178,8 @@ class UndistortStage(Stage[str, UndistortTask]):
         )
         known = self._is_as_made(task, files) or self._is_changed_by_user(task, files)
         pixels = camera.width * camera.height
-        cost = Cost(_SECONDS * pixels, _PROCESS_BYTES + _BYTES * pixels, _FILE_BYTES * pixels)
+        process = _PROCESS_BYTES if image.is_colmaps else 0.0
+        cost = Cost(_SECONDS * pixels, process + _BYTES * pixels, _FILE_BYTES * pixels)
         return Job(key, Facts() if known else None, cost, task)
 
     def _is_as_made(self, task: UndistortTask, files: list[Path]) -> bool:

@@ -36,7 +36,7 @@ class WrongSize(str):
         return problem
 
 
-def image_problem(path: Path, width: int, height: int) -> str | None:
+def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -> str | None:
     """Say what is wrong with an image, as the end of a sentence, or return None.
 
     Parameters
@@ -45,6 +45,8 @@ def image_problem(path: Path, width: int, height: int) -> str | None:
         Image file; it is decoded if its header is right.
     width, height : int
         Size of its camera in pixels, without regard to any EXIF orientation, which COLMAP ignores too.
+    decode : bool
+        Whether to look further than at its header.
 
     Returns
     -------
@@ -58,7 +60,8 @@ def image_problem(path: Path, width: int, height: int) -> str | None:
         # Before anything is decoded: a small file can hold a huge image.
         if (header.width, header.height) != (width, height):
             return WrongSize((header.width, header.height), (width, height))
-        read_pixels(path)
+        if decode:
+            read_pixels(path)
     except OSError as error:
         return f"cannot be read ({reason_of(error)})"
     except DamagedError as error:

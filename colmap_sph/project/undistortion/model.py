@@ -147,6 +147,6 @@ def raise_if_disk_is_full(folder: Path) -> None:
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 raise OutputError(
-                    f"Nothing more can be written to {folder} ({reason_of(error)}); free some space or choose "
-                    "another --output."
+                    f"Nothing more can be written to {folder} ({reason_of(error)}); free some space, raise the "
+                    "limit (a quota, or ulimit -f), or choose another --output."
                 ) from error
