@@ -172,13 +172,7 @@ class Preparation:
     def finish(self, results: Mapping[str, Result]) -> None:
         """Give the workspace its model, where that is not there for these images."""
         names = sorted(results)
-        found = self._found
-        if found is not None and is_model_changed(self.workspace, found):
-            logger.warning(
-                "%s was changed since this program made it; it is used as it is", self.workspace.sparse_dir
-            )
-            return
-        if found is not None and list(found.images) == names and has_model(self.workspace.sparse_dir):
+        if self._is_model_there(names):
             logger.info("The undistorted images in %s are up to date", self.workspace.root)
             return
         self.workspace.create_stereo_dirs(names)
@@ -190,15 +184,21 @@ class Preparation:
 
     def scene(self, results: Mapping[str, Result]) -> Scene | None:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
-        found = self._found
-        is_there = not self._overwrite and found is not None and found.version > 1
-        if (
-            is_there
-            and found is not None
-            and (list(found.images) == sorted(results) or is_model_changed(self.workspace, found))
-        ):
+        if not self._overwrite and self._is_model_there(sorted(results)):
             return None
         return foreseen_scene(self._originals, results, self._options.undistortion)
+
+    def _is_model_there(self, names: Sequence[str]) -> bool:
+        """Whether the workspace has the model of these images, or one that the user has changed."""
+        found = self._found
+        if found is None or found.version == 1 or not has_model(self.workspace.sparse_dir):
+            return False
+        if is_model_changed(self.workspace, found):
+            logger.warning(
+                "%s was changed since this program made it; it is used as it is", self.workspace.sparse_dir
+            )
+            return True
+        return list(found.images) == list(names)
 
     def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
         """Undistort the model in a process of its own; return the folder where it is."""

@@ -144,7 +144,7 @@ def _of_results(case: Case, outcome: Outcome, grounds: Grounds) -> Iterator[Find
 
 
 def _has_warned(outcome: Outcome) -> bool:
-    return any(word in outcome.stderr for word in ("WARNING", "skipped:", "few points:"))
+    return any(word in outcome.stderr for word in ("warning:", "skipped:", "incomplete:", "few points:"))
 
 
 def _of_cloud(case: Case, grounds: Grounds) -> Iterator[Finding]:
