@@ -171,6 +171,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     terminal.table("Depth maps", ["image", "coverage", "agreement"], rows, caption)
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
     facts = [("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")]
+    if report.stretched:
+        facts.append(("values", report.stretched))
     facts.append(("agreement", _agreement(report)))
     facts.append(("pairs", f"{report.pairs} matched ({report.pair_source})"))
     facts.append(("cloud", f"{report.points:,} points in {workspace.fused_path}"))

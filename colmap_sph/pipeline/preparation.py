@@ -162,8 +162,7 @@ class Preparation:
             if isinstance(result.facts, ImageFacts) and result.facts.sample is not None
         }
         ranges = common_ranges(samples.values())
-        for sentence in describe_ranges(ranges):
-            logger.info(sentence)
+        self._context.report.stretched = "; ".join(describe_ranges(ranges))
         values = {name: ranges[sample.kind] for name, sample in samples.items()}
         return executor(
             UndistortStage(self._context, self._originals, keys_of(images), values, verify=self._verify)

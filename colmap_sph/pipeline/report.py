@@ -39,6 +39,8 @@ class RunReport:
     incomplete : dict
         Image name → what its results, or the cloud, had to do without for a reason that may pass, such as a file
         that could not be read. The next run makes them again.
+    stretched : str
+        Which values became black and white in images of more than 8 bits, where these were changed.
     pair_source : str
         Where the pairs come from.
     pairs : int
@@ -73,6 +75,7 @@ class RunReport:
     images: int = 0
     skipped_images: dict[str, str] = field(default_factory=dict)
     incomplete: dict[str, str] = field(default_factory=dict)
+    stretched: str = ""
     pair_source: str = ""
     pairs: int = 0
     skipped_pairs: dict[str, str] = field(default_factory=dict)
