@@ -15,7 +15,6 @@ import errno
 import shutil
 import signal
 import sys
-from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -289,11 +288,7 @@ def files_made_again(finished: dict[Path, int]) -> list[Path]:
 def leftovers(workspace: Path) -> list[str]:
     """What a run that was ended has left behind, and the one after it has not removed; in one sentence if any."""
     found = [path for path in workspace.rglob("*") if path.name.endswith(".tmp")]
-    found += [
-        path for name in (".fusion.tmp", ".undistorting.tmp") for path in workspace.glob(f"colmap_sph/{name}")
-    ]
-    kinds = Counter(path.suffix or path.name for path in found)
-    return [f"left behind: {', '.join(f'{number} {kind}' for kind, number in kinds.items())}"] if found else []
+    return [f"left behind: {', '.join(sorted(path.name for path in found))}"] if found else []
 
 
 if __name__ == "__main__":

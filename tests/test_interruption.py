@@ -113,7 +113,7 @@ def test_the_check_of_interruptions_finds_faults(tmp_path: Path) -> None:
     assert script.differences(disturbed, whole)[0].startswith("3 results differ")
     (disturbed / "stereo/.1-2.tmp").touch()
     (disturbed / "colmap_sph/.fusion.tmp").mkdir()
-    assert script.leftovers(disturbed) == ["left behind: 1 .tmp, 1 fusion"]
+    assert script.leftovers(disturbed) == ["left behind: .1-2.tmp, .fusion.tmp"]
 
 
 def test_stages_of_file_operations(scripts_on_path: None) -> None:

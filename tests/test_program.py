@@ -13,7 +13,7 @@ from colmap_sph.pipeline import program
 from colmap_sph.pipeline.program import reached_modules
 
 PACKAGE = Path(colmap_sph.__file__).parent
-MAKERS = {name: f"colmap_sph.pipeline.stages.{name}" for name in ("match", "vote", "confirm", "fuse")}
+MAKERS = {name: f"colmap_sph.pipeline.stages.{name}" for name in ("undistort", "match", "vote", "confirm", "fuse")}
 ROOMS_THAT_MAKE_NOTHING = ("app", "evaluation", "synthetic")
 
 LOADED = """

@@ -7,6 +7,7 @@ from typing import TypeVar
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.workers import for_all
+from colmap_sph.project.state.records import vouching_in_background
 
 logger = logging.getLogger(__name__)
 
@@ -42,7 +43,7 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
             return Result(job.key, made=True, facts=stage.make(job.task))
 
     with stage.opened(), context.stage(stage.name, len(stage.items)):
-        with stage.holding(kept):
+        with stage.holding(kept), vouching_in_background():
             results = _one_by_one(work, stage) if stage.whole else _by_threads(work, stage)
         stage.close(results)
     made, reused = stage.count(results)

@@ -102,7 +102,7 @@ def read_normal_planes(path: Path, digest: str | None = None) -> NDArray[np.floa
 def _write_planes(path: Path, planes: Iterable[NDArray[np.floating]], shape: tuple[int, int, int]) -> str:
     """Write planes one after the other, so that only one has to be in memory; `shape` is (H, W, planes)."""
     height, width, channels = shape
-    with atomic_file(path) as file:
+    with atomic_file(path, sync=False) as file:  # whoever vouches for it waits for the disk
         file.write(f"{width}&{height}&{channels}&".encode())
         for plane in planes:
             file.write(np.ascontiguousarray(plane, dtype="<f4").data)

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta
 
-from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.pipeline.load_cache import LoadCache
-from colmap_sph.project.files import read_small, sync_file, sync_folder, whole_digest
+from colmap_sph.project.files import read_small, whole_digest
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.pair_lists import fusion_cfg, write_fusion_cfg
 from colmap_sph.project.sparse_model import image_names, load_model
 from colmap_sph.project.state.ownership import fusion_cfg_place
-from colmap_sph.project.state.records import begin, claim, vouch, vouched_facts
+from colmap_sph.project.state.records import begin, claim, vouch, vouch_when_on_disk, vouched_facts
 from colmap_sph.project.workspace import mask_path
 from colmap_sph.stereo.fusion_losses import DepthAndNormals, explain_losses
 
@@ -69,15 +68,7 @@ def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts) -> None:
     facts : CloudFacts
     """
     place = context.cloud_place
-    try:
-        for path in place.files:
-            sync_file(path)
-            sync_folder(path.parent)
-    except OSError as error:
-        raise OutputError(
-            f"{place.files[0]} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
-    vouch(place.record, key, {path: whole_digest(path) for path in place.files}, facts)
+    vouch_when_on_disk(place.record, key, {path: whole_digest(path) for path in place.files}, facts)
 
 
 def list_fused_images(context: "Context", names: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
-from colmap_sph.project.state.records import begin, vouch, vouched_facts, whole_digests
+from colmap_sph.project.state.records import begin, vouch_when_on_disk, vouched_facts, whole_digests
 
 MAP_BYTES = 16.0
 """Bytes on disk per pixel, of a depth and a normal map."""
@@ -61,11 +61,11 @@ class MapFiles:
         Facts
             With the share of pixels with a depth, and the agreement.
         """
-        begin(self.record, [self.depth, self.normals])
+        begin(self.record, [self.depth, self.normals], sync=False)
         digests = {self.depth: write_depth_map(self.depth, depth)}
         digests[self.normals] = write_normal_map(self.normals, normals)
         facts = MapFacts(float((depth > 0).mean()), **asdict(agreement or Agreement()))
-        vouch(self.record, key, digests, facts)
+        vouch_when_on_disk(self.record, key, digests, facts)
         return facts.as_facts()
 
     def facts(self, key: str) -> Facts | None:

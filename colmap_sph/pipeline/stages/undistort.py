@@ -13,7 +13,7 @@ from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.cameras import plain_camera
-from colmap_sph.project.files import make_dir, remove, scratch_folder, sync_file, sync_folder, whole_digest
+from colmap_sph.project.files import make_dir, remove, scratch_folder, whole_digest
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
@@ -22,7 +22,7 @@ from colmap_sph.project.state.records import (
     altered_files,
     begin,
     read_record,
-    vouch,
+    vouch_when_on_disk,
     vouched_facts,
     whole_digests,
 )
@@ -92,13 +92,11 @@ def _publish(task: UndistortTask) -> None:
     elif _is_mask_of_earlier_run(task):
         remove(task.mask_target)
     digests = {target: whole_digest(made) for target, made in moves.items()}
-    begin(task.record, list(moves))
+    begin(task.record, list(moves), sync=False)
     for target, made in moves.items():
         make_dir(target.parent)
-        sync_file(made)
         made.replace(target)
-        sync_folder(target.parent)
-    vouch(task.record, task.key, digests)
+    vouch_when_on_disk(task.record, task.key, digests)
 
 
 def _is_mask_of_earlier_run(task: UndistortTask) -> bool:

@@ -107,7 +107,7 @@ def write_arrays(
     for array in whole:
         state.update(_bytes_of(array))
     head = Head(kind, key, tuple(texts), tuple(numbers), tuple(map(array_type, whole)), state.digest())
-    with atomic_file(path) as file:
+    with atomic_file(path, sync=False) as file:  # whoever reads it checks every byte
         file.write(_packed(head))
         for array in whole:
             file.write(_bytes_of(array))

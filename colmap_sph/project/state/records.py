@@ -7,8 +7,9 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -18,7 +19,16 @@ import xxhash
 from msgspec import Meta
 
 from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.project.files import atomic_file, make_dir, open_regular, read_small, set_aside, whole_digest
+from colmap_sph.project.files import (
+    atomic_file,
+    make_dir,
+    open_regular,
+    read_small,
+    set_aside,
+    sync_file,
+    sync_folder,
+    whole_digest,
+)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -59,6 +69,7 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     state: Literal["done", "void", "doubtful", "making"] = "done"
 
 
+_background: tuple[ThreadPoolExecutor, list["Future[None]"]] | None = None
 _UNREADABLE = Record(state="void")
 
 
@@ -105,14 +116,14 @@ def _check(content: Mapping[str, Any]) -> str:
     return xxhash.xxh3_128_hexdigest(json.dumps(content, sort_keys=True).encode())
 
 
-def _write(path: Path, record: Record) -> None:
+def _write(path: Path, record: Record, *, sync: bool = True) -> None:
     content = msgspec.to_builtins(record)
     make_dir(path.parent)
-    with atomic_file(path) as file:
+    with atomic_file(path, sync=sync) as file:
         file.write(json.dumps(content | {"check": _check(content)}, indent=1).encode())
 
 
-def begin(record: Path, files: Sequence[Path]) -> None:
+def begin(record: Path, files: Sequence[Path], *, sync: bool = True) -> None:
     """Say that `files` are about to be written: from here on their content is unknown, but ours.
 
     Nothing of others is lost: a file that is not as the record knows it, or of which no record knows, is set aside
@@ -123,6 +134,8 @@ def begin(record: Path, files: Sequence[Path]) -> None:
     record : Path
     files : sequence of Path
         The same, in the same order, as for `vouch`.
+    sync : bool
+        Whether to wait until the disk has it: not where it has a record of these files already.
 
     Raises
     ------
@@ -135,12 +148,12 @@ def begin(record: Path, files: Sequence[Path]) -> None:
     for path in altered_files(known, files):
         backup = set_aside(path)
         logger.warning("%s is not what this program wrote there; it is now %s", path, backup.name)
-    claim(record)
+    claim(record, sync=sync)
 
 
-def claim(record: Path) -> None:
+def claim(record: Path, *, sync: bool = True) -> None:
     """Take what is in a record's place for ours, whatever it is: it may be replaced."""
-    _write(record, Record(state="making"))
+    _write(record, Record(state="making"), sync=sync)
 
 
 def vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassInstance | None" = None) -> None:
@@ -164,6 +177,51 @@ def vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassIn
             raise OutputError(f"{path} cannot be read back ({reason_of(error)}); run again.") from error
     plain = {} if facts is None else asdict(facts)
     _write(record, Record(key, tuple(stamps), tuple(files.values()), plain))
+
+
+def vouch_when_on_disk(
+    record: Path, key: str, files: Mapping[Path, str], facts: "DataclassInstance | None" = None
+) -> None:
+    """Do what `vouch` does, once the disk has the files; in `vouching_in_background` without waiting for that."""
+    if _background is None:
+        _sync_and_vouch(record, key, files, facts)
+    else:
+        pool, waiting = _background
+        waiting.append(pool.submit(_sync_and_vouch, record, key, files, facts))
+
+
+def _sync_and_vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassInstance | None") -> None:
+    try:
+        for path in files:
+            sync_file(path)
+        for folder in {path.parent for path in files}:
+            sync_folder(folder)
+    except OSError as error:
+        raise OutputError(
+            f"{next(iter(files))} cannot be written ({reason_of(error)}); check space and permissions."
+        ) from error
+    vouch(record, key, files, facts)
+
+
+@contextmanager
+def vouching_in_background() -> Iterator[None]:
+    """Let a thread of its own wait for the disk meanwhile, so that no worker does.
+
+    Raises
+    ------
+    OutputError
+        At the end, where a file or a record could not be written.
+    """
+    global _background
+    with ThreadPoolExecutor(1, thread_name_prefix="vouch") as pool:
+        waiting: list[Future[None]] = []
+        _background = (pool, waiting)
+        try:
+            yield
+        finally:
+            _background = None
+    for each in waiting:
+        each.result()
 
 
 def vouched_facts(record: Path, key: str, files: Sequence[Path], kind: type[T]) -> T | None:
