@@ -54,12 +54,19 @@ def reached_modules(module: str) -> list[str]:
 
 
 def _imported_by(module: str) -> Iterator[str]:
-    for node in _running(ast.parse(_source_of(module).read_bytes())):
+    return filter(_is_ours, _names_imported(_source_of(module).read_bytes()))
+
+
+@cache
+def _names_imported(source: bytes) -> tuple[str, ...]:
+    """Full names of all that a module's code imports, of ``from a import b`` both ``a`` and ``a.b``."""
+    names: list[str] = []
+    for node in _running(ast.parse(source)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names if _is_ours(alias.name))
-        elif isinstance(node, ast.ImportFrom) and node.module and _is_ours(node.module):
-            yield node.module
-            yield from (name for alias in node.names if _is_ours(name := f"{node.module}.{alias.name}"))
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+    return tuple(names)
 
 
 def _running(node: ast.AST) -> Iterator[ast.AST]:

@@ -77,18 +77,23 @@ def undistort(task: ImageToUndistort) -> None:
         A file cannot be written.
     """
     options = task.options.for_colmap()
-    camera = task.undistorted_camera
     if task.values is not None:
         undistort_deep(task.source, task.camera, options, task.image_path, task.values)
     elif task.is_colmaps:
         _undistort_by_colmap(task)
     else:
         copy_without_orientation(task.source, task.image_path)
-    problem = image_problem(task.image_path, camera.width, camera.height)
-    if problem is not None:
-        raise InputError(f"{task.source} could not be undistorted: the result {problem}.")
+    if task.is_colmaps:
+        _check(task)
     if task.mask is not None:
         undistort_mask(task.mask, task.camera, options, task.mask_path)
+
+
+def _check(task: ImageToUndistort) -> None:
+    """Make sure that COLMAP has written the image: it may not notice a full disk."""
+    problem = image_problem(task.image_path, task.undistorted_camera.width, task.undistorted_camera.height)
+    if problem is not None:
+        raise InputError(f"{task.source} could not be undistorted: the result {problem}.")
 
 
 def _undistort_by_colmap(task: ImageToUndistort) -> None:
