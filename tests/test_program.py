@@ -36,7 +36,7 @@ def test_no_key_holds_what_makes_nothing(maker: str) -> None:
     rooms = {name.split(".")[1] for name in reached_modules(maker) if name.count(".")}
     assert rooms.isdisjoint(ROOMS_THAT_MAKE_NOTHING)
     shared = {"context", "execute", "keys", "options", "plan", "reconstruct", "report", "workers"}
-    assert shared.isdisjoint(name.rpartition(".")[2] for name in reached_modules(maker))
+    assert {f"colmap_sph.pipeline.{name}" for name in shared}.isdisjoint(reached_modules(maker))
 
 
 @pytest.fixture
