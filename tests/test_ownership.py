@@ -119,7 +119,7 @@ def test_a_run_killed_while_it_writes_leaves_files_of_its_own(
 
     for place in ("maps", "cloud"):
         with monkeypatch.context() as patch:
-            patch.setattr(f"colmap_sph.pipeline.stages.{place}.vouch", killed)
+            patch.setattr(f"colmap_sph.pipeline.stages.{place}.vouch_when_on_disk", killed)
             with pytest.raises(OutputError, match="killed"):
                 finished.rerun(normals=NormalOptions(radius=3))
     finished.rerun()
@@ -138,7 +138,7 @@ def test_a_first_run_killed_before_any_map_leaves_places_of_its_own(
         raise OutputError("killed")
 
     with monkeypatch.context() as patch:
-        patch.setattr("colmap_sph.pipeline.stages.maps.vouch", killed)
+        patch.setattr("colmap_sph.pipeline.stages.maps.vouch_when_on_disk", killed)
         with pytest.raises(OutputError, match="killed"):
             colmap_sph.run(workspace=foreign, options=OPTIONS)
     assert list(foreign.glob("stereo/*_maps/*.bin"))
@@ -402,7 +402,7 @@ def operations(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[tuple[str, str]
 def test_files_are_on_the_disk_before_a_record_vouches_for_them(
     finished: Finished, operations: list[tuple[str, str]]
 ) -> None:
-    """File, then its name, then the folder; the last writing of the record comes after all of them."""
+    """Names, then the files and their folders; the last writing of the record comes after all of them."""
     finished.rerun(overwrite=True, threads=1)
     workspace = Workspace(finished.dense)
     for name in NAMES:
@@ -423,9 +423,8 @@ def check_order(operations: list[tuple[str, str]], record: Path, files: list[Pat
     vouched = last_rename(operations, record)
     for path in files:
         renamed = last_rename(operations, path)
-        temporary = operations[renamed][1].split()[0]
-        assert last(operations[:renamed], ("sync", temporary)) < renamed
-        assert renamed < last(operations[:vouched], ("sync", str(path.parent)))
+        for what in (path, path.parent):
+            assert renamed < last(operations[:vouched], ("sync", str(what)))
 
 
 def last(operations: list[tuple[str, str]], operation: tuple[str, str]) -> int:
