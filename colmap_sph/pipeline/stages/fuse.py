@@ -158,8 +158,11 @@ class FuseStage(Stage[str, FuseTask]):
         self._key = context.keys.cloud({name: maps[name].key for name in maps}, self._partners, context.scene)
         self._known = known_cloud(context, self._key)
         self._is_there = self._known is not None
-        self._index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
-        self._known_sources: dict[str, MapSources] = {}
+        index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
+        # All at once: where maps turn out to be damaged, their records say other things meanwhile.
+        self._sources = {
+            name: _sources_of(context, name, index_of[context.scene.view(name).image_id]) for name in self.items
+        }
         self._scratch = context.workspace.fusion_scratch_dir
 
     def job(self, item: str) -> Job[FuseTask]:
@@ -171,20 +174,14 @@ class FuseStage(Stage[str, FuseTask]):
         seconds = _SECONDS + _PARTNER_SECONDS * len(partners)
         cost = Cost(seconds * pixels / 1e6, _FUSE_BYTES * pixels, _CLOUD_BYTES * pixels)
         task = FuseTask(
-            self._sources(item),
-            tuple(map(self._sources, partners)),
+            self._sources[item],
+            tuple(self._sources[partner] for partner in partners),
             tuple(stations),
             self.context.options.fusion,
             scene.anchor,
             self._stem(item),
         )
         return Job(self._key, None if self._known is None else Facts(), cost, task)
-
-    def _sources(self, name: str) -> MapSources:
-        if name not in self._known_sources:
-            index = self._index_of[self.context.scene.view(name).image_id]
-            self._known_sources[name] = _sources_of(self.context, name, index)
-        return self._known_sources[name]
 
     def _stem(self, name: str) -> Path:
         return self._scratch / f"{self.context.scene.view(name).image_id}"
