@@ -114,7 +114,7 @@ def test_a_run_killed_while_it_writes_leaves_files_of_its_own(
     """Between the beginning of maps or a cloud and their record."""
     before = contents(finished.dense)
 
-    def killed(*_: Any) -> None:
+    def killed(*_: Any, **__: Any) -> None:
         raise OutputError("killed")
 
     for place in ("maps", "cloud"):
@@ -134,7 +134,7 @@ def test_a_first_run_killed_before_any_map_leaves_places_of_its_own(
     for path in [*foreign.glob("stereo/*_maps/*.bin"), *foreign.glob("fused*")]:
         path.unlink()
 
-    def killed(*_: Any) -> None:
+    def killed(*_: Any, **__: Any) -> None:
         raise OutputError("killed")
 
     with monkeypatch.context() as patch:
@@ -144,6 +144,43 @@ def test_a_first_run_killed_before_any_map_leaves_places_of_its_own(
     assert list(foreign.glob("stereo/*_maps/*.bin"))
     assert colmap_sph.run(workspace=foreign, options=OPTIONS).images == 4
     assert backups(foreign) == {}
+
+
+@pytest.mark.parametrize("place", ["match.make_disparity_map", "cloud.begin_cloud"])
+def test_what_others_make_after_a_run_was_ended_is_kept(
+    place: str, foreign: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The user gives up, lets COLMAP make maps and cloud, and starts again: only what was ours is ours."""
+    theirs = dict.fromkeys([*foreign.glob("stereo/*_maps/*.bin"), *foreign.glob("fused*")], b"of COLMAP")
+    for path in theirs:
+        path.unlink()
+
+    def killed(*_: Any, **__: Any) -> None:
+        raise OutputError("killed")
+
+    with monkeypatch.context() as patch:
+        module, _, name = place.partition(".")
+        if name == "begin_cloud":
+            patch.setattr(f"colmap_sph.pipeline.stages.fuse.{name}", killed)
+        else:
+            patch.setattr(f"colmap_sph.pipeline.stages.{module}.MatchStage.make", killed)
+        with pytest.raises(OutputError, match="killed"):
+            colmap_sph.run(workspace=foreign, options=OPTIONS)
+    for path, content in theirs.items():
+        path.write_bytes(content)
+    with pytest.raises(InputError, match=r"not made by this program"):
+        colmap_sph.run(workspace=foreign, options=OPTIONS)
+    colmap_sph.run(workspace=foreign, options=OPTIONS, overwrite=True)
+    assert backups(foreign) == {f"{path.relative_to(foreign)}.backup": content for path, content in theirs.items()}
+
+
+def test_an_incomplete_cloud_is_ours_only_as_it_is(finished: Finished) -> None:
+    """What the user makes of it is kept, as of a complete one."""
+    spoil(finished.dense / f"stereo/{MAPS[0]}")
+    assert finished.rerun(**OTHER_FUSION).skipped_images
+    (finished.dense / "fused.ply").write_bytes(b"cleaned by the user")
+    assert finished.rerun(**OTHER_FUSION).made["fuse"] == 1
+    assert backups(finished.dense)["fused.ply.backup"] == b"cleaned by the user"
 
 
 # ---- fusion.cfg --------------------------------------------------------------------------------------------

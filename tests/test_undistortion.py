@@ -26,6 +26,7 @@ from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.records import begin
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.workspace import Workspace
@@ -336,6 +337,39 @@ def test_workspace_of_an_earlier_version(tmp_path: Path) -> None:
     assert not list(dense.rglob("*.backup*"))
     assert contents(old).keys() == contents(new).keys()
     assert old.patch_match_cfg_path.read_text() == "a.png\nb.png\n"
+
+
+@pytest.mark.parametrize("given", [False, True])
+def test_masks_in_a_workspace_of_an_earlier_version(tmp_path: Path, given: bool) -> None:
+    """Those that it made are replaced; where it was given none they are the user's, and are used."""
+    sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    new = prepare(sparse, tmp_path / "new")
+    old = Workspace(tmp_path / "dense")
+    pycolmap.undistort_images(old.root, sparse, tmp_path / "images")
+    marker = {"version": 1, "options": {"max_image_size": -1}, "images": "i", "masks": "m" if given else None}
+    marker["model"] = json.loads(new.marker_path.read_bytes())["model"]
+    old.state_dir.mkdir()
+    old.marker_path.write_text(json.dumps(marker))
+    old.masks_dir.mkdir()
+    mask = old.made_mask_path("a.png")
+    assert cv2.imwrite(str(mask), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    before = mask.read_bytes()
+    prepare(sparse, old.root)
+    assert mask.exists() != given
+    assert given or mask.read_bytes() == before
+    assert not list(old.root.rglob("*.backup*"))
+
+
+def test_a_mask_that_may_be_the_users_is_kept(tmp_path: Path) -> None:
+    """Put there after a run that was killed between the beginning of an image and its record."""
+    sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    workspace = prepare(sparse, tmp_path / "dense")
+    begin(workspace.records_dir / "a.png.undistorted.json", [workspace.image_path("a.png")])
+    mask = workspace.made_mask_path("a.png")
+    mask.parent.mkdir()
+    mask.write_bytes(b"mine")
+    prepare(sparse, workspace.root)
+    assert mask.with_name("a.png.png.backup").read_bytes() == b"mine"
 
 
 def test_unfinished_workspace_is_not_worked_in(tmp_path: Path) -> None:

@@ -145,8 +145,8 @@ class Preparation:
         check_space(self._originals, images, self.workspace.root, self._options.undistortion)
         found = self._found
         if found is not None and found.version == 1:
+            self._adopt_images(has_masks=found.has_masks)
             found = adopt(self.workspace, found)
-            self._adopt_images(found.images)
         if found is not None and self._overwrite:
             self._discard(found)
             found = None
@@ -215,10 +215,14 @@ class Preparation:
             child.close()
         return task.final_dir
 
-    def _adopt_images(self, names: Sequence[str]) -> None:
-        """Take what an earlier version undistorted for this program's, so that it may be replaced."""
-        for name in names:
-            claim(undistorted_place(self.workspace, name).record)
+    def _adopt_images(self, *, has_masks: bool) -> None:
+        """Take what an earlier version undistorted for this program's, so that it may be replaced.
+
+        Masks in a workspace for which it was given none are the user's.
+        """
+        for name in self.names:
+            place = undistorted_place(self.workspace, name)
+            claim(place.record, place.files if has_masks else place.files[:1])
 
     def _discard(self, found: Marker) -> None:
         """Make room for all anew: once begun, the next run goes on with it, whether it is told to or not."""

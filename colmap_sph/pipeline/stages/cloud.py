@@ -52,13 +52,13 @@ def known_cloud(context: "Context", key: str) -> CloudFacts | None:
 
 
 def begin_cloud(context: "Context") -> None:
-    """Say that the cloud is about to be made anew; what is not ours in its place is set aside."""
+    """Say that the cloud is about to be replaced; what is not ours in its place is set aside."""
     place = context.cloud_place
     begin(place.record, place.files)
 
 
-def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts) -> None:
-    """Record that the cloud is complete.
+def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts, *, is_complete: bool) -> None:
+    """Record that the cloud is ours, and that it is complete, if it is: otherwise the next run makes it again.
 
     Parameters
     ----------
@@ -66,9 +66,12 @@ def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts) -> None:
     key : str
         Under which it was made.
     facts : CloudFacts
+    is_complete : bool
+        Whether nothing that belongs to it could not be read.
     """
     place = context.cloud_place
-    vouch_when_on_disk(place.record, key, {path: whole_digest(path) for path in place.files}, facts)
+    digests = {path: whole_digest(path) for path in place.files}
+    vouch_when_on_disk(place.record, key, digests, facts, state="done" if is_complete else "void")
 
 
 def list_fused_images(context: "Context", names: Sequence[str]) -> None:
@@ -86,7 +89,7 @@ def list_fused_images(context: "Context", names: Sequence[str]) -> None:
     if found == fusion_cfg(names):
         return
     if found is not None and set(found.decode(errors="replace").split("\n")) - {""} == _all_images(context):
-        claim(place.record)  # as COLMAP's undistortion writes it
+        claim(place.record, place.files)  # as COLMAP's undistortion writes it
     begin(place.record, place.files)
     vouch(place.record, "", {workspace.fusion_cfg_path: write_fusion_cfg(workspace.fusion_cfg_path, names)})
 

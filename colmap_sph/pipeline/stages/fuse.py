@@ -195,13 +195,12 @@ class FuseStage(Stage[str, FuseTask]):
 
     @contextmanager
     def opened(self) -> Iterator[None]:
-        """Begin the cloud anew where it must be made; its parts are there until this ends."""
+        """Where the cloud must be made, its parts are there until this ends."""
         list_fused_images(self.context, self.items)
         if self._known is not None:
             yield
             return
         check_places(self.context.workspace)
-        begin_cloud(self.context)
         _warn_of_masks(self.context)
         with scratch_folder(self._scratch):
             yield
@@ -222,8 +221,7 @@ class FuseStage(Stage[str, FuseTask]):
             self._put_together([self._stem(name) for name in results], points)
             self._known = facts_of_cloud(context, list(results), points, self._partners_among(results))
             is_complete = not self._report_unread(results) and len(results) == len(self.items)
-            if is_complete:
-                vouch_for_cloud(context, self._key, self._known)
+            vouch_for_cloud(context, self._key, self._known, is_complete=is_complete)
         report_cloud(context, self._known)
 
     def _partners_among(self, results: Mapping[str, Result]) -> dict[str, tuple[list[str], list[int]]]:
@@ -253,6 +251,7 @@ class FuseStage(Stage[str, FuseTask]):
             join_parts(stems, self._scratch, points)
             if origin.any():
                 link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
+            begin_cloud(self.context)  # not before: it may take hours, in which the one that is there is whole
             move_cloud_into_place(self._scratch, workspace, origin)
         except (OSError, RuntimeError) as error:
             raise OutputError(
@@ -361,6 +360,5 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         if self._known is None:
             points = sum(result.facts.points for result in results.values())
             self._known = facts_of_cloud(self.context, self._sound, points)
-            if self._sound == self._names:
-                vouch_for_cloud(self.context, self._key, self._known)
+            vouch_for_cloud(self.context, self._key, self._known, is_complete=self._sound == self._names)
         report_cloud(self.context, self._known)

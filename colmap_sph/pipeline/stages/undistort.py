@@ -13,7 +13,7 @@ from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.cameras import plain_camera
-from colmap_sph.project.files import make_dir, remove, scratch_folder, whole_digest
+from colmap_sph.project.files import make_dir, remove, scratch_folder, set_aside, whole_digest
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
@@ -89,8 +89,8 @@ def _publish(task: UndistortTask) -> None:
     moves = {task.target: task.image.image_path}
     if task.image.mask is not None:
         moves[task.mask_target] = task.image.mask_path
-    elif _is_mask_of_earlier_run(task):
-        remove(task.mask_target)
+    else:
+        _withdraw_mask(task)
     digests = {target: whole_digest(made) for target, made in moves.items()}
     begin(task.record, list(moves), sync=False)
     for target, made in moves.items():
@@ -99,9 +99,16 @@ def _publish(task: UndistortTask) -> None:
     vouch_when_on_disk(task.record, task.key, digests)
 
 
-def _is_mask_of_earlier_run(task: UndistortTask) -> bool:
-    """Whether there is a mask that was made when the original image had one."""
-    return task.mask_target not in altered_files(read_record(task.record), [task.target, task.mask_target])
+def _withdraw_mask(task: UndistortTask) -> None:
+    """Remove a mask that was made when the original image had one; what may be the user's gets another name."""
+    if not task.mask_target.is_file():
+        return
+    known = read_record(task.record)
+    if known is not None and known.state == "making":
+        backup = set_aside(task.mask_target)
+        logger.warning("%s may not be what this program wrote there; it is now %s", task.mask_target, backup.name)
+    elif task.mask_target not in altered_files(known, [task.target, task.mask_target]):
+        remove(task.mask_target)
 
 
 def _child(folder: Path) -> ChildProcess:

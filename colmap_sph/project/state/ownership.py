@@ -16,7 +16,6 @@ from colmap_sph.project.files import remove, set_aside, whole_digest
 from colmap_sph.project.state.array_file import OLD_SUFFIX, SUFFIX, is_array_file, is_whole
 from colmap_sph.project.state.records import (
     altered_files,
-    begin,
     invalidate,
     read_record,
 )
@@ -123,7 +122,10 @@ def foreign_files(places: Sequence[Place], *, overwrite: bool) -> list[Path]:
 
 
 def take_places(places: Sequence[Place], *, overwrite: bool) -> None:
-    """Make places ours, before anything is written there; from then on a killed run leaves no doubt of that.
+    """Make room in places before anything is written there: what others made gets another name.
+
+    What is there later is ours from the moment that a record says so (see `records.begin`), and no sooner: after
+    a run that was ended, another program may have put its own there.
 
     Parameters
     ----------
@@ -139,9 +141,6 @@ def take_places(places: Sequence[Place], *, overwrite: bool) -> None:
             _were(foreign),
             ", ".join(path.name for path in backups[:_NAMED_FILES]) + _and_more(backups, _NAMED_FILES),
         )
-    for place in places:
-        if read_record(place.record) is None:
-            begin(place.record, place.files)
 
 
 def named(paths: Sequence[Path]) -> str:

@@ -135,7 +135,7 @@ def begin(record: Path, files: Sequence[Path], *, sync: bool = True) -> None:
     files : sequence of Path
         The same, in the same order, as for `vouch`.
     sync : bool
-        Whether to wait until the disk has it: not where it has a record of these files already.
+        Whether to wait until the disk has it, also where it has a record of these files already.
 
     Raises
     ------
@@ -148,15 +148,30 @@ def begin(record: Path, files: Sequence[Path], *, sync: bool = True) -> None:
     for path in altered_files(known, files):
         backup = set_aside(path)
         logger.warning("%s is not what this program wrote there; it is now %s", path, backup.name)
-    claim(record, sync=sync)
+    # What has no record yet must have one before it is there: without, it is nobody's after a power cut.
+    _write(record, Record(state="making"), sync=sync or known is None)
 
 
-def claim(record: Path, *, sync: bool = True) -> None:
-    """Take what is in a record's place for ours, whatever it is: it may be replaced."""
-    _write(record, Record(state="making"), sync=sync)
+def claim(record: Path, files: Sequence[Path]) -> None:
+    """Take files of which no record knows for ours: as they are now, they may be replaced.
+
+    Parameters
+    ----------
+    record : Path
+    files : sequence of Path
+        The first of those of `begin`; need not be there.
+    """
+    _write(record, Record(stamps=tuple(_stamp_if_readable(path) or "" for path in files), state="void"))
 
 
-def vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassInstance | None" = None) -> None:
+def vouch(
+    record: Path,
+    key: str,
+    files: Mapping[Path, str],
+    facts: "DataclassInstance | None" = None,
+    *,
+    state: Literal["done", "void"] = "done",
+) -> None:
     """Write a record: `files` are complete, and were made under `key`.
 
     Parameters
@@ -168,6 +183,8 @@ def vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassIn
         With the digest of every byte, see `files.whole_digest`.
     facts : dataclass, optional
         What a later run wants to know without reading the files.
+    state : {"done", "void"}
+        "void": they are not what they should be, and only ours.
     """
     stamps = []
     for path in files:
@@ -176,21 +193,32 @@ def vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassIn
         except OSError as error:
             raise OutputError(f"{path} cannot be read back ({reason_of(error)}); run again.") from error
     plain = {} if facts is None else asdict(facts)
-    _write(record, Record(key, tuple(stamps), tuple(files.values()), plain))
+    _write(record, Record(key, tuple(stamps), tuple(files.values()), plain, state))
 
 
 def vouch_when_on_disk(
-    record: Path, key: str, files: Mapping[Path, str], facts: "DataclassInstance | None" = None
+    record: Path,
+    key: str,
+    files: Mapping[Path, str],
+    facts: "DataclassInstance | None" = None,
+    *,
+    state: Literal["done", "void"] = "done",
 ) -> None:
     """Do what `vouch` does, once the disk has the files; in `vouching_in_background` without waiting for that."""
     if _background is None:
-        _sync_and_vouch(record, key, files, facts)
+        _sync_and_vouch(record, key, files, facts, state)
     else:
         pool, waiting = _background
-        waiting.append(pool.submit(_sync_and_vouch, record, key, files, facts))
+        waiting.append(pool.submit(_sync_and_vouch, record, key, files, facts, state))
 
 
-def _sync_and_vouch(record: Path, key: str, files: Mapping[Path, str], facts: "DataclassInstance | None") -> None:
+def _sync_and_vouch(
+    record: Path,
+    key: str,
+    files: Mapping[Path, str],
+    facts: "DataclassInstance | None",
+    state: Literal["done", "void"],
+) -> None:
     try:
         for path in files:
             sync_file(path)
@@ -200,7 +228,7 @@ def _sync_and_vouch(record: Path, key: str, files: Mapping[Path, str], facts: "D
         raise OutputError(
             f"{next(iter(files))} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
-    vouch(record, key, files, facts)
+    vouch(record, key, files, facts, state=state)
 
 
 @contextmanager

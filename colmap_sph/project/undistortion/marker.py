@@ -47,6 +47,8 @@ class Marker:
         Digest of each file of the workspace's model as it was written, by its name.
     version : int
         Of the program's marker: what version 1 lists is other things.
+    has_masks : bool
+        Of version 1: whether masks were undistorted, too.
     """
 
     model: str
@@ -54,6 +56,7 @@ class Marker:
     images: tuple[str, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
     version: int = _VERSION
+    has_masks: bool = False
 
     @property
     def is_finished(self) -> bool:
@@ -73,6 +76,7 @@ class _OldMarker:
     version: Literal[1]
     model: str
     options: dict[str, Any]
+    masks: Any = None
 
 
 def read_marker(workspace: Workspace) -> Marker | None:
@@ -84,7 +88,7 @@ def read_marker(workspace: Workspace) -> Marker | None:
             return marker
         old = read_json(path, _OldMarker, max_bytes=_MAX_BYTES)
         if old is not None:
-            return Marker(old.model, old.options, version=1)
+            return Marker(old.model, old.options, version=1, has_masks=old.masks is not None)
     return None
 
 
@@ -147,7 +151,7 @@ def adopt(workspace: Workspace, marker: Marker) -> Marker:
     for path in (*(workspace.root / name for name in _SCRIPTS), _old_scratch(workspace)):
         remove(path)
     names = tuple(names_in_model(workspace))
-    marker = replace(marker, images=names, files=_digests(workspace.sparse_dir), version=_VERSION)
+    marker = replace(marker, images=names, files=_digests(workspace.sparse_dir), version=_VERSION, has_masks=False)
     write_marker(workspace, marker)
     return marker
 
