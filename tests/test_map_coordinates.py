@@ -138,6 +138,17 @@ def test_local_workspace_is_made_again(near: Near, tmp_path: Path) -> None:
     assert_same_cloud(near.dense, tmp_path / "dense", (0.0, 0.0, 0.0))
 
 
+def test_a_local_cloud_that_the_user_cleaned_is_kept(near: Near, tmp_path: Path) -> None:
+    sparse = move(near.project / "sparse" / "0", UTM, tmp_path / "sparse" / "0")
+    (tmp_path / "images").symlink_to(near.project / "images")
+    colmap_sph.run(sparse, options=OPTIONS)
+    workspace = Workspace(tmp_path / "dense")
+    cloud = Workspace(workspace.local_dir).fused_path
+    cloud.write_bytes(b"cleaned")
+    assert remove_recorded(workspace) == [cloud]
+    assert cloud.read_bytes() == b"cleaned"
+
+
 def test_far_model_without_tracks(near: Near, tmp_path: Path) -> None:
     """Pairs by viewing frusta and fusion by partners do not mind the coordinates either."""
     model = pycolmap.Reconstruction(near.project / "sparse" / "0")

@@ -145,6 +145,7 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
     OutputError
         The cloud in map coordinates cannot be written.
     """
+    Workspace(workspace.local_dir).fused_path.unlink(missing_ok=True)
     remove_local_workspace(workspace)
     if origin.any():
         _keep_local_workspace(workspace, Workspace(scratch), origin)
@@ -155,14 +156,13 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
 
 
 def remove_local_workspace(workspace: Workspace) -> None:
-    """Remove what this program left there; a mesh that COLMAP made there stays."""
+    """Remove what this program left there but the cloud, of which a record knows; a mesh that COLMAP made stays."""
     local = Workspace(workspace.local_dir)
     for link in (local.images_dir, local.stereo_dir, local.visibility_path):
         if link.is_symlink():
             link.unlink()
     for name in (*MODEL_FILES, *RIG_FILES):
         (local.sparse_dir / f"{name}.bin").unlink(missing_ok=True)
-    local.fused_path.unlink(missing_ok=True)
     workspace.local_origin_path.unlink(missing_ok=True)
     for folder in (local.sparse_dir, local.root):
         with suppress(OSError):  # not there, or not empty
