@@ -187,6 +187,20 @@ def test_finished_workspace_is_reused(tmp_path: Path) -> None:
     assert times(workspace) == before
 
 
+def test_a_finished_workspace_needs_no_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk that the results have filled is no reason to refuse other options."""
+    sparse = make_project(tmp_path)
+    monkeypatch.setattr("colmap_sph.project.undistortion.model.free_space", lambda _: 0)
+    with pytest.raises(OutputError, match="need about"):
+        prepare(sparse, tmp_path / "dense")
+    with monkeypatch.context() as patch:
+        patch.setattr("colmap_sph.project.undistortion.model.free_space", lambda _: 1 << 40)
+        prepare(sparse, tmp_path / "dense")
+    prepare(sparse, tmp_path / "dense")
+    with pytest.raises(OutputError, match="need about"):
+        prepare(sparse, tmp_path / "dense", overwrite=True)
+
+
 def test_a_copied_project_is_known_by_its_content(tmp_path: Path) -> None:
     sparse = make_project(tmp_path / "project", "OPENCV", (0.1, 0.0, 0.0, 0.0))
     prepare(sparse, tmp_path / "project" / "dense")

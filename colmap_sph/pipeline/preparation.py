@@ -142,8 +142,10 @@ class Preparation:
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""
-        check_space(self._originals, images, self.workspace.root, self._options.undistortion)
         found = self._found
+        missing = [name for name in images if self._overwrite or not self.workspace.image_path(name).exists()]
+        if missing:  # a workspace that is there needs no more space
+            check_space(self._originals, missing, self.workspace.root, self._options.undistortion)
         if found is not None and found.version == 1:
             self._adopt_images(has_masks=found.has_masks)
             found = adopt(self.workspace, found)
