@@ -16,7 +16,7 @@ from PIL import Image, ImageOps, PngImagePlugin
 from projects import read_picture
 
 from colmap_sph.errors import InputError
-from colmap_sph.project.images.decoding import read_pixels
+from colmap_sph.project.images.decoding import read_header, read_pixels
 from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.images.reading import image_problem, read_colours, read_grey, read_whole_grey
 
@@ -390,3 +390,15 @@ def test_grey_values_of_jpeg_files_are_those_stored(tmp_path: Path) -> None:
     read = read_grey(path)
     assert read.dtype == np.uint8
     np.testing.assert_allclose(read.astype(int), grey, atol=1)
+
+
+@pytest.mark.parametrize("num_segments", [0, 1, 2, 5])
+def test_jpeg_headers_of_any_length(num_segments: int, tmp_path: Path) -> None:
+    """Up to several times what is read of a file at first."""
+    path = tmp_path / "a.jpg"
+    assert cv2.imwrite(str(path), noise(3, "uint8"))
+    data = path.read_bytes()
+    path.write_bytes(data[:2] + num_segments * (b"\xff\xe2\xff\xff" + bytes(65533)) + data[2:])
+    header = read_header(path)
+    assert (header.width, header.height, header.channels, header.dtype) == (WIDTH, HEIGHT, 3, "uint8")
+    assert image_problem(path, WIDTH, HEIGHT) is None

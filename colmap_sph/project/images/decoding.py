@@ -25,6 +25,8 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 # Its first chunk: length, kind, width, height, bits, kind of colours, compression, filter, interlacing, checksum.
 _PNG_HEADER = struct.Struct(">I4sIIBB3xI")
 _PNG_GREY = (0, 4)
+# Headers with a preview and profiles of colour are mostly shorter.
+_JPEG_HEADER_BYTES = 1 << 17
 # COLMAP leaves out the last channel of two or four: transparency.
 _COLOUR_CHANNELS = {1: 1, 2: 1, 3: 3, 4: 3}
 
@@ -73,7 +75,7 @@ def read_header(path: Path) -> Header:
     OSError
         It cannot be read.
     """
-    if is_jpeg(path) and (found := jpeg.jpeg_size(path.read_bytes())) is not None:
+    if is_jpeg(path) and (found := _jpeg_size(path)) is not None:
         width, height, space = found
         return Header(width, height, 1 if space == "Gray" else 3, "uint8")
     if _starts_with(path, _PNG_START):
@@ -120,6 +122,13 @@ def read_pixels(path: Path, *, deep: bool = True) -> NDArray[Any]:
         if pixels is None or image.has_error:
             raise DamagedError(_in_short(image.geterror(), path))
     return np.asarray(pixels).reshape(header.height, header.width, header.channels)
+
+
+def _jpeg_size(path: Path) -> tuple[int, int, str] | None:
+    """As `jpeg.jpeg_size`; of a file whose header ends soon the rest is not read."""
+    with path.open("rb") as file:
+        start = file.read(_JPEG_HEADER_BYTES)
+        return jpeg.jpeg_size(start) or jpeg.jpeg_size(start + file.read())
 
 
 def _starts_with(path: Path, start: bytes) -> bool:
