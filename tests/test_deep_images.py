@@ -8,14 +8,16 @@ import pycolmap
 import pytest
 from conftest import keep_images
 from PIL import Image
-from projects import FOUR_NAMES, prepare, read_picture
+from projects import FOUR_NAMES, make_context, prepare, read_picture
 from test_images import colmaps, orientation, write
+from test_undistortion import make_project
 
 import colmap_sph
 from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.stages.check_images import Known, read_known, write_known
 from colmap_sph.project.images.decoding import read_pixels
-from colmap_sph.project.images.depth import ValueRange, common_ranges, describe_ranges, sample_values
+from colmap_sph.project.images.depth import ValueRange, ValueSample, common_ranges, describe_ranges, sample_values
 from colmap_sph.project.images.undistorting import undistort_deep, write_undistorted
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
@@ -217,3 +219,35 @@ def test_a_workspace_is_not_turned(block: DemoBlock, project: Path) -> None:
     for name in FOUR_NAMES:
         assert orientation(workspace.image_path(name)) == 1
         assert read_picture(workspace.image_path(name)).shape == (240, 320, 3)
+
+
+@pytest.mark.parametrize("old", [b"16-bit grey", b'"quantiles":[7', b'"check":"', b'"size":[96'])
+def test_a_damaged_list_of_images_is_not_believed(old: bytes, tmp_path: Path) -> None:
+    """Also where a stranger has made its digest fit."""
+    sparse = make_project(tmp_path)
+    for number, path in enumerate(sorted((tmp_path / "images").rglob("*.png"))):
+        shape = read_picture(path).shape[:2]
+        write(path, np.random.default_rng(number).integers(7600, 8100, (*shape, 1)).astype(np.uint16), "uint16")
+    workspace = prepare(sparse, tmp_path / "dense")
+    known = workspace.state_dir / "originals.json"
+    whole = known.read_bytes()
+    image = workspace.image_path("a.png").read_bytes()
+    assert old in whole
+    known.write_bytes(whole.replace(old, old[:-1] + b"5", 1))
+    prepare(sparse, workspace.root)
+    assert known.read_bytes() == whole
+    key = make_context(workspace).keys.known_images()
+    images = {"a.png": Known((96, 64), "digest", (1, 2), ValueSample("odd", (1.0,)))}
+    assert read_known(known, key)
+    write_known(known, key, images)
+    assert read_known(known, key) == {}
+    prepare(sparse, workspace.root)
+    assert workspace.image_path("a.png").read_bytes() == image
+
+
+def test_what_is_known_of_images_depends_on_the_program(tmp_path: Path) -> None:
+    """Another version may find damage in them that this one does not."""
+    images = {"a.png": Known((96, 64), "digest", (1, 2))}
+    write_known(tmp_path / "images.json", "key", images)
+    assert read_known(tmp_path / "images.json", "key") == images
+    assert read_known(tmp_path / "images.json", "other") == {}

@@ -17,6 +17,7 @@ from colmap_sph.stereo.rectified_pair import RectifiedPair
 _MAKERS = {
     kind: f"colmap_sph.pipeline.stages.{module}"
     for kind, module in {
+        "known images": "check_images",
         "undistorted": "undistort",
         "pair": "match",
         "vote": "vote",
@@ -73,6 +74,10 @@ class Keys:
 
     def _key(self, kind: str, *parts: object) -> str:
         return digest(kind, self._programs.get(kind), self.fresh, *parts)
+
+    def known_images(self) -> str:
+        """Of what is known of images: how they were looked at. Their contents stand beside it."""
+        return self._key("known images")
 
     def undistorted(self, image: str, camera: tuple[object, ...], values: object, mask: Path | None) -> str:
         """Of an undistorted image.

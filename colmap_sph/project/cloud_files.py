@@ -156,7 +156,7 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
 
 
 def remove_local_workspace(workspace: Workspace) -> None:
-    """Remove what this program left there but the cloud, of which a record knows; a mesh that COLMAP made stays."""
+    """Remove what this program left there but the cloud, of which a record knows; what COLMAP made stays."""
     local = Workspace(workspace.local_dir)
     for link in (local.images_dir, local.stereo_dir, local.visibility_path):
         if link.is_symlink():

@@ -4,11 +4,13 @@ A file whose size, times and place on the disk are as they were is not read agai
 its digest, and decoded only if that is new.
 """
 
-import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
+
+import msgspec
+import xxhash
 
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.digests import file_digest
@@ -66,6 +68,44 @@ class Known:
     sample: ValueSample | None = None
 
 
+class KnownFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What is kept of images from run to run.
+
+    Attributes
+    ----------
+    check : str
+        Digest of the code that looked at them, and of the rest.
+    images : dict of str to Known
+        In JSON, by name.
+    """
+
+    check: str
+    images: msgspec.Raw
+
+
+def read_known(path: Path, key: str) -> dict[str, Known]:
+    """Read what `write_known` wrote under this key; nothing where the file holds anything else."""
+    file = read_json(path, KnownFile, max_bytes=_MAX_BYTES)
+    if file is None or file.check != _check(key, file.images):
+        return {}
+    try:
+        return msgspec.json.decode(file.images, type=dict[str, Known])
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        return {}
+
+
+def write_known(path: Path, key: str, images: Mapping[str, Known]) -> None:
+    """Keep what is known of images; `OutputError` where that fails."""
+    known = msgspec.Raw(msgspec.json.encode(images))
+    make_dir(path.parent)
+    with atomic_file(path) as file:
+        file.write(msgspec.json.encode(KnownFile(_check(key, known), known)))
+
+
+def _check(key: str, images: msgspec.Raw) -> str:
+    return xxhash.xxh3_128_hexdigest(key.encode() + bytes(images))
+
+
 @dataclass(frozen=True)
 class ImagePlaces:
     """Where images are, and how to speak of them.
@@ -116,10 +156,8 @@ class CheckStage(Stage[str, ImageFile]):
         self._places = places
         self._bad: dict[str, str] = {}
         self._file = context.workspace.state_dir / f"{places.what}.json"
-        known = (
-            None if context.keys.fresh or verify else read_json(self._file, dict[str, Known], max_bytes=_MAX_BYTES)
-        )
-        self._known = known or {}
+        self._key = context.keys.known_images()
+        self._known = {} if context.keys.fresh or verify else read_known(self._file, self._key)
         self._seen: dict[str, Known] = {}
 
     def job(self, item: str) -> Job[ImageFile]:
@@ -154,9 +192,7 @@ class CheckStage(Stage[str, ImageFile]):
             if isinstance(result.facts, ImageFacts)
         }
         if good != self._known:
-            make_dir(self._file.parent)
-            with atomic_file(self._file) as file:
-                file.write(json.dumps({name: asdict(known) for name, known in good.items()}, indent=0).encode())
+            write_known(self._file, self._key, good)
 
     def tell_problems(self) -> None:
         """Tell what is wrong with bad images; `InputError` where there is no other."""

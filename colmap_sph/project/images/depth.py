@@ -7,9 +7,10 @@ stretched alike before: one range of values for all of a kind, so that the same 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, reason_of
@@ -49,8 +50,8 @@ class ValueSample:
         Its values at evenly spaced ranks.
     """
 
-    kind: str
-    quantiles: tuple[float, ...]
+    kind: Annotated[str, Meta(pattern="^(16-bit|floating-point) (grey|colour)$")]
+    quantiles: Annotated[tuple[float, ...], Meta(max_length=_QUANTILES)]
 
 
 def sample_values(path: Path) -> ValueSample | None:
