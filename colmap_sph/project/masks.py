@@ -14,9 +14,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.images.decoding import read_pixels
+from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.workspace import mask_path
 
@@ -48,10 +49,20 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8] | None:
     """
     if not path.exists():
         return None
-    problem = image_problem(path, width, height)
+    problem = image_problem(path, width, height, decode=False)
     if problem is not None:
-        raise InputError(f"The mask {path} {problem.replace('its camera', 'its image')}; mend or remove it.")
-    return np.where((read_pixels(path) != 0).any(axis=2), np.uint8(255), np.uint8(0))
+        raise _unusable(path, problem.replace("its camera", "its image"))
+    try:
+        pixels = read_pixels(path)
+    except OSError as error:
+        raise _unusable(path, f"cannot be read ({reason_of(error)})") from error
+    except DamagedError as error:
+        raise _unusable(path, f"is damaged or no image ({error})") from error
+    return np.where((pixels != 0).any(axis=2), np.uint8(255), np.uint8(0))
+
+
+def _unusable(path: Path, problem: str) -> InputError:
+    return InputError(f"The mask {path} {problem}; mend or remove it.")
 
 
 def check_masks(
