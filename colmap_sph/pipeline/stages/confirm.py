@@ -106,13 +106,14 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         self._vote_keys = keys_of(votes)
         self._voted = {name: result.facts.coverage for name, result in votes.items()}
         self._all_partners = partners_of(pair_keys)
+        self._tracks = context.sparse_tracks  # found once, and not by every worker at a time
 
     def job(self, item: str) -> Job[ConfirmTask]:
         """See `Stage.job`."""
         options = self.context.options
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
-        sights = self.context.sparse_tracks.sights(item)
+        sights = self._tracks.sights(item)
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, sights)
         maps = self.context.map_files(item, "geometric")
         task = ConfirmTask(
