@@ -18,6 +18,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.given.image_places import tell_problems
+from colmap_sph.project.images.decoding import is_jpeg
 from colmap_sph.project.images.depth import ValueSample, sample_values
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.state.records import read_json
@@ -30,9 +31,11 @@ Size = tuple[int, int]
 
 _MAX_BYTES = 1 << 30
 
-# Processor seconds per megapixel, and largest bytes in use per pixel, while an image is decoded.
+# Processor seconds per megapixel, and largest bytes in use per pixel, while an image is decoded: other files than
+# JPEG may hold colours as floating-point numbers.
 _SECONDS = 0.012
-_DECODE_BYTES = 12.0
+_JPEG_BYTES = 12.0
+_OTHER_BYTES = 25.0
 
 
 @dataclass(frozen=True)
@@ -175,7 +178,8 @@ class CheckStage(Stage[str, ImageFile]):
         if known is not None and (known.digest, known.size) == (digest, image.size):
             facts = ImageFacts(sample=known.sample)
         pixels = image.size[0] * image.size[1]
-        cost = Cost(_SECONDS * pixels / 1e6, _DECODE_BYTES * pixels, 0.0)
+        memory = (_JPEG_BYTES if is_jpeg(image.path) else _OTHER_BYTES) * pixels
+        cost = Cost(_SECONDS * pixels / 1e6, memory, 0.0)
         return Job(digest, facts, cost, image)
 
     def skip(self, item: str, reason: str) -> None:

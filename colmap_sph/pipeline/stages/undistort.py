@@ -35,10 +35,12 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# Processor seconds and bytes on disk per pixel of the original image; largest bytes in use, and of a process.
+# Processor seconds and bytes on disk per pixel of the original image; largest bytes in use, also where it has more
+# than 8 bits, and of a process.
 _SECONDS = 0.06e-6
 _FILE_BYTES = 1.0
 _BYTES = 14.0
+_DEEP_BYTES = 25.0
 _PROCESS_BYTES = 120e6
 
 _thread = threading.local()
@@ -183,8 +185,10 @@ class UndistortStage(Stage[str, UndistortTask]):
         )
         known = self._is_as_made(task, files) or self._is_changed_by_user(task, files)
         pixels = camera.width * camera.height
-        process = _PROCESS_BYTES if image.is_colmaps else 0.0
-        cost = Cost(_SECONDS * pixels, process + _BYTES * pixels, _FILE_BYTES * pixels)
+        memory = (_BYTES if values is None else _DEEP_BYTES) * pixels
+        if image.is_colmaps:
+            memory += _PROCESS_BYTES
+        cost = Cost(_SECONDS * pixels, memory, _FILE_BYTES * pixels)
         return Job(key, Facts() if known else None, cost, task)
 
     def _is_as_made(self, task: UndistortTask, files: list[Path]) -> bool:
