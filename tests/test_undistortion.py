@@ -353,6 +353,24 @@ def test_workspace_of_an_earlier_version(tmp_path: Path) -> None:
     assert old.patch_match_cfg_path.read_text() == "a.png\nb.png\n"
 
 
+def test_a_model_in_a_workspace_of_an_earlier_version_that_the_user_reduced(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path, "OPENCV", (0.1, 0.0, 0.0, 0.0))
+    new = prepare(sparse, tmp_path / "new")
+    old = Workspace(tmp_path / "dense")
+    pycolmap.undistort_images(old.root, sparse, tmp_path / "images")
+    model = pycolmap.Reconstruction(old.sparse_dir)
+    model.deregister_frame(model.image(4).frame_id)
+    model.write_binary(old.sparse_dir)
+    theirs = {path.name: path.read_bytes() for path in old.sparse_dir.iterdir()}
+    marker = {"version": 1, "options": {"max_image_size": -1}, "images": "i", "masks": None}
+    marker["model"] = json.loads(new.marker_path.read_bytes())["model"]
+    old.state_dir.mkdir()
+    old.marker_path.write_text(json.dumps(marker))
+    prepare(sparse, old.root)
+    assert {path.stem: path.read_bytes() for path in old.sparse_dir.glob("*.backup")} == theirs
+    assert len(read_scene(old.sparse_dir).views) == 4
+
+
 @pytest.mark.parametrize("given", [False, True])
 def test_masks_in_a_workspace_of_an_earlier_version(tmp_path: Path, given: bool) -> None:
     """Those that it made are replaced; where it was given none they are the user's, and are used."""

@@ -36,6 +36,7 @@ from colmap_sph.project.undistortion.marker import (
     check_made_from,
     check_ours,
     is_model_changed,
+    names_in_model,
     publish_model,
     remove_model,
     set_model_aside,
@@ -147,6 +148,8 @@ class Preparation:
         if missing:  # a workspace that is there needs no more space
             check_space(self._originals, missing, self.workspace.root, self._options.undistortion)
         if found is not None and found.version == 1:
+            if names_in_model(self.workspace) != sorted(images):  # it will be replaced, and may be the user's
+                set_model_aside(self.workspace, found)
             self._adopt_images(has_masks=found.has_masks)
             found = adopt(self.workspace, found)
         if found is not None and self._overwrite:
