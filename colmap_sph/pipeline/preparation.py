@@ -5,6 +5,7 @@ says of itself that it is not finished, and that the next run goes on with.
 """
 
 import logging
+import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +19,7 @@ from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts, ImagePlaces
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.undistort import UndistortStage
-from colmap_sph.project.files import scratch_folder
+from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.images.depth import common_ranges, describe_ranges
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.project import Project
@@ -182,7 +183,10 @@ class Preparation:
         self.workspace.create_stereo_dirs(names)
         scratch = self.workspace.undistortion_scratch_dir
         with scratch_folder(scratch):
-            made = self._undistort_model(scratch, names)
+            # Of its own for each run, as the process of one that was killed may still be at work.
+            folder = scratch / str(os.getpid())
+            make_dir(folder)
+            made = self._undistort_model(folder, names)
             publish_model(self.workspace, self._marker, made, names)
         logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
 

@@ -1,6 +1,7 @@
 """With a sparse model: every original image → the undistorted one, with its mask."""
 
 import logging
+import os
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
@@ -166,8 +167,9 @@ class UndistortStage(Stage[str, UndistortTask]):
         camera = plain_camera(self._cameras[item])
         values = self._values.get(item)
         mask = self._originals.mask_of(item)
-        # Of its own for each image, as its name may be another's without the folders.
-        scratch = workspace.undistortion_scratch_dir / str(self._numbers[item])
+        # Of its own for each image, as its name may be another's without the folders; and for each run, as the
+        # process of one that was killed may still be at work.
+        scratch = workspace.undistortion_scratch_dir / f"{os.getpid()}-{self._numbers[item]}"
         image = ImageToUndistort(
             self._originals.image_path(item), values, mask, camera, options, scratch, scratch / "masks"
         )
