@@ -197,6 +197,19 @@ def test_a_list_of_images_that_says_the_same_is_left_alone(finished: Finished) -
     assert cfg_of(finished.dense).stat().st_ino == before.st_ino
 
 
+def test_the_list_that_undistortion_wrote_is_replaced(finished: Finished) -> None:
+    """Also where an image has come to the model since."""
+    dense, image = finished.project / "other", finished.project / "images" / NAMES[3]
+    whole = image.read_bytes()
+    image.write_bytes(b"damaged")
+    model = finished.project / "sparse/0"
+    assert list(colmap_sph.run(model, output=dense, options=OPTIONS).skipped_images) == [NAMES[3]]
+    image.write_bytes(whole)
+    colmap_sph.run(model, output=dense, options=OPTIONS)
+    assert cfg_of(dense).read_text().split() == NAMES
+    assert backups(dense) == {}
+
+
 def test_an_edited_list_of_images_is_kept(finished: Finished, caplog: pytest.LogCaptureFixture) -> None:
     path = cfg_of(finished.dense)
     path.write_text(f"{NAMES[2]}\n")

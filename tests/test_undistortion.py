@@ -76,7 +76,7 @@ def test_workspace_of_undistorted_images(tmp_path: Path, text: bool) -> None:
     # Without COLMAP's scripts, which would write over our maps.
     assert sorted(path.name for path in workspace.root.iterdir()) == ["colmap_sph", "images", "sparse", "stereo"]
     state = sorted(path.name for path in workspace.state_dir.iterdir())
-    assert state == ["originals.json", "state", "undistortion.json"]
+    assert state == ["fusion_cfg.json", "originals.json", "state", "undistortion.json"]
 
 
 def test_max_image_size(tmp_path: Path) -> None:

@@ -17,7 +17,8 @@ from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.files import atomic_file, make_dir, remove, set_aside
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
-from colmap_sph.project.state.records import read_json
+from colmap_sph.project.state.ownership import fusion_cfg_place
+from colmap_sph.project.state.records import claim, read_json
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -217,6 +218,8 @@ def publish_model(workspace: Workspace, marker: Marker, made: Path, names: Seque
         write_patch_match_cfg(workspace.patch_match_cfg_path, dict.fromkeys(names, _SOURCES))
     if not workspace.fusion_cfg_path.exists():
         write_fusion_cfg(workspace.fusion_cfg_path, names)
+        place = fusion_cfg_place(workspace)
+        claim(place.record, place.files)
     write_marker(workspace, replace(marker, images=tuple(names), files=files))
 
 
