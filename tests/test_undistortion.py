@@ -540,3 +540,24 @@ def test_what_is_no_workspace_is_told(tmp_path: Path) -> None:
     (tmp_path / "sparse").mkdir()
     with pytest.raises(InputError, match="No COLMAP model"):
         open_workspace(Project(workspace=tmp_path))
+
+
+def test_verify_makes_a_changed_image_again(tmp_path: Path) -> None:
+    """Bit rot that still is an image looks like an image that the user has exchanged."""
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    path = workspace.image_path("a.png")
+    sound = path.read_bytes()
+    path.write_bytes(workspace.image_path("b.png").read_bytes())
+    prepare(sparse, workspace.root)
+    assert path.read_bytes() != sound
+    Preparation(Project(sparse, output=workspace.root), RunOptions(), verify=True).run(execute)
+    assert path.read_bytes() == sound
+    assert path.with_name("a.png.backup").read_bytes() == workspace.image_path("b.png").read_bytes()
+
+
+def test_masks_that_are_a_link_to_itself(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    (tmp_path / "masks").symlink_to("masks")
+    with pytest.raises(InputError, match="mask folder .*masks does not exist"):
+        prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")

@@ -4,6 +4,7 @@ import sqlite3
 from pathlib import Path
 
 from colmap_sph.errors import InputError, reason_of
+from colmap_sph.project.files import real_path
 
 # COLMAP numbers a pair `image_id1 * 2147483647 + image_id2`.
 _MAX_NUM_IMAGES = 2147483647
@@ -11,7 +12,7 @@ _MAX_NUM_IMAGES = 2147483647
 
 def find_database(model_dir: Path) -> Path | None:
     """COLMAP's ``database.db`` beside or above the model, if there is one."""
-    folders = [model_dir, *model_dir.resolve().parents[:2]]
+    folders = [model_dir, *real_path(model_dir).parents[:2]]
     return next((f / "database.db" for f in folders if (f / "database.db").is_file()), None)
 
 
@@ -35,7 +36,7 @@ def read_verified_matches(database: Path) -> dict[tuple[str, str], int]:
         The file cannot be read, or is not a COLMAP database.
     """
     try:
-        connection = sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)
+        connection = sqlite3.connect(f"{real_path(database).as_uri()}?mode=ro", uri=True)
         try:
             name_of = dict(connection.execute("SELECT image_id, name FROM images"))
             rows = connection.execute("SELECT pair_id, rows FROM two_view_geometries WHERE rows > 0").fetchall()

@@ -35,6 +35,11 @@ def make_dir(folder: Path) -> None:
         ) from error
 
 
+def real_path(path: Path) -> Path:
+    """Where a path leads to, through all links; one that leads to itself is taken as it is."""
+    return Path(os.path.realpath(path))
+
+
 def free_space(path: Path) -> int:
     """Free bytes on the disk where a file or folder is, or would be."""
     return shutil.disk_usage(next(each for each in (path, *path.absolute().parents) if each.exists())).free

@@ -15,7 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.files import atomic_file, make_dir, real_path
 from colmap_sph.project.images.decoding import read_pixels
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.reading import image_problem
@@ -110,7 +110,7 @@ def warn_of_unused_masks(folder: Path, names: Iterable[str], image_dir: Path) ->
     """Report files in a folder of masks that belong to none of the images `names`."""
     names = list(names)
     known = {mask_path(folder, name) for name in names}
-    if folder.resolve() == image_dir.resolve():
+    if real_path(folder) == real_path(image_dir):
         known |= {folder / name for name in names}
     files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path not in known)
     unused = [

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from colmap_sph.errors import InputError, OptionError
 from colmap_sph.project.database import find_database
+from colmap_sph.project.files import real_path
 from colmap_sph.project.masks import check_masks
 from colmap_sph.project.sparse_model import cameras_of_images, has_model, load_model, model_files, models_inside
 from colmap_sph.project.undistortion.marker import refuse_unfinished
@@ -68,7 +69,7 @@ class Project:
         if self.output is not None:
             return self.output
         assert self.model is not None
-        project = self.model.resolve()
+        project = real_path(self.model)
         if project.name.isdigit():  # sparse/0, but not a project that is called 2024
             project = project.parent
         if project.name == "sparse":

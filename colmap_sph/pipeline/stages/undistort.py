@@ -200,7 +200,12 @@ class UndistortStage(Stage[str, UndistortTask]):
         return not self._verify or whole_digests(task.record, len(files)) == tuple(map(whole_digest, files))
 
     def _is_changed_by_user(self, task: UndistortTask, files: list[Path]) -> bool:
-        """Whether an image was made and then exchanged for another good one, or its mask was: they are used."""
+        """Whether an image was made and then exchanged for another good one, or its mask was: they are used.
+
+        Not with `verify`: bit rot may look like that, too.
+        """
+        if self._verify:
+            return False
         record = read_record(task.record)
         is_made = record is not None and (record.key, record.state) == (task.key, "done")
         if not is_made or not all(path.is_file() for path in files):
@@ -223,8 +228,10 @@ class UndistortStage(Stage[str, UndistortTask]):
         try:
             yield
         finally:
-            while _children:
-                _children.pop().close()
+            folder = self.context.workspace.undistortion_scratch_dir
+            for child in [child for child in _children if child.folder == folder]:
+                _children.remove(child)
+                child.close()
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""

@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from colmap_sph.errors import InputError
+from colmap_sph.project.files import real_path
 from colmap_sph.project.images.reading import WrongSize
 
 _Size = tuple[int, int]
@@ -38,7 +39,7 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
         under another spelling.
     """
     # Of a link to a model both where it is and where it leads to.
-    places = (Path.cwd() / model_dir, model_dir.resolve())
+    places = (Path.cwd() / model_dir, real_path(model_dir))
     parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
     folders = list(dict.fromkeys(parent / "images" for parent in parents))
     found = [sum((folder / name).is_file() for name in names) for folder in folders]

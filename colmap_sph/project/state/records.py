@@ -7,8 +7,9 @@ import hashlib
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -69,7 +70,6 @@ class Record(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     state: Literal["done", "void", "doubtful", "making"] = "done"
 
 
-_background: tuple[ThreadPoolExecutor, list["Future[None]"]] | None = None
 _UNREADABLE = Record(state="void")
 
 
@@ -205,11 +205,8 @@ def vouch_when_on_disk(
     state: Literal["done", "void"] = "done",
 ) -> None:
     """Do what `vouch` does, once the disk has the files; in `vouching_in_background` without waiting for that."""
-    if _background is None:
+    if not _background.submit(_sync_and_vouch, record, key, files, facts, state):
         _sync_and_vouch(record, key, files, facts, state)
-    else:
-        pool, waiting = _background
-        waiting.append(pool.submit(_sync_and_vouch, record, key, files, facts, state))
 
 
 def _sync_and_vouch(
@@ -231,6 +228,47 @@ def _sync_and_vouch(
     vouch(record, key, files, facts, state=state)
 
 
+class _Background:
+    """A thread that waits for the disk, while any run wants it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pool: ThreadPoolExecutor | None = None
+        self._runs = 0
+        self._waiting: list[Future[None]] = []
+
+    def submit(self, function: Callable[..., None], *arguments: object) -> bool:
+        """Have a function called later; False where no run wants the thread."""
+        with self._lock:
+            if self._pool is None:
+                return False
+            self._waiting.append(self._pool.submit(function, *arguments))
+            return True
+
+    def open(self) -> None:
+        """A run begins that wants it."""
+        with self._lock:
+            self._runs += 1
+            self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="vouch")
+
+    def close(self) -> list["Future[None]"]:
+        """A run ends; returns all that is done now, of whichever run."""
+        with self._lock:
+            done = self._waiting
+            self._waiting = []
+            self._runs -= 1
+            pool = self._pool
+            if self._runs == 0:
+                self._pool = None
+        wait(done)
+        if pool is not None and self._runs == 0:
+            pool.shutdown()
+        return done
+
+
+_background = _Background()
+
+
 @contextmanager
 def vouching_in_background() -> Iterator[None]:
     """Let a thread of its own wait for the disk meanwhile, so that no worker does.
@@ -240,15 +278,12 @@ def vouching_in_background() -> Iterator[None]:
     OutputError
         At the end, where a file or a record could not be written.
     """
-    global _background
-    with ThreadPoolExecutor(1, thread_name_prefix="vouch") as pool:
-        waiting: list[Future[None]] = []
-        _background = (pool, waiting)
-        try:
-            yield
-        finally:
-            _background = None
-    for each in waiting:
+    _background.open()
+    try:
+        yield
+    finally:
+        done = _background.close()
+    for each in done:
         each.result()
 
 

@@ -8,6 +8,7 @@ import pycolmap
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import refuse_panoramas
+from colmap_sph.project.files import real_path
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import image_names, load_model, model_files
@@ -51,9 +52,9 @@ class Originals:
 
     def check_outside(self, workspace: Workspace) -> None:
         """Raise `InputError` where the model, the images or the masks lie where a workspace is to be written."""
-        root = workspace.root.resolve()
+        root = real_path(workspace.root)
         for option, place in (("model", self.model_dir), ("images", self.image_dir), ("masks", self.mask_dir)):
-            if place is not None and place.resolve().is_relative_to(root):
+            if place is not None and real_path(place).is_relative_to(root):
                 raise InputError(
                     f"--{option} {place} lies inside the workspace {workspace.root} that is to be written; choose "
                     "another --output."
