@@ -559,5 +559,5 @@ def test_verify_makes_a_changed_image_again(tmp_path: Path) -> None:
 def test_masks_that_are_a_link_to_itself(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     (tmp_path / "masks").symlink_to("masks")
-    with pytest.raises(InputError, match="mask folder .*masks does not exist"):
+    with pytest.raises(InputError, match=r"mask folder .*masks does not exist"):
         prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
