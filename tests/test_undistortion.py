@@ -306,6 +306,21 @@ def test_a_damaged_marker_is_told_and_overwrite_helps(tmp_path: Path) -> None:
     assert (workspace.sparse_dir / "images.bin.backup3").is_file()
 
 
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_a_damaged_model_of_ours_is_made_again(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    path = workspace.sparse_dir / f"{name}.bin"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-3])
+    prepare(sparse, workspace.root)
+    assert path.read_bytes() == whole
+    assert path.with_name(f"{name}.bin.backup").read_bytes() == whole[:-3]
+    assert f"{path} is not what this program wrote there; it is now {name}.bin.backup" in caplog.text
+
+
 class Killed(BaseException):
     """The process ends without a chance to clean up."""
 
