@@ -18,6 +18,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.check_images import Known, read_known, write_known
 from colmap_sph.project.images.decoding import read_pixels
 from colmap_sph.project.images.depth import ValueRange, ValueSample, common_ranges, describe_ranges, sample_values
+from colmap_sph.project.images.reading import read_grey
 from colmap_sph.project.images.undistorting import undistort_deep, write_undistorted
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
@@ -137,6 +138,20 @@ def test_a_common_range_of_all_images(tmp_path: Path) -> None:
     )
     # One more image of the same kind does not make all of them anew.
     assert ranges_of(tmp_path, [cold, warm, thermal(7650, 8090, 2).astype(np.uint16)]) == found
+
+
+def test_what_is_saturated_does_not_count(tmp_path: Path) -> None:
+    """The sun, a fire, or "no value": 5 % of an image hide the range of the rest no more than 0.01 % do."""
+    frame = thermal(7600, 8111).astype(np.uint16)
+    frame[:6] = 65535
+    values = ranges_of(tmp_path, [frame])["16-bit grey"]
+    assert 7500 < values.low <= 7600
+    assert 8111 <= values.high < 8210
+    # In a workspace of others each image by itself.
+    write(tmp_path / "frame.tif", frame, "uint16")
+    grey = read_grey(tmp_path / "frame.tif")
+    assert (grey[:6] == 255).all()
+    assert float(np.ptp(grey[6:])) > 200
 
 
 def test_kelvin(tmp_path: Path) -> None:

@@ -235,6 +235,21 @@ def test_damage_is_noticed(tmp_path: Path, damage: str) -> None:
             read(path)
 
 
+@pytest.mark.parametrize("layout", [{}, {"tile_width": 16, "tile_height": 16}, {"planarconfig": "separate"}])
+def test_every_flipped_bit_of_a_deflated_tiff_is_noticed(tmp_path: Path, layout: dict[str, object]) -> None:
+    """libtiff compares no checksum of a short last strip and of tiles; other bits may change nothing."""
+    path = tmp_path / "image.tif"
+    write(path, smooth(), "uint8", compression="zip", rowsperstrip=64, **layout)
+    whole = path.read_bytes()
+    pixels = read_pixels(path)
+    for place in np.random.default_rng(0).integers(8, len(whole), 150):
+        changed = bytearray(whole)
+        changed[place] ^= 16
+        path.write_bytes(changed)
+        if image_problem(path, 400, 300) is None:
+            np.testing.assert_array_equal(read_pixels(path), pixels)
+
+
 def spoil_jpeg(kind: str) -> bytes:
     """A JPEG file at which libjpeg warns, though all its pixels are right."""
     whole = bytes(cv2.imencode(".jpg", smooth())[1])

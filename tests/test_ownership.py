@@ -108,6 +108,19 @@ def test_what_another_program_wrote_over_ours_is_kept(
     assert finished.dense.joinpath("fused.ply.backup2").read_bytes() == b"another"
 
 
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_an_edit_that_the_samples_do_not_show_is_kept(finished: Finished, overwrite: bool) -> None:
+    """Every byte is looked at before a file is replaced."""
+    path = Workspace(finished.dense).fused_path
+    edited = bytearray(path.read_bytes())
+    edited[len(edited) // 2 + 20] ^= 1
+    path.write_bytes(edited)
+    assert not any(finished.rerun().made.values())
+    options = {} if overwrite else OTHER_FUSION
+    finished.rerun(overwrite=overwrite, **options)
+    assert backups(finished.dense) == {"fused.ply.backup": bytes(edited)}
+
+
 def test_a_run_killed_while_it_writes_leaves_files_of_its_own(
     finished: Finished, monkeypatch: pytest.MonkeyPatch
 ) -> None:

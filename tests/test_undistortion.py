@@ -287,6 +287,55 @@ def test_input_inside_the_output_is_refused(tmp_path: Path, what: str, overwrite
     assert sorted(tmp_path.rglob("*")) == before
 
 
+@pytest.mark.parametrize("what", ["model", "images", "masks"])
+def test_input_that_is_linked_to_the_output_is_refused(tmp_path: Path, what: str) -> None:
+    """Files may lie inside though their folder does not: --overwrite would remove them."""
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    places: dict[str, Path | None] = {"model": sparse, "images": tmp_path / "images", "masks": None}
+    inside = {"model": workspace.sparse_dir, "images": workspace.images_dir, "masks": workspace.images_dir}[what]
+    places[what] = tmp_path / "given"
+    (tmp_path / "given").mkdir()
+    for path in inside.iterdir():
+        (tmp_path / "given" / path.name).symlink_to(path)
+    project = Project(places["model"], places["images"], places["masks"], workspace.root)
+    with pytest.raises(InputError, match=r"given/.* is a link into the workspace .*dense that is to be written"):
+        Preparation(project, RunOptions(), overwrite=True)
+
+
+def test_a_damaged_marker_is_told_and_overwrite_helps(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    made = {path: path.read_bytes() for path in [path for path in workspace.root.rglob("*") if path.is_file()]}
+    whole = workspace.marker_path.read_bytes()
+    for damage in (b"", whole[1:], whole[:-3]):
+        workspace.marker_path.write_bytes(damage)
+        with pytest.raises(InputError, match=r"undistortion\.json is damaged.*--overwrite"):
+            prepare(sparse, workspace.root)
+        prepare(sparse, workspace.root, overwrite=True)
+        assert workspace.marker_path.read_bytes() == whole
+        assert {path: path.read_bytes() for path in made if "colmap_sph" not in path.parts} == {
+            path: content for path, content in made.items() if "colmap_sph" not in path.parts
+        }
+    # Nothing says whose the model was.
+    assert (workspace.sparse_dir / "images.bin.backup3").is_file()
+
+
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
+def test_a_damaged_model_of_ours_is_made_again(
+    tmp_path: Path, name: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    path = workspace.sparse_dir / f"{name}.bin"
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-3])
+    prepare(sparse, workspace.root)
+    assert path.read_bytes() == whole
+    assert path.with_name(f"{name}.bin.backup").read_bytes() == whole[:-3]
+    assert f"{path} is not what this program wrote there; it is now {name}.bin.backup" in caplog.text
+
+
 class Killed(BaseException):
     """The process ends without a chance to clean up."""
 

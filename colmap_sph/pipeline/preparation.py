@@ -187,6 +187,8 @@ class Preparation:
             folder = scratch / str(os.getpid())
             make_dir(folder)
             made = self._undistort_model(folder, names)
+            if self._found is not None:
+                set_model_aside(self.workspace, self._found)  # one that is damaged, see `_is_model_there`
             publish_model(self.workspace, self._marker, made, names)
         logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
 
@@ -202,6 +204,8 @@ class Preparation:
         if found is None or found.version == 1 or not has_model(self.workspace.sparse_dir):
             return False
         if is_model_changed(self.workspace, found):
+            if not names_in_model(self.workspace):
+                return False  # nobody changed it so
             logger.warning(
                 "%s was changed since this program made it; it is used as it is", self.workspace.sparse_dir
             )

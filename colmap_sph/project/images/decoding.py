@@ -16,7 +16,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 from numpy.typing import NDArray
 
-from colmap_sph.project.images import jpeg
+from colmap_sph.project.images import jpeg, tiff
 from colmap_sph.project.images.jpeg import DamagedError
 
 # The kinds that COLMAP's library surely reads; it has others, of which some end the process.
@@ -116,6 +116,8 @@ def read_pixels(path: Path, *, deep: bool = True) -> NDArray[Any]:
             return pixels[..., ::-1]
     if _starts_with(path, _PNG_START):
         _check_png(path.read_bytes())
+    elif any(_starts_with(path, start) for start in tiff.STARTS):
+        tiff.check_tiff(path.read_bytes())
     with _opened(path) as image:
         header = _header(image)
         pixels = image.read_image(0, 0, 0, header.channels, header.dtype if deep else "uint8")

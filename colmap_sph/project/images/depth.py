@@ -131,11 +131,16 @@ def _white_of(kind: str) -> float:
 
 
 def _quantiles(pixels: NDArray[Any]) -> NDArray[np.float64]:
-    """Quantiles of an image's values, without those which mean that there is none: no number, and zero."""
+    """Quantiles of an image's values, without those which mean that there is none.
+
+    These are no number, zero, and the largest 16-bit number: nothing is seen in what is saturated.
+    """
     # An odd step, so that not a few columns stand for all.
     step = max(1, pixels.size // _SAMPLES) | 1
     values = pixels.reshape(-1)[::step]
     values = values[np.isfinite(values) & (values != 0)]
+    if pixels.dtype == np.uint16:
+        values = values[values != _WHITE["uint16"]]
     if not values.size:
         return np.empty(0)
     ranks = (np.arange(_QUANTILES) + 0.5) / _QUANTILES

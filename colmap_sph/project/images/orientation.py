@@ -16,6 +16,7 @@ from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.images import jpeg
 from colmap_sph.project.images.decoding import png_chunks
 from colmap_sph.project.images.jpeg import DamagedError
+from colmap_sph.project.images.tiff import entries
 
 # A part of a file, by its begin and end, and what comes in its place.
 Edit = tuple[int, int, bytes]
@@ -28,8 +29,6 @@ _XMP_ORIENTATION = re.compile(rb"tiff:Orientation\s*(?:=\s*[\"']|>)\s*([2-9])")
 _XMP_KEYWORD = b"XML:com.adobe.xmp\0"
 # Text chunks in which ImageMagick keeps Exif and XMP, in hexadecimal.
 _RAW_PROFILE = re.compile(rb"Raw profile type (?:exif|APP1|xmp)\0", re.IGNORECASE)
-# More directories than any file has; damaged ones go round in circles.
-_MAX_DIRECTORIES = 1000
 
 
 def copy_without_orientation(source: Path, target: Path) -> None:
@@ -116,27 +115,11 @@ def _in_xmp(body: bytes, start: int) -> Iterator[Edit]:
 
 
 def _in_tiff(data: bytes) -> Iterator[Edit]:
-    order = "<" if data.startswith(b"II") else ">"
-    (version,) = struct.unpack_from(order + "H", data, 2)
-    if version not in (42, 43):
-        return
-    is_big = version == 43
-    count_format, entry_format, offset_format = ("Q", "HHQ", "Q") if is_big else ("H", "HHI", "I")
-    (directory,) = struct.unpack_from(order + offset_format, data, 8 if is_big else 4)
-    seen = set[int]()
-    while directory and directory not in seen and len(seen) < _MAX_DIRECTORIES:
-        seen.add(directory)
-        (count,) = struct.unpack_from(order + count_format, data, directory)
-        entry = directory + struct.calcsize(order + count_format)
-        for _ in range(count):
-            tag, kind, number = struct.unpack_from(order + entry_format, data, entry)
-            value = entry + struct.calcsize(order + entry_format)
-            if tag == _ORIENTATION:
-                # One short number, or, by odd writers, a long one.
-                one = struct.pack(order + ("H" if kind == 3 else "I"), 1)
-                yield value, value + len(one), one
-            if tag == _XMP:
-                (place,) = struct.unpack_from(order + offset_format, data, value)
-                yield from _in_xmp(data[place : place + number], place)
-            entry = value + struct.calcsize(offset_format)
-        (directory,) = struct.unpack_from(order + offset_format, data, entry)
+    for entry in entries(data):
+        if entry.tag == _ORIENTATION:
+            # One short number, or, by odd writers, a long one.
+            one = struct.pack(entry.order + ("H" if entry.kind == 3 else "I"), 1)
+            yield entry.place, entry.place + len(one), one
+        if entry.tag == _XMP:
+            (place,) = struct.unpack_from(entry.order + entry.offset, data, entry.place)
+            yield from _in_xmp(data[place : place + entry.number], place)

@@ -206,7 +206,7 @@ def _remove(places: Iterable[Place]) -> list[Path]:
     """Remove files that are as we left them; return the others."""
     altered: list[Path] = []
     for place in places:
-        others = altered_files(read_record(place.record), place.files)
+        others = altered_files(read_record(place.record), place.files, every_byte=True)
         for path in place.files:
             if path not in others and (path.is_file() or path.is_symlink()):
                 remove(path)

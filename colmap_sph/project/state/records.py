@@ -145,7 +145,7 @@ def begin(record: Path, files: Sequence[Path], *, sync: bool = True) -> None:
     known = read_record(record)
     if known is not None and known.state == "making":
         return
-    for path in altered_files(known, files):
+    for path in altered_files(known, files, every_byte=True):
         backup = set_aside(path)
         logger.warning("%s is not what this program wrote there; it is now %s", path, backup.name)
     # What has no record yet must have one before it is there: without, it is nobody's after a power cut.
@@ -342,7 +342,7 @@ def invalidate(record: Path, state: Literal["void", "doubtful"] = "void") -> Non
         _write(record, msgspec.structs.replace(known, state=state))
 
 
-def altered_files(known: Record | None, files: Sequence[Path]) -> list[Path]:
+def altered_files(known: Record | None, files: Sequence[Path], *, every_byte: bool = False) -> list[Path]:
     """Those of `files` which are there, but not as a record of ours left them; no folders, which writing refuses.
 
     Parameters
@@ -350,6 +350,8 @@ def altered_files(known: Record | None, files: Sequence[Path]) -> list[Path]:
     known : Record or None
         None: there is no record of them.
     files : sequence of Path
+    every_byte : bool
+        Whether to look at all of a large file, too: before it is replaced or removed.
     """
     there = [path for path in files if os.path.lexists(path) and (path.is_symlink() or not path.is_dir())]
     if known is None or not there:
@@ -358,7 +360,7 @@ def altered_files(known: Record | None, files: Sequence[Path]) -> list[Path]:
         return []
     stamps = dict(zip(files, known.stamps, strict=False))
     altered = [path for path in there if _stamp_if_readable(path) != stamps.get(path)]
-    if known.state == "doubtful":
+    if known.digests and (every_byte or known.state == "doubtful"):
         digests = dict(zip(files, known.digests, strict=False))
         altered += [path for path in there if path not in altered and _digest(path) != digests.get(path)]
     return altered

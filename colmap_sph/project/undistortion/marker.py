@@ -65,6 +65,10 @@ class Marker:
         return bool(self.images) or self.version == 1
 
 
+# What there is instead of a damaged one: a workspace of which nothing is known.
+_DAMAGED = Marker("", {}, images=("",))
+
+
 def _old_scratch(workspace: Workspace) -> Path:
     """Where earlier versions undistorted."""
     return workspace.state_dir / "undistorting"
@@ -109,6 +113,11 @@ def check_made_from(workspace: Workspace, marker: Marker) -> Marker | None:
         Something else made it, or it was made from other inputs.
     """
     found = check_ours(workspace)
+    if found is _DAMAGED:
+        raise InputError(
+            f"{workspace.marker_path} is damaged, which says what the workspace was made from; start afresh with "
+            "--overwrite, or choose another --output."
+        )
     if found is None or not found.is_finished:
         return found
     changed = [name for name in ("model", "options") if getattr(found, name) != getattr(marker, name)]
@@ -121,8 +130,16 @@ def check_made_from(workspace: Workspace, marker: Marker) -> Marker | None:
 
 
 def check_ours(workspace: Workspace) -> Marker | None:
-    """Return the marker; `InputError` where the folder has none and holds a workspace of something else."""
+    """Return the marker, or one of nothing where it is damaged.
+
+    Raises
+    ------
+    InputError
+        The folder has none, and holds a workspace of something else.
+    """
     found = read_marker(workspace)
+    if found is None and workspace.marker_path.is_file():
+        return _DAMAGED
     there = [part for part in _PARTS if (workspace.root / part).exists()]
     if found is None and there:
         raise InputError(

@@ -1,6 +1,7 @@
 """What is to be undistorted: a sparse model, its images and their masks, found."""
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -59,6 +60,21 @@ class Originals:
                     f"--{option} {place} lies inside the workspace {workspace.root} that is to be written; choose "
                     "another --output."
                 )
+        for path in self._files():
+            if path.resolve().is_relative_to(root):
+                raise InputError(
+                    f"{path} is a link into the workspace {workspace.root} that is to be written; choose another "
+                    "--output."
+                )
+
+    def _files(self) -> Iterator[Path]:
+        """The files of model, images and masks."""
+        yield from model_files(self.model_dir)
+        for name in image_names(self.model):
+            yield self.image_path(name)
+            mask = self.mask_of(name)
+            if mask is not None:
+                yield mask
 
 
 def read_originals(project: Project) -> Originals:
