@@ -179,3 +179,14 @@ def test_a_line_of_any_length_is_looked_at_once(text: Path) -> None:
         (text / "images.txt").write_text("\n".join([first, line, *rest]))
         with pytest.raises(InputError, match="line 2"):
             load_model(text)
+
+
+def test_a_rotation_of_zeros_is_told(text: Path) -> None:
+    def without_rotation(lines: list[str]) -> list[str]:
+        number, *_, x, y, z, camera, name = lines[2].split()
+        return [*lines[:2], " ".join([number, *"0000", x, y, z, camera, name]), *lines[3:]]
+
+    change(text / "images.txt", without_rotation)
+    assert pycolmap.Reconstruction(text).num_reg_images() == 4  # what is guarded against
+    with pytest.raises(InputError, match=rf"no rotation of '{NAMES[1]}'"):
+        load_model(text)

@@ -260,6 +260,11 @@ def _check_count(folder: Path, what: str, written: int, read: int) -> None:
 def _check_pose(folder: Path, image: _Image, read: pycolmap.Image) -> None:
     """COLMAP takes the poses of ``frames.txt``, where there is one; those beside it must not be others."""
     w, x, y, z, *translation = map(float, image.pose.split())
+    if not any((w, x, y, z)):  # COLMAP makes some rotation of it
+        raise InputError(
+            f"The model in {folder} has no rotation of {image.name!r}: its quaternion in images.txt is zero; export "
+            "the model again, or remove the image."
+        )
     rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
     rotation.normalize()
     pose = np.column_stack([rotation.matrix(), translation])
