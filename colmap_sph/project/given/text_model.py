@@ -262,8 +262,8 @@ def _check_pose(folder: Path, image: _Image, read: pycolmap.Image) -> None:
     w, x, y, z, *translation = map(float, image.pose.split())
     if not any((w, x, y, z)):  # COLMAP makes some rotation of it
         raise InputError(
-            f"The model in {folder} has no rotation of {image.name!r}: its quaternion in images.txt is zero; export "
-            "the model again, or remove the image."
+            f"The model in {folder} has no rotation of {image.name!r}: its quaternion in images.txt is zero; "
+            "export the model again, or remove the image."
         )
     rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
     rotation.normalize()
