@@ -50,6 +50,7 @@ def rename(sparse: Path, names: dict[str, str]) -> None:
         ("cam/../x.png", "'cam/../x.png' leads out of the workspace"),
         ("../x.png", "'../x.png' leads out of the workspace"),
         ("/x.png", "'/x.png' leads out of the workspace"),
+        ("d/" * 1500 + "x.png", "has more than 200 folders"),
         ("", "'', which is no name"),
         ("x" * 250, "is longer than"),
     ],

@@ -10,6 +10,8 @@ from colmap_sph.project.files import make_dir
 
 MapKind = Literal["photometric", "geometric"]
 
+# Folders are made one inside the other, and a path has an end.
+_MAX_FOLDERS = 200
 # What a file system takes, less the longest ending: ``.photometric.json``.
 _MAX_NAME_BYTES = 255 - 17
 
@@ -201,6 +203,10 @@ def checked_name(name: str) -> str:
     parts = PurePosixPath(name)
     if not name or parts.is_absolute() or ".." in parts.parts:
         raise InputError(f"The image name {name!r} leads out of the workspace; rename the image in the model.")
+    if len(parts.parts) > _MAX_FOLDERS:
+        raise InputError(
+            f"The image name '{name[:20]}…' has more than {_MAX_FOLDERS} folders; rename the image in the model."
+        )
     if len(parts.name.encode()) > _MAX_NAME_BYTES:
         raise InputError(
             f"The image name '{parts.name[:20]}…' is longer than the {_MAX_NAME_BYTES} bytes for which the names "

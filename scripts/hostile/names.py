@@ -206,5 +206,5 @@ def _rename_on_disk(images: Path, old: str, new: bytes) -> None:
     try:
         os.makedirs(os.path.dirname(target), exist_ok=True)  # noqa: PTH103, PTH120
         (images / old).rename(os.fsdecode(target))
-    except (OSError, ValueError):
+    except (OSError, ValueError, RecursionError):
         pass

@@ -110,7 +110,8 @@ def _options(stage: Stage) -> Case:
     for _ in range(int(stage.rng.integers(1, 4))):
         flag = str(stage.pick(*flags))
         value = str(stage.pick(*_VALUES))
-        if flag in ("--output", "--model", "--images", "--masks", "--workspace") and value[:1] in "/.~":
+        is_path = flag in ("--model", "--images", "--masks", "--workspace") and value[:1] in "/.~"
+        if flag == "--output" or is_path:
             value = str(stage.world / "none")  # what is written to must be in the world
         if "\0" not in value:
             given += [flag] if stage.chance(0.05) else [flag, value]
