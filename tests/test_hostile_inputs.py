@@ -182,8 +182,8 @@ def test_verdicts_on_files(hostile: SimpleNamespace, tmp_path: Path) -> None:
         (1.05, 0.3, True, "", "quietly wrong"),
         (1.05, 0.3, False, "", None),
         (np.nan, 0.6, False, "", "quietly wrong"),
-        (1.05, 0.6, False, "WARNING it does not fit", None),
-        (1.05, 0.6, True, "WARNING it does not fit", "quietly wrong"),
+        (1.05, 0.6, False, "warning: it does not fit", None),
+        (1.05, 0.6, True, "warning: it does not fit", "quietly wrong"),
         (0.0, 0.7, True, "", "quietly wrong"),
     ],
 )
