@@ -118,8 +118,8 @@ add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add
 void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
                         float max_step, float *right);
 
-/* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. Candidates of
- * one station count as one; `stations` has the number of each candidate's, ascending. */
+/* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. Candidates
+ * of one station count as one; `stations` has the number of each candidate's, ascending. */
 void vote_depth(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t count,
                 ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support);
 

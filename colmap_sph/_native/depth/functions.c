@@ -87,8 +87,9 @@ static int run_vote_depth(void *arguments) {
     return 0;
 }
 
-FUNCTION(vote_depth, VOTE_DEPTH, check_vote_depth,
-         "The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size in stations.");
+FUNCTION(
+    vote_depth, VOTE_DEPTH, check_vote_depth,
+    "The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size in stations.");
 
 #define COMPARE_DEPTHS(X) \
     X(VALUE, backend, backend) \

@@ -14,8 +14,8 @@ static inline direction normal_at(const view_maps *maps, ptrdiff_t pixel) {
     return (direction){n[0], n[plane], n[2 * plane]};
 }
 
-/* Number of stations, other than the view's own, with an agreeing partner. Where any bit of a station is set below its
- * last, adding ones at all bits below carries into the last. */
+/* Number of stations, other than the view's own, with an agreeing partner. Where any bit of a station is set below
+ * its last, adding ones at all bits below carries into the last. */
 static inline int other_stations(const fused_rows *rows, uint64_t agreeing) {
     const uint64_t bits = agreeing & rows->elsewhere, last = rows->last;
     return __builtin_popcountll((((bits & ~last) + ~last) | bits) & last);
