@@ -108,7 +108,8 @@ static int is_spoiled(enum kind kind, const char *path) {
     atomic_fetch_add(&control->hit, 1);
     if (control->action == STOP) {
         syscall(SYS_kill, control->process, control->value);
-        if (control->process < 0) syscall(SYS_kill, 0, control->value);
+        if (control->process < 0)
+            syscall(SYS_kill, 0, control->value);
         return 0;
     }
     errno = control->value;
