@@ -610,3 +610,11 @@ def test_masks_that_are_a_link_to_itself(tmp_path: Path) -> None:
     (tmp_path / "masks").symlink_to("masks")
     with pytest.raises(InputError, match=r"mask folder .*masks does not exist"):
         prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
+
+
+def test_an_image_that_is_a_link_to_itself_is_left_out(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    (tmp_path / "images" / "b.png").unlink()
+    (tmp_path / "images" / "b.png").symlink_to("b.png")
+    workspace = prepare(sparse, tmp_path / "dense")
+    assert [view.name for view in read_scene(workspace.sparse_dir).views] == ["a.png", "cam/c.png", "cam/d.png"]

@@ -11,7 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import OutputError
-from colmap_sph.project.files import atomic_file, make_dir, set_aside
+from colmap_sph.project.files import atomic_file, make_dir, real_path, set_aside
 from colmap_sph.project.map_coordinates import move_cloud, move_model
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES
 from colmap_sph.project.workspace import Workspace
@@ -123,7 +123,7 @@ def link_workspace(
     model.write_binary(linked.sparse_dir)
     for link, target in ((linked.images_dir, workspace.images_dir), (linked.stereo_dir, workspace.stereo_dir)):
         # Relative, so that the workspace can be moved as a whole.
-        link.symlink_to(os.path.relpath(target.resolve(), folder.resolve()))
+        link.symlink_to(os.path.relpath(real_path(target), real_path(folder)))
 
 
 def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[np.float64]) -> None:

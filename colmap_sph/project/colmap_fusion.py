@@ -16,7 +16,7 @@ import pycolmap
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.cloud_files import check_places, link_workspace, move_cloud_into_place
 from colmap_sph.project.colmap_library import quiet_colmap
-from colmap_sph.project.files import make_dir, scratch_folder
+from colmap_sph.project.files import make_dir, real_path, scratch_folder
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.map_coordinates import local_origin
 from colmap_sph.project.map_files import check_map
@@ -115,7 +115,7 @@ def _link_masks(folder: Path, cameras: Mapping[str, pycolmap.Camera], links: Pat
         if read_mask(mask, camera.width, camera.height) is not None:
             link = links / f"{name}.png"
             make_dir(link.parent)
-            link.symlink_to(mask.resolve())
+            link.symlink_to(real_path(mask))
 
 
 def _check_written(made: Workspace, num_points: int) -> None:

@@ -61,7 +61,7 @@ class Originals:
                     "another --output."
                 )
         for path in self._files():
-            if path.resolve().is_relative_to(root):
+            if real_path(path).is_relative_to(root):
                 raise InputError(
                     f"{path} is a link into the workspace {workspace.root} that is to be written; choose another "
                     "--output."
