@@ -26,7 +26,7 @@ from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, 
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
-from colmap_sph.pipeline.stages.match import MatchStage
+from colmap_sph.pipeline.stages.match import MatchStage, row_residuals
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.pipeline.workers import one_opencv_thread
@@ -249,9 +249,11 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
         What is done with each stage, see `Executor`.
     """
     check_numbers(context, pairs)
-    pair_keys = keys_of(executor(MatchStage(context, pairs)))
-    votes = executor(VoteStage(context, pair_keys))
-    maps = executor(ConfirmStage(context, pair_keys, votes))
+    matched = executor(MatchStage(context, pairs))
+    pair_keys = keys_of(matched)
+    residuals = row_residuals(matched)
+    votes = executor(VoteStage(context, pair_keys, residuals))
+    maps = executor(ConfirmStage(context, residuals, votes))
     executor(fuse_stage(context, pair_keys, maps))
 
 
