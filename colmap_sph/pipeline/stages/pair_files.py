@@ -59,13 +59,14 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "", ties: Ties | None
     residual = row_residual(ties)
     table = np.column_stack([ties.left, ties.right, ties.sigma])
     numbers = [least, step, _UNKNOWN if residual is None else residual, *_numbers_of(pair.geometry)]
-    write_arrays(path, _PAIR, key, [codes, table], texts=texts, numbers=numbers)
+    arrays = [codes, table] if len(ties) else [codes]  # no array of a file is empty
+    write_arrays(path, _PAIR, key, arrays, texts=texts, numbers=numbers)
     return _facts(residual, pair.geometry)
 
 
 def read_pair(path: Path) -> PairDisparity:
     """Read a pair's disparity map; `InputError` where the file is missing or damaged."""
-    head, (codes, _) = _read(path)
+    head, (codes, *_) = _read(path)
     least, step = head.numbers[:2]
     disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
     disparity[codes == 0] = np.nan
@@ -74,12 +75,15 @@ def read_pair(path: Path) -> PairDisparity:
 
 def read_ties(path: Path) -> Ties:
     """Read a pair's ties; `InputError` where the file is missing or damaged."""
-    _, (_, table) = _read(path)
+    _, (_, *tables) = _read(path)
+    if not tables:
+        return Ties.none()
+    (table,) = tables
     return Ties(table[:, :2], table[:, 2:4], table[:, 4])
 
 
 def _read(path: Path) -> tuple[Head, Sequence[NDArray[Any]]]:
-    return read_arrays(path, _PAIR, lambda head: [_codes_type(_geometry_of(head)), _ties_type(head)])
+    return read_arrays(path, _PAIR, lambda head: _array_types(head, _geometry_of(head)))
 
 
 def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: RectifiedPair) -> Facts | None:
@@ -93,8 +97,7 @@ def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: Rectifi
         or (head.kind, head.key, head.texts) != (_PAIR, key, _texts_of(left, right, geometry))
         or not _has_scale(head)
         or head.numbers[_OWN_NUMBERS:] != tuple(_numbers_of(geometry))
-        or not _has_ties(head)
-        or head.arrays != (_codes_type(geometry), _ties_type(head))
+        or head.arrays != tuple(_array_types(head, geometry))
     ):
         return None
     residual = head.numbers[2]
@@ -150,20 +153,13 @@ def _estimate_types(view: View) -> list[ArrayType]:
     return [(np.dtype(name), (view.height, view.width)) for name in ("<f4", "<f4", "<u1")]
 
 
-def _codes_type(geometry: RectifiedPair) -> ArrayType:
-    return np.dtype("<u2"), (geometry.height, geometry.left_width)
-
-
-def _has_ties(head: Head) -> bool:
-    """Whether the second array is a table, and holds no more ties than there can be."""
-    return len(head.arrays) == 2 and len(head.arrays[1][1]) == 2 and head.arrays[1][1][0] <= MAX_TIES
-
-
-def _ties_type(head: Head) -> ArrayType:
-    """Of the table of ties; `ValueError` where there is none."""
-    if not _has_ties(head):
-        raise ValueError("it does not hold ties")
-    return np.dtype("<f4"), (head.arrays[1][1][0], _TIE_COLUMNS)
+def _array_types(head: Head, geometry: RectifiedPair) -> list[ArrayType]:
+    """Of what a pair's file must hold: disparities, and a table of ties where it has one."""
+    types: list[ArrayType] = [(np.dtype("<u2"), (geometry.height, geometry.left_width))]
+    if len(head.arrays) > 1:
+        rows = min(head.arrays[1][1][0], MAX_TIES)
+        types.append((np.dtype("<f4"), (rows, _TIE_COLUMNS)))
+    return types
 
 
 def _has_scale(head: Head) -> bool:
