@@ -27,7 +27,7 @@ from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectification import rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
-from colmap_sph.stereo.ties import filled_residuals, find_corners, find_ties
+from colmap_sph.stereo.ties import find_corners, find_ties
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -212,9 +212,3 @@ class MatchStage(Stage[Pair, MatchTask]):
             reason = next(iter(report.skipped_pairs.values()), "no pair")
             raise NoResultError(f"None of the {len(self.items)} pairs could be matched ({reason}).")
         report.pairs = len(results)
-
-
-def row_residuals(matched: Mapping[Pair, Result]) -> dict[Pair, float]:
-    """Row residual of each pair, radians; pairs with too few ties have the median of all, and none too much."""
-    measured = filled_residuals([result.facts.row_residual for result in matched.values()])
-    return dict(zip(matched, measured, strict=True))

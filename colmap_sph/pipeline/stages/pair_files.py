@@ -59,7 +59,7 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "", ties: Ties | None
     residual = row_residual(ties)
     table = np.column_stack([ties.left, ties.right, ties.sigma])
     numbers = [least, step, _UNKNOWN if residual is None else residual, *_numbers_of(pair.geometry)]
-    arrays = [codes, table] if len(ties) else [codes]  # no array of a file is empty
+    arrays: list[NDArray[Any]] = [codes, table] if len(ties) else [codes]  # no array of a file is empty
     write_arrays(path, _PAIR, key, arrays, texts=texts, numbers=numbers)
     return _facts(residual, pair.geometry)
 
