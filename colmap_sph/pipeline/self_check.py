@@ -106,8 +106,8 @@ def judge_rows(report: RunReport, scene: Scene, residuals: Mapping[Pair, float |
     if report.row_residual > _IMPRECISE_PIXELS:
         worst = sorted(report.row_residuals.items(), key=lambda item: -item[1])[:_NAMED_WORST]
         report.imprecision = (
-            f"Rows of pairs disagree by {report.row_residual:.2f} pixels ({_EXPECTED_PIXELS} expected): poses or lens "
-            "models are imprecise, and tolerances are wider by that. Most in "
+            f"Rows of pairs disagree by {report.row_residual:.2f} pixels ({_EXPECTED_PIXELS} expected): poses or "
+            "lens models are imprecise, and tolerances are wider by that. Most in "
             + ", ".join(f"{name} ({value:.2f})" for name, value in worst)
             + "."
         )

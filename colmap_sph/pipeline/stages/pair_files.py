@@ -157,7 +157,7 @@ def _array_types(head: Head, geometry: RectifiedPair) -> list[ArrayType]:
     """Of what a pair's file must hold: disparities, and a table of ties where it has one."""
     types: list[ArrayType] = [(np.dtype("<u2"), (geometry.height, geometry.left_width))]
     if len(head.arrays) > 1:
-        rows = min(head.arrays[1][1][0], MAX_TIES)
+        rows = min(*head.arrays[1][1][:1], MAX_TIES)
         types.append((np.dtype("<f4"), (rows, _TIE_COLUMNS)))
     return types
 
