@@ -23,10 +23,10 @@ _DIRECTIONS = 4
 _TEXTURE_BANDS = 8
 _NOISE_BANDS = 4
 # Noise grows with light, so it is looked for in tiles of about the same brightness: this share of them is taken
-# for blank. The blankest are below the mean by about this factor.
+# for blank. What is below this factor of what they have may be noise, too.
 _BRIGHTNESSES = 3
 _BLANK_SHARE = 0.05
-_BLANK_BIAS = 1.15
+_MARGIN = 1.5
 # Power of the rounding to whole grey values.
 _ROUNDING = 1 / 12
 # What is returned where nothing but noise is seen, and the steps of what is returned.
@@ -120,12 +120,13 @@ def _noise_of(power: Float, frequency: Float, brightness: Float) -> Float:
     Texture falls with the square of the frequency, at least, where noise does not fall.
     """
     high = power[:, :, -_NOISE_BANDS:].mean(axis=(1, 2))
-    noise = np.empty(len(high))
+    ends = [slice(-2 * _NOISE_BANDS, -_NOISE_BANDS), slice(-_NOISE_BANDS, None)]
+    growth = float((frequency**2)[ends[1]].mean() - (frequency**2)[ends[0]].mean())
+    points = []
     for alike in np.array_split(np.argsort(brightness, kind="stable"), _BRIGHTNESSES):
         blankest = alike[np.argsort(high[alike], kind="stable")][: max(1, round(_BLANK_SHARE * len(alike)))]
         spectrum = power[blankest].mean(axis=(0, 1))
-        ends = [slice(-2 * _NOISE_BANDS, -_NOISE_BANDS), slice(-_NOISE_BANDS, None)]
         lower, upper = (float((spectrum * frequency**2)[end].mean()) for end in ends)
-        growth = float((frequency**2)[ends[1]].mean() - (frequency**2)[ends[0]].mean())
-        noise[alike] = _BLANK_BIAS * min(max((upper - lower) / growth, 0), spectrum[ends[1]].mean())
-    return noise
+        white = min(max((upper - lower) / growth, 0), float(spectrum[ends[1]].mean()))
+        points.append((float(brightness[blankest].mean()), white))
+    return _MARGIN * np.interp(brightness, *zip(*sorted(points), strict=True))
