@@ -9,9 +9,10 @@ import json
 import logging
 import resource
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import mean
 from typing import Any, Protocol
 
 from colmap_sph.errors import NoResultError, OptionError
@@ -23,7 +24,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
-from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
@@ -43,6 +44,7 @@ from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
+from colmap_sph.stereo.rectification import sampling_of
 from colmap_sph.stereo.ties import filled_residuals
 
 logger = logging.getLogger(__name__)
@@ -282,11 +284,22 @@ def with_good_images(
     there = [view for view in context.scene.views if view.name not in to_come]
     sizes = {view.name: (view.width, view.height) for view in there}
     places = ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
-    images: dict[str, str] = {}
-    if there:
-        images = keys_of(executor(CheckStage(context, sizes, places, verify=verify)))
+    checked = executor(CheckStage(context, sizes, places, verify=verify)) if there else {}
+    images = keys_of(checked)
+    details = details_of(checked)
+    if details:
+        _report_detail(context, details)
     keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
-    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys)
+    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
+
+
+def _report_detail(context: Context, details: Mapping[str, float]) -> None:
+    """Tell how much the images hold, and how finely they are therefore matched."""
+    sampling = context.options.rectification.sampling * mean(sampling_of(detail) for detail in details.values())
+    detail = mean(details.values())
+    context.report.detail = round(detail, 3)
+    context.report.sampling = round(sampling, 3)
+    logger.info("Images hold %.2f of their pixels' detail: pairs are sampled at %.2f", detail, sampling)
 
 
 def choose_pairs(

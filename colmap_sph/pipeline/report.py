@@ -41,6 +41,10 @@ class RunReport:
         that could not be read. The next run makes them again.
     stretched : str
         Which values became black and white in images of more than 8 bits, where these were changed.
+    detail : float or None
+        Samples per pixel that hold what the images show, on average, see `image_detail`.
+    sampling : float or None
+        Rectified pixels per pixel at which pairs are therefore matched.
     pair_source : str
         Where the pairs come from.
     pairs : int
@@ -83,6 +87,8 @@ class RunReport:
     skipped_images: dict[str, str] = field(default_factory=dict)
     incomplete: dict[str, str] = field(default_factory=dict)
     stretched: str = ""
+    detail: float | None = None
+    sampling: float | None = None
     pair_source: str = ""
     pairs: int = 0
     skipped_pairs: dict[str, str] = field(default_factory=dict)

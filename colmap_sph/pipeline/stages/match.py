@@ -132,6 +132,7 @@ class MatchStage(Stage[Pair, MatchTask]):
         super().__init__(context, pairs)
         self._scratch_bytes = _SCRATCH_BYTES
         self._unfit: set[Pair] = set()
+        self._usual_detail = float(np.median([*context.details.values()] or [1.0]))
 
     def job(self, item: Pair) -> Job[MatchTask]:
         """See `Stage.job`; `RectificationError` for a pair that cannot be rectified."""
@@ -161,10 +162,15 @@ class MatchStage(Stage[Pair, MatchTask]):
 
     def _geometry(self, left: View, right: View) -> RectifiedPair:
         try:
-            return rectify_pair(self.context.scene, left, right, self.context.options.rectification)
+            details = (self._detail(left), self._detail(right))
+            return rectify_pair(self.context.scene, left, right, self.context.options.rectification, details)
         except RectificationError:
             self._unfit.add((left.name, right.name))
             raise
+
+    def _detail(self, view: View) -> float:
+        """Detail of an image; of one that is not there yet, that of those that are, or what a sharp one has."""
+        return self.context.details.get(view.name, self._usual_detail)
 
     def _photo(self, view: View) -> PhotoFile:
         workspace = self.context.workspace
