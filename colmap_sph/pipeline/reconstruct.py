@@ -290,7 +290,8 @@ def with_good_images(
 
 def _report_detail(context: Context, details: Mapping[str, float]) -> None:
     """Tell how much the images hold, and how finely they are therefore matched."""
-    sampling = context.options.rectification.sampling * mean(sampling_of(detail) for detail in details.values())
+    samplings = [sampling_of(context.scene.view(name), detail) for name, detail in details.items()]
+    sampling = context.options.rectification.sampling * mean(samplings)
     detail = mean(details.values())
     context.report.detail = round(detail, 3)
     context.report.sampling = round(sampling, 3)
