@@ -1,5 +1,6 @@
 """Pairs are sampled as finely as their images are sharp."""
 
+import math
 import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -43,7 +44,7 @@ def geometry_of(context: Context) -> RectifiedPair:
 
 
 def finest_of(views: Iterable[View], details: Mapping[str, float]) -> float:
-    return max(sampling_of(view, details[view.name]) for view in views)
+    return max(sampling_of(details[view.name], view.reprojection_error) for view in views)
 
 
 @pytest.fixture
@@ -84,7 +85,9 @@ def test_the_detail_of_an_image_is_measured_once(dense: Path, monkeypatch: pytes
     second = with_good_images(context_of(dense), execute)
     assert second.details == first.details
     assert second.report.detail == pytest.approx(np.mean(list(first.details.values())), abs=0.001)
-    expected = 0.8 * np.mean([sampling_of(view, first.details[view.name]) for view in first.scene.views])
+    expected = 0.8 * np.mean(
+        [sampling_of(first.details[view.name], view.reprojection_error) for view in first.scene.views]
+    )
     assert second.report.sampling == pytest.approx(expected, abs=0.001)
 
 
@@ -95,8 +98,7 @@ def test_images_to_come_are_taken_for_sharp(dense: Path) -> None:
     assert foreseen.details == {}
     half_known = replace(foreseen, details={context.scene.views[2].name: 0.4})
     ratio = geometry_of(half_known).columns_per_radian / geometry_of(foreseen).columns_per_radian
-    view = context.scene.views[0]
-    assert ratio == pytest.approx(sampling_of(view, 0.4) / sampling_of(view, 1.0), rel=0.01)
+    assert ratio == pytest.approx(sampling_of(0.4) / sampling_of(1.0), rel=0.01)
 
 
 def test_many_pixels_are_right_where_many_are_asked_for(dense: Path) -> None:
@@ -107,15 +109,23 @@ def test_many_pixels_are_right_where_many_are_asked_for(dense: Path) -> None:
     for sampling, details in ((1.0, None), (1.0, (1.0, 1.0)), (4.0, (1.0, 0.3)), (0.3, (0.3, 0.3))):
         pair = rectify_pair(scene, left, right, replace(coarse, sampling=sampling), details)
         usual = rectify_pair(scene, left, right, coarse)
-        finest = 1.0 if details is None else max(map(sampling_of, (left, right), details))
+        finest = 1.0 if details is None else max(map(sampling_of, details))
         assert pair.columns_per_radian == pytest.approx(sampling * finest * usual.columns_per_radian, rel=0.01)
 
 
-def test_imprecise_poses_are_not_sampled_finely() -> None:
-    view = View(1, "a", 640, 480, np.diag([500.0, 500, 1]), np.eye(3), np.zeros(3), np.zeros(0, np.int64))
-    sharp = sampling_of(view, 1.0)
-    assert sharp == sampling_of(replace(view, reprojection_error=0.2), 1.0)
-    assert sampling_of(replace(view, reprojection_error=0.8), 1.0) * 0.8 == pytest.approx(0.5)
-    soft = sampling_of(view, 0.3)
-    assert soft < sampling_of(replace(view, reprojection_error=20.0), 1.0)
-    assert sampling_of(replace(view, reprojection_error=20.0), 0.3) == soft
+def test_imprecise_poses_are_not_sampled_finely(dense: Path) -> None:
+    scene = read_scene(Workspace(dense).sparse_dir)
+    left, right = (replace(view, reprojection_error=math.nan) for view in scene.views[:2])
+
+    def scale(errors: tuple[float, float], detail: float) -> float:
+        views = [replace(v, reprojection_error=e) for v, e in zip((left, right), errors, strict=True)]
+        return rectify_pair(scene, views[0], views[1], RectificationOptions(), (detail, detail)).columns_per_radian
+
+    sharp = scale((math.nan, math.nan), 1.0)
+    assert scale((0.2, 0.3), 1.0) == sharp
+    assert scale((0.2, math.nan), 1.0) == sharp
+    # Half a rectified pixel, of what comes from the errors of both.
+    imprecise = scale((0.6, 0.8), 1.0) / sharp * sampling_of(1.0)
+    assert imprecise * math.sqrt((0.6**2 + 0.8**2) / 2) == pytest.approx(0.5, rel=0.01)
+    soft = scale((math.nan, math.nan), 0.3)
+    assert scale((20.0, 20.0), 0.3) == soft < scale((20.0, 20.0), 1.0)

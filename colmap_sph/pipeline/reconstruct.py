@@ -290,7 +290,7 @@ def with_good_images(
 
 def _report_detail(context: Context, details: Mapping[str, float]) -> None:
     """Tell how much the images hold, and how finely they are therefore matched."""
-    samplings = [sampling_of(context.scene.view(name), detail) for name, detail in details.items()]
+    samplings = [sampling_of(d, context.scene.view(name).reprojection_error) for name, d in details.items()]
     sampling = context.options.rectification.sampling * mean(samplings)
     detail = mean(details.values())
     context.report.detail = round(detail, 3)

@@ -27,8 +27,8 @@ _MAX_SIDE = 32766
 # windows are of whole pixels; and as many per pixel at most.
 _OVERSAMPLING = 1.45
 _MOST_SAMPLING = 1.4
-# Sparse points are no more than so many rectified pixels from where the model has them, as rows that disagree by more
-# do not match; but this is no reason to go below so many rectified pixels per pixel.
+# Sparse points are no more than so many rectified pixels from where the model has them, as rows that disagree by
+# more do not match; but this is no reason to go below so many rectified pixels per pixel.
 _MOST_ERROR = 0.5
 _LEAST_PRECISE_SAMPLING = 0.5
 # Fewer rows or columns than this are not worth matching.
@@ -72,19 +72,20 @@ class RectificationOptions:
             )
 
 
-def sampling_of(view: View, detail: float) -> float:
+def sampling_of(detail: float, error: float = np.nan) -> float:
     """Rectified pixels per pixel that serve an image.
 
     Parameters
     ----------
-    view : View
-        For the precision of its pose: the reprojection error of its sparse points, where it has any.
     detail : float
         What `image_detail` finds in it.
+    error : float
+        How imprecise poses are: the reprojection error of the sparse points of the pair, pixels. NaN
+        where it is not known.
     """
     sampling = min(_OVERSAMPLING * detail, _MOST_SAMPLING)
-    if view.reprojection_error > 0:
-        sampling = min(sampling, max(_MOST_ERROR / view.reprojection_error, _LEAST_PRECISE_SAMPLING))
+    if error > 0:
+        sampling = min(sampling, max(_MOST_ERROR / error, _LEAST_PRECISE_SAMPLING))
     return sampling
 
 
@@ -144,7 +145,8 @@ def rectify_pair(
         extent = extent_on_sphere(rotation, left, right, points, options.min_cosine)
     else:
         extent = extent_on_plane(rotation, left, right, points, baseline)
-    samplings = (1.0, 1.0) if details is None else (sampling_of(left, details[0]), sampling_of(right, details[1]))
+    error = float(np.hypot(left.reprojection_error, right.reprojection_error) / np.sqrt(2))
+    samplings = (1.0, 1.0) if details is None else tuple(sampling_of(detail, error) for detail in details)
     scales = _scale(left, points), _scale(right, points)
     scale = options.sampling * max(samplings[0] * scales[0], samplings[1] * scales[1])
     scale = few_digits(scale, np.round)
