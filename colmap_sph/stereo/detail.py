@@ -60,8 +60,9 @@ def image_detail(image: NDArray[Any]) -> float:
 
     Examples
     --------
-    >>> texture = np.cumsum(np.cumsum(np.random.default_rng(0).normal(size=(512, 512)), axis=0), axis=1)
-    >>> image_detail(np.zeros((512, 512), np.uint8))
+    A surface without any texture:
+
+    >>> image_detail(np.full((480, 640), 128, np.uint8))
     0.25
     """
     tiles = _tiles(image)
