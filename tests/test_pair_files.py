@@ -189,7 +189,7 @@ def numbers_with(changes: dict[int, float]) -> list[float]:
     """Scale, rotation and the other numbers of the geometry, some of them changed."""
     geometry = vars(make_pair(np.zeros((HEIGHT, WIDTH))).geometry)
     others = [value for value in geometry.values() if isinstance(value, (int, float))]
-    numbers = [0.0, 1 / 64, 0.3, *geometry["rectified_from_world"].ravel(), *map(float, others)]
+    numbers = [0.0, 1 / 64, 1.0, 0.3, *geometry["rectified_from_world"].ravel(), *map(float, others)]
     for place, value in changes.items():
         numbers[place] = value
     return numbers
@@ -224,11 +224,13 @@ def written(
         {"numbers": numbers_with({0: np.nan})},
         {"numbers": numbers_with({1: 0.0})},
         {"numbers": numbers_with({1: -1.0})},
-        {"numbers": numbers_with({2: np.nan})},
-        {"numbers": numbers_with({12: np.inf})},
-        {"numbers": numbers_with({18: HEIGHT + 1.0})},
-        {"numbers": numbers_with({19: 1e300})},
-        {"numbers": numbers_with({19: -WIDTH})},
+        {"numbers": numbers_with({2: 0.0})},
+        {"numbers": numbers_with({2: 1.5})},
+        {"numbers": numbers_with({3: np.nan})},
+        {"numbers": numbers_with({13: np.inf})},
+        {"numbers": numbers_with({19: HEIGHT + 1.0})},
+        {"numbers": numbers_with({20: 1e300})},
+        {"numbers": numbers_with({20: -WIDTH})},
         {"codes": np.zeros((HEIGHT, WIDTH), np.float32)},
         {"codes": np.zeros((WIDTH, HEIGHT), np.uint16)},
         {"codes": np.zeros((HEIGHT, WIDTH, 2), np.uint16)},

@@ -52,8 +52,8 @@ class RunReport:
     skipped_pairs : dict
         "left - right" → why the pair was not matched.
     row_residual : float or None
-        How far the rows of rectified pairs disagree, pixels: the median of all pairs; None where no pair has enough
-        ties to tell.
+        How far the rows of rectified pairs disagree, pixels: the median of all pairs; None where no pair
+        has enough ties to tell.
     row_residuals : dict
         Image name → the same of its pairs.
     coverage : dict
