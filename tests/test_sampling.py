@@ -1,8 +1,6 @@
 """Pairs are sampled as finely as their images are sharp."""
 
-import math
 import shutil
-from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +19,7 @@ from colmap_sph.pipeline.stages import check_images
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Scene
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import RectifiedPair
 
@@ -41,10 +39,6 @@ def pair_of(scene: Scene) -> tuple[str, str]:
 def geometry_of(context: Context) -> RectifiedPair:
     pair = pair_of(context.scene)
     return MatchStage(context, [pair]).job(pair).task.geometry
-
-
-def finest_of(views: Iterable[View], details: Mapping[str, float]) -> float:
-    return max(sampling_of(details[view.name], view.reprojection_error) for view in views)
 
 
 @pytest.fixture
@@ -72,8 +66,8 @@ def test_blurred_images_are_sampled_coarsely(dense: Path) -> None:
         k: v for k, v in sharp.details.items() if k not in names
     }
     ratio = geometry_of(soft).columns_per_radian / geometry_of(sharp).columns_per_radian
-    views = [sharp.scene.view(name) for name in names]
-    assert ratio == pytest.approx(finest_of(views, soft.details) / finest_of(views, sharp.details), rel=0.01)
+    finest = [sampling_of(max(context.details[name] for name in names)) for context in (sharp, soft)]
+    assert ratio == pytest.approx(finest[1] / finest[0], rel=0.01)
     assert ratio < 0.6
     pair = pair_of(sharp.scene)
     assert MatchStage(soft, [pair]).job(pair).key != MatchStage(sharp, [pair]).job(pair).key
@@ -85,9 +79,7 @@ def test_the_detail_of_an_image_is_measured_once(dense: Path, monkeypatch: pytes
     second = with_good_images(context_of(dense), execute)
     assert second.details == first.details
     assert second.report.detail == pytest.approx(np.mean(list(first.details.values())), abs=0.001)
-    expected = 0.8 * np.mean(
-        [sampling_of(first.details[view.name], view.reprojection_error) for view in first.scene.views]
-    )
+    expected = 0.8 * np.mean([sampling_of(detail) for detail in first.details.values()])
     assert second.report.sampling == pytest.approx(expected, abs=0.001)
 
 
@@ -111,21 +103,3 @@ def test_many_pixels_are_right_where_many_are_asked_for(dense: Path) -> None:
         usual = rectify_pair(scene, left, right, coarse)
         finest = 1.0 if details is None else max(map(sampling_of, details))
         assert pair.columns_per_radian == pytest.approx(sampling * finest * usual.columns_per_radian, rel=0.01)
-
-
-def test_imprecise_poses_are_not_sampled_finely(dense: Path) -> None:
-    scene = read_scene(Workspace(dense).sparse_dir)
-    left, right = (replace(view, reprojection_error=math.nan) for view in scene.views[:2])
-
-    def scale(errors: tuple[float, float], detail: float) -> float:
-        views = [replace(v, reprojection_error=e) for v, e in zip((left, right), errors, strict=True)]
-        return rectify_pair(scene, views[0], views[1], RectificationOptions(), (detail, detail)).columns_per_radian
-
-    sharp = scale((math.nan, math.nan), 1.0)
-    assert scale((0.2, 0.3), 1.0) == sharp
-    assert scale((0.2, math.nan), 1.0) == sharp
-    # Half a rectified pixel, of what comes from the errors of both.
-    imprecise = scale((0.6, 0.8), 1.0) / sharp * sampling_of(1.0)
-    assert imprecise * math.sqrt((0.6**2 + 0.8**2) / 2) == pytest.approx(0.5, rel=0.01)
-    soft = scale((math.nan, math.nan), 0.3)
-    assert scale((20.0, 20.0), 0.3) == soft < scale((20.0, 20.0), 1.0)

@@ -295,8 +295,7 @@ def with_good_images(
 
 def _report_detail(context: Context, details: Mapping[str, float]) -> None:
     """Tell how much the images hold, and how finely they are therefore matched."""
-    samplings = [sampling_of(d, context.scene.view(name).reprojection_error) for name, d in details.items()]
-    sampling = context.options.rectification.sampling * mean(samplings)
+    sampling = context.options.rectification.sampling * mean(map(sampling_of, details.values()))
     detail = mean(details.values())
     context.report.detail = round(detail, 3)
     context.report.sampling = round(sampling, 3)

@@ -27,10 +27,6 @@ _MAX_SIDE = 32766
 # windows are of whole pixels; and as many per pixel at most.
 _OVERSAMPLING = 1.45
 _MOST_SAMPLING = 1.4
-# Sparse points are no more than so many rectified pixels from where the model has them, as rows that disagree by
-# more do not match; but this is no reason to go below so many rectified pixels per pixel.
-_MOST_ERROR = 0.5
-_LEAST_PRECISE_SAMPLING = 0.5
 # Fewer rows or columns than this are not worth matching.
 _MIN_SIDE = 16
 
@@ -72,21 +68,9 @@ class RectificationOptions:
             )
 
 
-def sampling_of(detail: float, error: float = np.nan) -> float:
-    """Rectified pixels per pixel that serve an image.
-
-    Parameters
-    ----------
-    detail : float
-        What `image_detail` finds in it.
-    error : float
-        How imprecise poses are: the reprojection error of the sparse points of the pair, pixels. NaN
-        where it is not known.
-    """
-    sampling = min(_OVERSAMPLING * detail, _MOST_SAMPLING)
-    if error > 0:
-        sampling = min(sampling, max(_MOST_ERROR / error, _LEAST_PRECISE_SAMPLING))
-    return sampling
+def sampling_of(detail: float) -> float:
+    """Rectified pixels per pixel of an image with this detail, see `image_detail`."""
+    return min(_OVERSAMPLING * detail, _MOST_SAMPLING)
 
 
 def rectify_pair(
@@ -145,8 +129,7 @@ def rectify_pair(
         extent = extent_on_sphere(rotation, left, right, points, options.min_cosine)
     else:
         extent = extent_on_plane(rotation, left, right, points, baseline)
-    error = float(np.hypot(left.reprojection_error, right.reprojection_error) / np.sqrt(2))
-    samplings = (1.0, 1.0) if details is None else tuple(sampling_of(detail, error) for detail in details)
+    samplings = (1.0, 1.0) if details is None else (sampling_of(details[0]), sampling_of(details[1]))
     scales = _scale(left, points), _scale(right, points)
     scale = options.sampling * max(samplings[0] * scales[0], samplings[1] * scales[1])
     scale = few_digits(scale, np.round)
