@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,11 @@ class SparsePoints:
 
 
 def _candidates(
-    surfaces: Sequence[Surface], cameras: Sequence[Camera], count: int, rng: np.random.Generator
+    surfaces: Sequence[Surface],
+    cameras: Sequence[Camera],
+    count: int,
+    rng: np.random.Generator,
+    blank: Collection[int],
 ) -> tuple[FloatArray, FloatArray]:
     """Points (N, 3) and world normals (N, 3) behind random places of every picture."""
     points = []
@@ -49,6 +53,8 @@ def _candidates(
         image = rng.uniform([0.0, 0.0], [camera.width, camera.height], (count, 2))
         hits = trace_points(surfaces, camera, image)
         for number in np.unique(hits.surface[hits.surface >= 0]):
+            if number in blank:
+                continue
             chosen = hits.surface == number
             place = camera.back_project(image[chosen], hits.distance[chosen])
             normal = surfaces[number].normals(place.T, hits.face[chosen]).T
@@ -94,6 +100,7 @@ def sample_sparse_points(
     rng: np.random.Generator,
     *,
     min_track_length: int = 3,
+    blank: Collection[int] = (),
 ) -> SparsePoints:
     """Sample surface points that at least `min_track_length` cameras see.
 
@@ -105,12 +112,14 @@ def sample_sparse_points(
         Number of points wanted; fewer where cameras overlap little.
     rng : numpy.random.Generator
     min_track_length : int
+    blank : collection of int
+        Numbers of surfaces without texture: no point can be found on them.
 
     Returns
     -------
     SparsePoints
     """
-    points, normals = _candidates(surfaces, cameras, 2 * count // len(cameras) + 1, rng)
+    points, normals = _candidates(surfaces, cameras, 2 * count // len(cameras) + 1, rng, blank)
     seen = np.stack([visible(surfaces, camera, points, normals) for camera in cameras])
     kept = rng.permutation(np.flatnonzero(seen.sum(axis=0) >= min_track_length))[:count]
     points = points[kept]

@@ -44,6 +44,10 @@ class Camera:
         """Camera centre (3,) in the world."""
         return -self.R.T @ self.t
 
+    def rays(self, x: FloatArray, y: FloatArray) -> Rays:
+        """Rays through the grid of image coordinates x (W,) and y (H,), pixels."""
+        return PinholeRays(self, x, y, grid=True)
+
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Image coordinates (N, 2) and z-depth (N,) of world points (N, 3)."""
         in_camera = points @ self.R.T + self.t
@@ -82,6 +86,19 @@ class Rays:
     def window(self, low: FloatArray, high: FloatArray) -> Index | None:
         """Index of the rays within a rectangle of those coordinates; None if there is none."""
         raise NotImplementedError
+
+    def depth(self, distance: FloatArray) -> FloatArray:
+        """z-depth (...) in the camera of the rays' points at parameters (...), infinite ones stay."""
+        return distance
+
+    def points(self, distance: FloatArray, places: npt.NDArray[np.int64]) -> FloatArray:
+        """World points (3, N) on the rays of flat indices `places`, at parameters (N,)."""
+        directions = self.directions.reshape(3, -1)[:, places]
+        if self.origins.size == 3:
+            return self.origins.reshape(3, 1) + distance * directions
+        origins = np.broadcast_to(self.origins, self.directions.shape).reshape(3, -1)[:, places]
+        points: FloatArray = origins + distance * directions
+        return points
 
     def windows(self, hulls: Sequence[FloatArray]) -> list[Index | None]:
         """Index of the rays that may meet the convex hull of each set of points (M, 3)."""
