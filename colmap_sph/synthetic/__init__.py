@@ -23,8 +23,10 @@ from colmap_sph.synthetic.pairs import (
     pinhole,
     slanted_plane_pair,
 )
+from colmap_sph.synthetic.photographs.bending import Bending
 from colmap_sph.synthetic.photographs.imperfections import Imperfections
 from colmap_sph.synthetic.photographs.photograph import exposure_gain, photograph
+from colmap_sph.synthetic.photographs.real_camera import Motion, RealCamera, real_camera
 from colmap_sph.synthetic.photographs.sky import Sky
 from colmap_sph.synthetic.primitives import ConvexPolyhedron, Ellipsoid, Plane, Surface
 from colmap_sph.synthetic.rays import Camera, Hits, trace_points
@@ -43,6 +45,7 @@ from colmap_sph.synthetic.texture import Facade, Material, Mottled, Noise, Paint
 from colmap_sph.synthetic.village import Village, build_village
 
 __all__ = [
+    "Bending",
     "BlockOptions",
     "Camera",
     "Capture",
@@ -55,10 +58,12 @@ __all__ = [
     "Imperfections",
     "Light",
     "Material",
+    "Motion",
     "Mottled",
     "Noise",
     "Painting",
     "Plane",
+    "RealCamera",
     "Rendering",
     "RoofTiles",
     "ShadowMap",
@@ -87,6 +92,7 @@ __all__ = [
     "photograph",
     "pinhole",
     "read_truth",
+    "real_camera",
     "render",
     "sample_sparse_points",
     "slanted_plane_pair",

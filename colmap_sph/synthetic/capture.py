@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -21,7 +22,10 @@ from colmap_sph.synthetic.model import (
     write_reconstruction,
 )
 from colmap_sph.synthetic.photographs.imperfections import Imperfections
+from colmap_sph.synthetic.photographs.moving_things import moving_things
 from colmap_sph.synthetic.photographs.photograph import photograph
+from colmap_sph.synthetic.photographs.real_camera import real_camera
+from colmap_sph.synthetic.photographs.structure_from_motion import disturb
 from colmap_sph.synthetic.primitives import Surface
 from colmap_sph.synthetic.rays import Camera
 from colmap_sph.synthetic.render import Rendering
@@ -177,21 +181,26 @@ def write_capture(
         If something cannot be written.
     """
     names = tuple(cameras)
-    real = tuple(cameras.values())
+    real = tuple(
+        real_camera(camera, options.effects, options.seed, number)
+        for number, camera in enumerate(cameras.values())
+    )
+    moving = [
+        moving_things(surfaces, camera, options.effects.moving, gsd=gsd, seed=options.seed, number=number)
+        for number, camera in enumerate(cameras.values())
+    ]
     try:
         for folder in ("images", "truth"):
             (output / folder).mkdir(parents=True, exist_ok=True)
         jobs = [
-            lambda number=number: _write_view(
-                output, names[number], real[number], surfaces, light, options, number
-            )
-            for number in range(len(names))
+            partial(_write_view, output, name, camera, (*surfaces, *before), light, options, number)
+            for number, (name, camera, before) in enumerate(zip(names, real, moving, strict=True))
         ]
         pictures = _in_threads(jobs, threads, progress)
     except OSError as error:
         raise OutputError(f"cannot write the demo block to {output}: {error}") from error
     rng = np.random.default_rng((options.seed, len(names)))
-    sparse = sample_sparse_points(surfaces, real, options.points, rng, blank=blank)
+    sparse = sample_sparse_points(surfaces, real, options.points, rng, blank=blank, moving=moving)
     model = build_reconstruction(
         names,
         real,
@@ -200,6 +209,7 @@ def write_capture(
         keypoint_noise=options.keypoint_noise,
         rng=rng,
     )
+    disturb(model, options.effects, options.seed)
     capture = Capture(output, names, real, sparse, tuple(surfaces), gsd)
     write_reconstruction(model, capture.sparse_dir)
     logger.info("demo block: %d pictures, %d points in %s", len(names), len(sparse.points), output)

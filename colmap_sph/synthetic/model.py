@@ -81,16 +81,24 @@ def visible(
     (N,) bool ndarray
     """
     image, depth = camera.project(points)
-    seen: npt.NDArray[np.bool_] = (depth > 0) & np.all(
-        (image > _BORDER) & (image < np.array([camera.width, camera.height]) - _BORDER), axis=1
-    )
+    seen: npt.NDArray[np.bool_] = (depth > 0) & _inside(camera, image)
     towards = camera.centre - points
     cosine = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)
     seen &= cosine > np.cos(_MAX_INCIDENCE)
     places = np.flatnonzero(seen)
     nearest = trace_points(surfaces, camera, image[places]).distance
     seen[places] = np.abs(nearest - depth[places]) < _SAME_DEPTH * depth[places]
+    places = np.flatnonzero(seen)
+    seen[places] = _inside(camera, camera.observe(points[places]))
     return seen
+
+
+def _inside(camera: Camera, image: FloatArray) -> npt.NDArray[np.bool_]:
+    """Whether image coordinates (N, 2) lie in the picture, but for a border."""
+    inside: npt.NDArray[np.bool_] = np.all(
+        (image > _BORDER) & (image < np.array([camera.width, camera.height]) - _BORDER), axis=1
+    )
+    return inside
 
 
 def sample_sparse_points(
@@ -101,6 +109,7 @@ def sample_sparse_points(
     *,
     min_track_length: int = 3,
     blank: Collection[int] = (),
+    moving: Sequence[Sequence[Surface]] | None = None,
 ) -> SparsePoints:
     """Sample surface points that at least `min_track_length` cameras see.
 
@@ -114,18 +123,26 @@ def sample_sparse_points(
     min_track_length : int
     blank : collection of int
         Numbers of surfaces without texture: no point can be found on them.
+    moving : sequence of sequence of Surface, one per camera, optional
+        What else stands before each camera, and hides points.
 
     Returns
     -------
     SparsePoints
     """
     points, normals = _candidates(surfaces, cameras, 2 * count // len(cameras) + 1, rng, blank)
-    seen = np.stack([visible(surfaces, camera, points, normals) for camera in cameras])
+    others = moving or [()] * len(cameras)
+    seen = np.stack(
+        [
+            visible((*surfaces, *before), camera, points, normals)
+            for camera, before in zip(cameras, others, strict=True)
+        ]
+    )
     kept = rng.permutation(np.flatnonzero(seen.sum(axis=0) >= min_track_length))[:count]
     points = points[kept]
     seen = seen[:, kept]
     indices = tuple(np.flatnonzero(row) for row in seen)
-    observations = tuple(camera.project(points[rows])[0] for camera, rows in zip(cameras, indices, strict=True))
+    observations = tuple(camera.observe(points[rows]) for camera, rows in zip(cameras, indices, strict=True))
     return SparsePoints(points, observations, indices)
 
 

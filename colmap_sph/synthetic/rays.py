@@ -56,6 +56,10 @@ class Camera:
             image = homogeneous[:, :2] / homogeneous[:, 2:]
         return image, in_camera[:, 2]
 
+    def observe(self, points: FloatArray) -> FloatArray:
+        """Image coordinates (N, 2) at which world points (N, 3) appear."""
+        return self.project(points)[0]
+
     def back_project(self, image: FloatArray, depth: FloatArray) -> FloatArray:
         """World points (N, 3) at image coordinates (N, 2) and z-depth (N,)."""
         rays = np.column_stack([image, np.ones(len(image))]) @ np.linalg.inv(self.K).T
@@ -128,7 +132,8 @@ def _take(array: FloatArray, index: Index) -> FloatArray:
     return array if constant else array[(slice(None), *index)]
 
 
-def _grid_window(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray) -> Index | None:
+def grid_window(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray) -> Index | None:
+    """Index of the part of a grid of ascending x and y that lies between two corners; None if nothing does."""
     left, right = np.searchsorted(x, [low[0], high[0]])
     top, bottom = np.searchsorted(y, [low[1], high[1]])
     return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
@@ -164,7 +169,7 @@ class OrthographicRays(Rays):
         return points @ self.axes[:2].T, np.full(len(points), np.inf)
 
     def window(self, low: FloatArray, high: FloatArray) -> Index | None:
-        return _grid_window(self.x, self.y, low, high)
+        return grid_window(self.x, self.y, low, high)
 
 
 class PinholeRays(Rays):
@@ -199,7 +204,7 @@ class PinholeRays(Rays):
 
     def window(self, low: FloatArray, high: FloatArray) -> Index | None:
         if self.grid:
-            return _grid_window(self.x, self.y, low, high)
+            return grid_window(self.x, self.y, low, high)
         inside = (self.x >= low[0]) & (self.x <= high[0]) & (self.y >= low[1]) & (self.y <= high[1])
         places = np.flatnonzero(inside)
         return (places,) if places.size else None

@@ -50,7 +50,7 @@ class Imperfections:
     centre_error: float = 0.0
     """Written centres are wrong along each axis by what so many pixels are at the images' median depth."""
     bundle_adjusted: bool = False
-    """Adjust poses and focal lengths to the tracks of the images as they are, as structure from motion does."""
+    """Adjust poses and points to the tracks of the images as they are, as structure from motion does."""
     sky: bool = False
     """A sky of graded blue where no surface is met, in place of one colour."""
     clouds: float = 0.0
