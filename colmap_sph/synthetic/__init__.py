@@ -33,7 +33,7 @@ from colmap_sph.synthetic.rays import Camera, Hits, trace_points
 from colmap_sph.synthetic.render import Rendering, exact_geometry, render
 from colmap_sph.synthetic.solids import box, gabled_house, sphere
 from colmap_sph.synthetic.street import (
-    Street,
+    BLANK_HOUSE,
     StreetOptions,
     build_street,
     make_street_block,
@@ -45,6 +45,7 @@ from colmap_sph.synthetic.texture import Facade, Material, Mottled, Noise, Paint
 from colmap_sph.synthetic.village import Village, build_village
 
 __all__ = [
+    "BLANK_HOUSE",
     "Bending",
     "BlockOptions",
     "Camera",
@@ -69,7 +70,6 @@ __all__ = [
     "ShadowMap",
     "Sky",
     "SparsePoints",
-    "Street",
     "StreetOptions",
     "Surface",
     "SyntheticPair",

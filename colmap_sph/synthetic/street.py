@@ -16,6 +16,9 @@ from colmap_sph.synthetic.rays import Camera
 from colmap_sph.synthetic.solids import box, gabled_house
 from colmap_sph.synthetic.texture import Facade, Mottled, Noise, RoofTiles
 
+BLANK_HOUSE = 1
+"""Number, among the street's surfaces, of the house whose walls have no texture."""
+
 # The houses' fronts stand about at y = 0, the cameras at negative y; metres.
 _DISTANCE = 26.0
 _HALF_ANGLE = np.radians(32.0)
@@ -44,22 +47,6 @@ class StreetOptions(CaptureOptions):
         return {"images": (2, 1000), "blank_contrast": (0.0, 1.0), **super().bounds()}
 
 
-@dataclass(frozen=True)
-class Street:
-    """The scene.
-
-    Attributes
-    ----------
-    surfaces : tuple of Surface
-        The ground first.
-    blank : int
-        Number of the house without texture.
-    """
-
-    surfaces: tuple[Surface, ...]
-    blank: int
-
-
 def street_gsd(options: StreetOptions) -> float:
     """Size of a pixel on the houses' fronts, seen from the middle of the arc, metres."""
     return _DISTANCE / (_FOCAL * options.width)
@@ -80,7 +67,7 @@ def street_cameras(options: StreetOptions) -> dict[str, Camera]:
     return cameras
 
 
-def build_street(gsd: float, seed: int, blank_contrast: float = 0.0) -> Street:
+def build_street(gsd: float, seed: int, blank_contrast: float = 0.0) -> tuple[Surface, ...]:
     """Lay out the scene.
 
     Parameters
@@ -94,7 +81,8 @@ def build_street(gsd: float, seed: int, blank_contrast: float = 0.0) -> Street:
 
     Returns
     -------
-    Street
+    tuple of Surface
+        The ground, the house without texture (`BLANK_HOUSE`), all others.
     """
     rng = np.random.default_rng((seed, 31))
     noise = Noise(gsd, seed)
@@ -105,7 +93,7 @@ def build_street(gsd: float, seed: int, blank_contrast: float = 0.0) -> Street:
         surfaces.append(_house(noise, x, length, eaves, ridge, offset))
     surfaces += _greenery(noise, rng)
     surfaces += _posts(noise)
-    return Street(tuple(surfaces), 1)
+    return tuple(surfaces)
 
 
 def make_street_block(
@@ -119,19 +107,19 @@ def make_street_block(
     options = options or StreetOptions()
     options.check()
     gsd = street_gsd(options)
-    street = build_street(gsd, options.seed, options.blank_contrast)
+    surfaces = build_street(gsd, options.seed, options.blank_contrast)
     extent = np.array([[x, y, z] for x in (-45.0, 45.0) for y in (-30.0, 40.0) for z in (0.0, 12.0)])
     sun = (-0.45, -0.75, 0.85)
-    light = Light(sun, shadows=ShadowMap.cast(street.surfaces[1:], sun, extent, 2 * gsd))
+    light = Light(sun, shadows=ShadowMap.cast(surfaces[1:], sun, extent, 2 * gsd))
     cameras = street_cameras(options)
     return write_capture(
         output,
         cameras,
-        street.surfaces,
+        surfaces,
         light,
         options,
         gsd=gsd,
-        blank=(street.blank,) if options.blank_contrast == 0 else (),
+        blank=(BLANK_HOUSE,) if options.blank_contrast == 0 else (),
         threads=threads,
         progress=progress,
     )
