@@ -2,11 +2,11 @@
 
     python scripts/bench_robustness.py [--only CASE ...] [--variant "NAME=OPTIONS" ...] [--peer "NAME=COMMAND" ...]
 
-Each case renders a small block of twelve images (a village from the air; where there is sky, houses across a street),
-runs `colmap_sph run` with its default options and with those of each variant, and compares depth maps and cloud with
-exact depth. A peer's command gets an ordinary COLMAP dense workspace, whose folder takes the place of {workspace} in
-it; scored is what it leaves there: ``stereo/depth_maps/NAME.geometric.bin`` (or ``.photometric.bin``) and
-``fused.ply``, each where it exists. Everything is made in a temporary folder and removed.
+Each case renders a small block of twelve images (a village from the air; where there is sky, houses across a
+street), runs `colmap_sph run` with its default options and with those of each variant, and compares depth maps and
+cloud with exact depth. A peer's command gets an ordinary COLMAP dense workspace, whose folder takes the place of
+{workspace} in it; scored is what it leaves there: ``stereo/depth_maps/NAME.geometric.bin`` (or ``.photometric.bin``)
+and ``fused.ply``, each where it exists. Everything is made in a temporary folder and removed.
 
 Depth maps are compared with what each pixel of the bent picture sees, the cloud with all that stands still, both
 without registration: poses that are wrong count.
@@ -20,6 +20,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -104,9 +105,19 @@ def street(size: float, effects: syn.Imperfections | None = None, noise: float =
     return Block(options)
 
 
-def effect(name: str, size: float, strength: float, **others: bool) -> Block:
-    """The village with one effect; `size` scales the images alone."""
-    return village(size, replace(syn.Imperfections(), **{name: strength}, **others))
+def effect(name: str, size: float, strength: float) -> Block:
+    """The village with one effect, of the name that it has in `Imperfections`."""
+    return village(size, _with(name, strength))
+
+
+def adjusted(name: str, size: float, strength: float) -> Block:
+    """The same, with poses adjusted to the tracks as they are."""
+    return village(size, replace(_with(name, strength), bundle_adjusted=True))
+
+
+def _with(name: str, strength: float) -> syn.Imperfections:
+    change: dict[str, Any] = {name: strength}
+    return syn.Imperfections(**change)
 
 
 def noisy(size: float, strength: float) -> Block:
@@ -149,9 +160,9 @@ CASES: dict[str, Case] = {
     "Gaussian blur": Case(partial(effect, "blur"), (0.7, 1.4, 2.8), "px"),
     "defocus": Case(partial(effect, "defocus"), (1, 2, 4), "px radius"),
     "motion blur": Case(partial(effect, "motion_blur"), (2, 5, 10), "px"),
-    "rolling shutter": Case(partial(effect, "rolling_shutter", bundle_adjusted=True), (2, 5, 10), "px"),
-    "lens": Case(partial(effect, "lens", bundle_adjusted=True), (0.3, 0.6, 1.2), "px rms"),
-    "wobble": Case(partial(effect, "wobble", bundle_adjusted=True), (0.3, 0.6, 1.2), "px rms"),
+    "rolling shutter": Case(partial(adjusted, "rolling_shutter"), (2, 5, 10), "px"),
+    "lens": Case(partial(adjusted, "lens"), (0.3, 0.6, 1.2), "px rms"),
+    "wobble": Case(partial(adjusted, "wobble"), (0.3, 0.6, 1.2), "px rms"),
     "rotations": Case(partial(effect, "rotation_error"), (0.25, 0.5, 1.0), "px"),
     "centres": Case(partial(effect, "centre_error"), (0.25, 0.5, 1.0), "px"),
     "highlights": Case(partial(effect, "specular"), (0.2, 0.5, 1.0), "of white"),
@@ -283,7 +294,7 @@ def rows_of(name: str, strength: float, size: float, methods: Sequence[Method], 
             except ColmapSphError as error:
                 print(f"{name}, {strength:g}, {method.name}: {error}", file=sys.stderr)
                 rows.append([*label, "failed", *["-"] * (len(_HEADER) - 4)])
-            print(" | ".join(rows[-1]), file=sys.stderr, flush=True)
+            print("|", " | ".join(rows[-1]), "|", file=sys.stderr, flush=True)
     return rows
 
 
@@ -307,8 +318,8 @@ def main() -> None:
     parser.add_argument("--size", type=float, default=1.0, help="scale of the images' sides; 1 is 480 x 360")
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
-    methods = [Method("default", ()), *(Method(*variant) for variant in arguments.variant)]
-    methods += [Method(*peer, is_peer=True) for peer in arguments.peer]
+    methods = [Method("default", ()), *(Method(name, words) for name, words in arguments.variant)]
+    methods += [Method(name, words, is_peer=True) for name, words in arguments.peer]
     rows = []
     for name in arguments.only:
         strengths = CASES[name].strengths
