@@ -110,25 +110,32 @@ class Keys:
         cameras = [_camera(view) for view in (left, right)]
         return self._key("pair", images, masks, cameras, geometry, self._options.matching)
 
-    def vote(self, view: View, pair_keys: Sequence[str], stations: Sequence[int]) -> str:
-        """Of a photometric estimate, from the keys of its pairs and their stations, as they vote."""
+    def vote(
+        self, view: View, pair_keys: Sequence[str], stations: Sequence[int], residuals: Sequence[float]
+    ) -> str:
+        """Of a photometric estimate, from the keys of its pairs as they vote, their stations and residuals."""
         mask = self._mask(view.name)
-        return self._key("vote", _camera(view), mask, pair_keys, stations, self._options.vote)
+        return self._key("vote", _camera(view), mask, pair_keys, stations, residuals, self._options.vote)
 
     def photometric(self, vote: str) -> str:
         """Of the photometric maps of the view with this vote."""
         return self._key("photometric", vote, self._options.normals)
 
     def geometric(
-        self, vote: str, partner_votes: Sequence[str], stations: Sequence[int], sights: SparseSights
+        self,
+        vote: str,
+        partner_votes: Sequence[str],
+        stations: Sequence[int],
+        residuals: Sequence[float],
+        sights: SparseSights,
     ) -> str:
-        """Of the geometric maps of a view, from its own vote, and those of its partners with their stations.
+        """Of the geometric maps of a view, from its own vote and its partners' votes, stations and row residuals.
 
         The sparse points have a part in what is known of the maps.
         """
         # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
         options = (self._options.confirm, self._options.normals, self._options.refinement)
-        return self._key("geometric", vote, partner_votes, stations, sights, *options)
+        return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)
 
     def cloud(self, maps: Mapping[str, str], partners: Mapping[str, Sequence[object]], scene: Scene) -> str:
         """Of the cloud, from the keys of the geometric maps of the images to fuse.

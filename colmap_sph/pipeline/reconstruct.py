@@ -22,7 +22,7 @@ from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, refuse_disagreement
+from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
@@ -43,6 +43,7 @@ from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
+from colmap_sph.stereo.ties import filled_residuals
 
 logger = logging.getLogger(__name__)
 
@@ -249,9 +250,13 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
         What is done with each stage, see `Executor`.
     """
     check_numbers(context, pairs)
-    pair_keys = keys_of(executor(MatchStage(context, pairs)))
-    votes = executor(VoteStage(context, pair_keys))
-    maps = executor(ConfirmStage(context, pair_keys, votes))
+    matched = executor(MatchStage(context, pairs))
+    pair_keys = keys_of(matched)
+    measured = {pair: result.facts.row_residual for pair, result in matched.items()}
+    judge_rows(context.report, context.scene, measured)
+    residuals = dict(zip(measured, filled_residuals(list(measured.values())), strict=True))
+    votes = executor(VoteStage(context, pair_keys, residuals))
+    maps = executor(ConfirmStage(context, residuals, votes))
     executor(fuse_stage(context, pair_keys, maps))
 
 

@@ -47,6 +47,10 @@ class RunReport:
         Pairs matched.
     skipped_pairs : dict
         "left - right" → why the pair was not matched.
+    row_residual : float or None
+        How far the rows of rectified pairs disagree, pixels: the median of all pairs. None where too few ties tell.
+    row_residuals : dict
+        Image name → the same of its pairs.
     coverage : dict
         Image name → share of its pixels with a geometric depth.
     agreement : dict
@@ -58,6 +62,8 @@ class RunReport:
         The numbers behind it.
     doubts : str
         Which images agree with few sparse points, and what that means.
+    imprecision : str
+        Where rows of pairs disagree by more than pixels are worth: what that means, and what helps.
     refusal : str
         Where hardly any point agrees over all: why the results mean nothing.
     points : int
@@ -79,11 +85,14 @@ class RunReport:
     pair_source: str = ""
     pairs: int = 0
     skipped_pairs: dict[str, str] = field(default_factory=dict)
+    row_residual: float | None = None
+    row_residuals: dict[str, float] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None
     sparse_points: Agreement = field(default_factory=Agreement)
     doubts: str = ""
+    imprecision: str = ""
     refusal: str = ""
     points: int = 0
     advice: str = ""

@@ -3,6 +3,7 @@
 What enough partners confirm and few see through is the *geometric* depth, averaged with theirs.
 """
 
+import itertools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ class ConfirmOptions:
     """What other views must say of a view's depth for it to stay."""
 
     max_reprojection_error: float = 2.0
-    """Two views' depths agree when the point, seen by the other view, projects back within this many pixels."""
+    """Two views' depths agree when the point, seen by the other view, projects back within this many pixels, and
+    twice what their rows disagree by."""
     tolerance: float = 4.5
     """Two views' depths agree when they also differ by less than this many standard deviations."""
     min_consistent: int = 2
@@ -56,6 +58,8 @@ class ConfirmOptions:
             raise OptionError(f"min_surface must lie in 0..1, not {self.min_surface}.", "min_surface")
 
 
+# Points may project back farther away by so many row residuals.
+_RESIDUALS = 2.0
 # Slope of the steepest surface that is looked for around a pixel, as depth over width.
 _STEEPEST = 4.0
 
@@ -66,6 +70,7 @@ def confirm_depth(
     partners: Iterable[tuple[View, DepthEstimate]],
     options: ConfirmOptions,
     stations: Sequence[int] | None = None,
+    residuals: Sequence[float] | None = None,
 ) -> DepthEstimate:
     """Geometric depth of a view: what the depth maps of its partners confirm, averaged with theirs.
 
@@ -80,6 +85,8 @@ def confirm_depth(
     stations : sequence of int, optional
         Number of the station of each partner, equal ones side by side (see `Stations`): partners of one station
         count as one. Without it each is a station of its own.
+    residuals : sequence of float, optional
+        Row residual of the view's pair with each partner, radians. Without it poses and lenses are perfect.
 
     Returns
     -------
@@ -88,12 +95,14 @@ def confirm_depth(
     """
     sums = _Sums.empty(estimate.depth.shape)
     sizes = Counter(stations)
-    numbered = enumerate(partners) if stations is None else zip(stations, partners, strict=True)
+    numbers = itertools.count() if stations is None else stations
+    shifts = itertools.repeat(0.0) if residuals is None else residuals
+    numbered = zip(numbers, partners, shifts, strict=False)
     for number, members in groupby(numbered, key=lambda member: member[0]):
         has_others = sizes[number] > 1
         station = _Sums.empty(estimate.depth.shape) if has_others else sums
-        for _, (partner, partner_estimate) in members:
-            _compare(view, estimate, partner, partner_estimate, options, station)
+        for _, (partner, partner_estimate), residual in members:
+            _compare(view, estimate, partner, partner_estimate, options, residual, station)
         if has_others:
             _add_as_one(station, sums)
     _native.confirm_depth(
@@ -130,6 +139,7 @@ def _compare(
     partner: View,
     partner_estimate: DepthEstimate,
     options: ConfirmOptions,
+    residual: float,
     sums: _Sums,
 ) -> None:
     """Add what a partner says of every pixel."""
@@ -142,7 +152,7 @@ def _compare(
         partner_estimate.support,
         pixel_transfer(view, partner),
         pixel_transfer(partner, view),
-        options.max_reprojection_error,
+        options.max_reprojection_error + _RESIDUALS * residual * float(view.K[0, 0]),
         options.tolerance,
         options.min_contradicting_support,
         *sums,

@@ -5,6 +5,7 @@ standard deviation from its geometry. The candidates vote: the largest mutually 
 weighted mean is the *photometric* depth.
 """
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -27,8 +28,9 @@ class VoteOptions:
     """How the pairs of a view vote on its depth."""
 
     disparity_sigma: float = 0.2
-    """Standard deviation, pixels, of a disparity on a smooth surface; where disparities are rough it is larger.
-    It is the scale of all tolerances, those of the confirmation among them."""
+    """Standard deviation, pixels, of a disparity on a smooth surface of a pair with perfect poses and lenses. It
+    is larger where disparities are rough, and where the rows of a pair disagree. It is the scale of all
+    tolerances, those of the confirmation among them."""
     max_disparity_step: float = 2.0
     """Neighbouring disparities that differ by more than this (pixels) belong to different surfaces."""
     tolerance: float = 3.0
@@ -59,6 +61,7 @@ def depth_candidates(
     side: Side,
     options: VoteOptions,
     rows: slice = slice(None),
+    residual: float = 0.0,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Triangulate a pair's disparities along the rays of one of its images.
 
@@ -76,6 +79,8 @@ def depth_candidates(
     options : VoteOptions
     rows : slice, optional
         Rows of the view to do, h of them.
+    residual : float
+        How far poses and lenses shift the pair's rays against each other, radians: its row residual.
 
     Returns
     -------
@@ -93,7 +98,7 @@ def depth_candidates(
         (geometry.column_origin(side), geometry.row_origin),
         geometry.disparity_origin,
         geometry.baseline,
-        options.disparity_sigma,
+        math.hypot(options.disparity_sigma, residual * geometry.columns_per_radian),
         options.max_disparity_step,
         geometry.surface == "spherical",
         side == "left",
@@ -105,7 +110,11 @@ def depth_candidates(
 
 
 def vote_depth(
-    view: View, pairs: Iterable[PairDisparity], options: VoteOptions, stations: Sequence[int] | None = None
+    view: View,
+    pairs: Iterable[PairDisparity],
+    options: VoteOptions,
+    stations: Sequence[int] | None = None,
+    residuals: Sequence[float] | None = None,
 ) -> DepthEstimate:
     """Photometric depth of a view: the vote of all its pairs.
 
@@ -118,6 +127,8 @@ def vote_depth(
     stations : sequence of int, optional
         Number of the station of each pair's partner, ascending (see `Stations`): partners of one station have one
         vote. Without it each is a station of its own.
+    residuals : sequence of float, optional
+        Row residual of each pair, radians. Without it poses and lenses are perfect.
 
     Returns
     -------
@@ -148,10 +159,14 @@ def vote_depth(
     shape = (view.height, view.width)
     voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
     numbers = np.arange(len(sources)) if stations is None else np.asarray(stations)
+    shifts = [0.0] * len(sources) if residuals is None else residuals
     step = max(_BAND_BYTES // (8 * view.width * max(len(sources), 1)), 1)
     for first in range(0, view.height if sources else 0, step):
         rows = slice(first, first + step)
-        candidates = [depth_candidates(view, *source, options, rows) for source in sources]
+        candidates = [
+            depth_candidates(view, *source, options, rows, residual)
+            for source, residual in zip(sources, shifts, strict=True)
+        ]
         _native.vote_depth(
             np.stack([depth for depth, _ in candidates]),
             np.stack([sigma for _, sigma in candidates]),

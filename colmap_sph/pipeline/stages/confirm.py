@@ -23,7 +23,7 @@ from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
-from colmap_sph.stereo.partners.pairing import Pair, partners_of
+from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
 
 if TYPE_CHECKING:
@@ -63,6 +63,7 @@ class ConfirmTask:
     reference: EstimateFile
     partners: tuple[EstimateFile, ...]
     stations: tuple[int, ...]
+    residuals: tuple[float, ...]
     sights: SparseSights
     mask: Path
     confirm_options: ConfirmOptions
@@ -76,7 +77,8 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     """Confirm a view's depth by its partners' and refine it on their images; writes its geometric maps."""
     view = task.reference.view
     others = ((partner.view, _estimate(partner)) for partner in task.partners)
-    confirmed = confirm_depth(view, _estimate(task.reference), others, task.confirm_options, task.stations)
+    estimate = _estimate(task.reference)
+    confirmed = confirm_depth(view, estimate, others, task.confirm_options, task.stations, task.residuals)
     planes = fit_normals(view, confirmed, task.normal_options)
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
@@ -101,11 +103,12 @@ class ConfirmStage(Stage[str, ConfirmTask]):
     name = "confirm depth"
     make = staticmethod(make_geometric_maps)
 
-    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], votes: Mapping[str, Result]) -> None:
+    def __init__(self, context: "Context", residuals: Mapping[Pair, float], votes: Mapping[str, Result]) -> None:
         super().__init__(context, [view.name for view in context.scene.views if view.name in votes])
         self._vote_keys = keys_of(votes)
         self._voted = {name: result.facts.coverage for name, result in votes.items()}
-        self._all_partners = partners_of(pair_keys)
+        self._residuals = residuals
+        self._all_partners = partners_of(residuals)
         self._tracks = context.sparse_tracks  # found once, and not by every worker at a time
 
     def job(self, item: str) -> Job[ConfirmTask]:
@@ -114,12 +117,14 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
         sights = self._tracks.sights(item)
-        key = self.context.keys.geometric(self._vote_keys[item], votes, stations, sights)
+        residuals = [self._residuals[as_pair(item, name)] for name in partners]
+        key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights)
         maps = self.context.map_files(item, "geometric")
         task = ConfirmTask(
             self._estimate_file(item),
             tuple(map(self._estimate_file, partners)),
             tuple(stations),
+            tuple(residuals),
             sights,
             self.context.workspace.mask_path(item),
             options.confirm,

@@ -49,9 +49,13 @@ class Facts:
     unread : mapping of str to str
         Image name → why what the result should have been made of could not be read. The result is not complete
         then, and no record vouches for it.
+    row_residual : float or None
+        Of a pair: how far rows of its rectified images disagree, radians (see `ties`); None where too few ties
+        tell.
     """
 
     coverage: float = 0.0
     agreement: Agreement = field(default_factory=Agreement)
     points: int = 0
     unread: Mapping[str, str] = field(default_factory=dict)
+    row_residual: float | None = None

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.pair_files import is_pair_there, write_pair
+from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import grey_bytes, read_grey
@@ -27,6 +27,7 @@ from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectification import rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
+from colmap_sph.stereo.ties import find_corners, find_ties
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -49,7 +50,21 @@ _RECTIFIED_SHARE = 1.4
 _SCRATCH_BYTES = 256 << 20
 _CACHE_BYTES = 512 << 20
 
-_images: LoadCache[NDArray[np.uint8] | NDArray[np.float32]] = LoadCache(lambda image: image.nbytes)
+
+@dataclass(frozen=True, eq=False)
+class _Photo:
+    """A grey image, and its corners."""
+
+    image: NDArray[np.uint8] | NDArray[np.float32]
+    corners: NDArray[np.float64]
+
+    @classmethod
+    def read(cls, path: Path) -> "_Photo":
+        image = read_grey(path)
+        return cls(image, find_corners(image))
+
+
+_photos: LoadCache[_Photo] = LoadCache(lambda photo: photo.image.nbytes + photo.corners.nbytes)
 _masks: LoadCache[NDArray[np.uint8] | None] = LoadCache(lambda mask: 0 if mask is None else mask.nbytes)
 _thread = threading.local()
 
@@ -77,7 +92,7 @@ class MatchTask:
 
 
 def make_disparity_map(task: MatchTask) -> Facts:
-    """Rectify and match a pair; writes its disparity map."""
+    """Rectify and match a pair; writes its disparity map and ties."""
     geometry = task.geometry
     if getattr(_thread, "scratch", None) is None or _thread.scratch.max_bytes != task.scratch_bytes:
         _thread.scratch = Scratch(task.scratch_bytes)
@@ -90,16 +105,21 @@ def make_disparity_map(task: MatchTask) -> Facts:
         _thread.scratch,
     )
     pair = PairDisparity(task.left.view.name, task.right.view.name, geometry, disparity)
-    write_pair(task.target, pair, task.key)
-    return Facts()
+    left, right = _photo(task.left), _photo(task.right)
+    photos = (task.left.view, left.image), (task.right.view, right.image)
+    ties = find_ties(*photos, geometry, disparity, left.corners)
+    return write_pair(task.target, pair, task.key, ties)
+
+
+def _photo(file: PhotoFile) -> _Photo:
+    return _photos.get(file_stamp(file.image), lambda: _Photo.read(file.image))
 
 
 def _rectified(photo: PhotoFile, geometry: RectifiedPair, side: Side) -> RectifiedImage:
     view = photo.view
-    image = _images.get(file_stamp(photo.image), lambda: read_grey(photo.image))
     mask_key = f"{file_stamp(photo.mask)} {view.width} {view.height}"
     mask = _masks.get(mask_key, lambda: read_mask(photo.mask, view.width, view.height))
-    return RectifiedImage(*resample(image, view, geometry, side, mask=mask))
+    return RectifiedImage(*resample(_photo(photo).image, view, geometry, side, mask=mask))
 
 
 class MatchStage(Stage[Pair, MatchTask]):
@@ -137,8 +157,7 @@ class MatchStage(Stage[Pair, MatchTask]):
             target,
             key,
         )
-        is_there = is_pair_there(target, key, left.name, right.name, geometry)
-        return Job(key, Facts() if is_there else None, cost, task)
+        return Job(key, facts_of_pair(target, key, left.name, right.name, geometry), cost, task)
 
     def _geometry(self, left: View, right: View) -> RectifiedPair:
         try:
@@ -183,7 +202,7 @@ class MatchStage(Stage[Pair, MatchTask]):
     def holding(self, kept: Kept) -> Iterator[None]:
         """See `Stage.holding`."""
         self._scratch_bytes = kept.scratch
-        with _images.holding(kept.cache), _masks.holding(kept.cache):
+        with _photos.holding(kept.cache), _masks.holding(kept.cache):
             yield
 
     def close(self, results: Mapping[Pair, Result]) -> None:

@@ -1,19 +1,23 @@
 """Intermediate results on disk, in files that hold the key they were made under: disparity maps and estimates.
 
-A pair's disparity map comes with the geometry that gives it meaning. Disparities are stored in 16 bits, 1/64 pixel
-apart or as fine as the pair's range allows; 0 = none.
+A pair's disparity map comes with the geometry that gives it meaning, and with its ties. Disparities are stored
+in 16 bits, 1/64 pixel apart or as fine as the pair's range allows; 0 = none.
 """
 
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.state.array_file import ArrayType, Head, read_arrays, read_head, write_arrays
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Surface
+from colmap_sph.stereo.ties import MAX_TIES, Ties, row_residual
 
 _PAIR = "pair"
 _ESTIMATE = "estimate"
@@ -21,10 +25,15 @@ _FINEST_STEP = 1 / 64
 _CODES = 65535
 _NUMBERS = [field.name for field in fields(RectifiedPair) if field.name not in ("surface", "rectified_from_world")]
 _WHOLE_NUMBERS = ("height", "left_width", "right_width")
+# Before the geometry: the least disparity, the step between two codes, and the row residual, or this where there
+# are too few ties for one.
+_OWN_NUMBERS = 3
+_UNKNOWN = -1.0
+_TIE_COLUMNS = 5
 
 
-def write_pair(path: Path, pair: PairDisparity, key: str = "") -> None:
-    """Write a pair's disparity map; `OutputError` where that fails.
+def write_pair(path: Path, pair: PairDisparity, key: str = "", ties: Ties | None = None) -> Facts:
+    """Write a pair's disparity map and its ties; `OutputError` where that fails.
 
     Parameters
     ----------
@@ -32,7 +41,13 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "") -> None:
         Target file; its folder exists.
     pair : PairDisparity
     key : str
-        What `is_pair_there` shall find.
+        What `facts_of_pair` shall find.
+    ties : Ties, optional
+
+    Returns
+    -------
+    Facts
+        What `facts_of_pair` will say.
     """
     found = np.isfinite(pair.disparity)
     least = float(pair.disparity[found].min()) if found.any() else 0.0
@@ -40,28 +55,57 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "") -> None:
     step = max(_FINEST_STEP, (most - least) / (_CODES - 1))
     codes = np.where(found, np.rint((pair.disparity - least) / step) + 1, 0).astype(np.uint16)
     texts = _texts_of(pair.left, pair.right, pair.geometry)
-    write_arrays(path, _PAIR, key, [codes], texts=texts, numbers=[least, step, *_numbers_of(pair.geometry)])
+    ties = ties or Ties.none()
+    residual = row_residual(ties)
+    table = np.column_stack([ties.left, ties.right, ties.sigma])
+    numbers = [least, step, _UNKNOWN if residual is None else residual, *_numbers_of(pair.geometry)]
+    arrays: list[NDArray[Any]] = [codes, table] if len(ties) else [codes]  # no array of a file is empty
+    write_arrays(path, _PAIR, key, arrays, texts=texts, numbers=numbers)
+    return _facts(residual, pair.geometry)
 
 
 def read_pair(path: Path) -> PairDisparity:
     """Read a pair's disparity map; `InputError` where the file is missing or damaged."""
-    head, (codes,) = read_arrays(path, _PAIR, lambda head: [_codes_type(_geometry_of(head))])
+    head, (codes, *_) = _read(path)
     least, step = head.numbers[:2]
     disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
     disparity[codes == 0] = np.nan
     return PairDisparity(head.texts[0], head.texts[1], _geometry_of(head), disparity)
 
 
-def is_pair_there(path: Path, key: str, left: str, right: str, geometry: RectifiedPair) -> bool:
-    """Whether a file holds the disparity map of this pair, made under this key; only its head is read."""
+def read_ties(path: Path) -> Ties:
+    """Read a pair's ties; `InputError` where the file is missing or damaged."""
+    _, (_, *tables) = _read(path)
+    if not tables:
+        return Ties.none()
+    (table,) = tables
+    return Ties(table[:, :2], table[:, 2:4], table[:, 4])
+
+
+def _read(path: Path) -> tuple[Head, Sequence[NDArray[Any]]]:
+    return read_arrays(path, _PAIR, lambda head: _array_types(head, _geometry_of(head)))
+
+
+def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: RectifiedPair) -> Facts | None:
+    """Say what is known of the disparity map of this pair, made under this key; None where it must be made.
+
+    Only the head of the file is read.
+    """
     head = read_head(path)
-    return (
-        head is not None
-        and (head.kind, head.key, head.texts) == (_PAIR, key, _texts_of(left, right, geometry))
-        and _has_scale(head)
-        and head.numbers[2:] == tuple(_numbers_of(geometry))
-        and head.arrays == (_codes_type(geometry),)
-    )
+    if (
+        head is None
+        or (head.kind, head.key, head.texts) != (_PAIR, key, _texts_of(left, right, geometry))
+        or not _has_scale(head)
+        or head.numbers[_OWN_NUMBERS:] != tuple(_numbers_of(geometry))
+        or head.arrays != tuple(_array_types(head, geometry))
+    ):
+        return None
+    residual = head.numbers[2]
+    return _facts(None if residual < 0 else residual, geometry)
+
+
+def _facts(residual: float | None, geometry: RectifiedPair) -> Facts:
+    return Facts(row_residual=None if residual is None else residual / geometry.columns_per_radian)
 
 
 def disparity_bytes(path: Path) -> int:
@@ -109,13 +153,19 @@ def _estimate_types(view: View) -> list[ArrayType]:
     return [(np.dtype(name), (view.height, view.width)) for name in ("<f4", "<f4", "<u1")]
 
 
-def _codes_type(geometry: RectifiedPair) -> ArrayType:
-    return np.dtype("<u2"), (geometry.height, geometry.left_width)
+def _array_types(head: Head, geometry: RectifiedPair) -> list[ArrayType]:
+    """Of what a pair's file must hold: disparities, and a table of ties where it has one."""
+    types: list[ArrayType] = [(np.dtype("<u2"), (geometry.height, geometry.left_width))]
+    if len(head.arrays) > 1:
+        rows = min(head.arrays[1][1][0], MAX_TIES)
+        types.append((np.dtype("<f4"), (rows, _TIE_COLUMNS)))
+    return types
 
 
 def _has_scale(head: Head) -> bool:
-    """Whether there are a least disparity and a step above 0."""
-    return len(head.numbers) > 1 and bool(np.isfinite(head.numbers[:2]).all()) and head.numbers[1] > 0
+    """Whether there are a least disparity, a step above 0, and a row residual."""
+    own = head.numbers[:_OWN_NUMBERS]
+    return len(own) == _OWN_NUMBERS and bool(np.isfinite(own).all()) and own[1] > 0
 
 
 def _texts_of(left: str, right: str, geometry: RectifiedPair) -> tuple[str, ...]:
@@ -131,11 +181,16 @@ def _numbers_of(geometry: RectifiedPair) -> list[float]:
 
 def _geometry_of(head: Head) -> RectifiedPair:
     """The geometry in the head of a pair's file; `ValueError` where there is none."""
-    if len(head.texts) != 3 or head.texts[2] not in get_args(Surface) or len(head.numbers) != 11 + len(_NUMBERS):
+    if (
+        len(head.texts) != 3
+        or head.texts[2] not in get_args(Surface)
+        or len(head.numbers) != _OWN_NUMBERS + 9 + len(_NUMBERS)
+    ):
         raise ValueError("it does not describe a pair")
     if not np.isfinite(head.numbers).all() or not _has_scale(head):
         raise ValueError("it does not describe a pair")
-    rotation = np.array(head.numbers[2:11]).reshape(3, 3)
-    values: dict[str, float] = dict(zip(_NUMBERS, head.numbers[11:], strict=True))
+    numbers = head.numbers[_OWN_NUMBERS:]
+    rotation = np.array(numbers[:9]).reshape(3, 3)
+    values: dict[str, float] = dict(zip(_NUMBERS, numbers[9:], strict=True))
     values |= {name: int(values[name]) for name in _WHOLE_NUMBERS}
     return RectifiedPair(surface=head.texts[2], rectified_from_world=rotation, **values)  # type: ignore[arg-type]

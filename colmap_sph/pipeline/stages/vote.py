@@ -47,6 +47,7 @@ class VoteTask:
     estimate: Path
     is_voted: bool
     stations: tuple[int, ...]
+    residuals: tuple[float, ...]
     vote_options: VoteOptions
     normal_options: NormalOptions
     maps: MapFiles
@@ -63,7 +64,7 @@ def make_photometric_maps(task: VoteTask) -> Facts:
 
 def _vote(task: VoteTask) -> DepthEstimate:
     pairs = (read_pair(file) for file in task.pairs)
-    estimate = vote_depth(task.view, pairs, task.vote_options, task.stations)
+    estimate = vote_depth(task.view, pairs, task.vote_options, task.stations, task.residuals)
     mask = read_mask(task.mask, task.view.width, task.view.height)
     if mask is not None:
         # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
@@ -78,9 +79,10 @@ class VoteStage(Stage[str, VoteTask]):
     name = "vote on depth"
     make = staticmethod(make_photometric_maps)
 
-    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str]) -> None:
+    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], residuals: Mapping[Pair, float]) -> None:
         super().__init__(context, [view.name for view in context.scene.views])
         self._pair_keys = pair_keys
+        self._residuals = residuals
         self._partners = partners_of(pair_keys)
 
     def job(self, item: str) -> Job[VoteTask]:
@@ -89,8 +91,9 @@ class VoteStage(Stage[str, VoteTask]):
         view = context.scene.view(item)
         partners, stations = context.stations.elsewhere(item, self._partners.get(item, []))
         files = tuple(context.pair_path(item, partner) for partner in partners)
-        pair_keys = [self._pair_keys[as_pair(item, partner)] for partner in partners]
-        key = context.keys.vote(view, pair_keys, stations)
+        pairs = [as_pair(item, partner) for partner in partners]
+        residuals = [self._residuals[pair] for pair in pairs]
+        key = context.keys.vote(view, [self._pair_keys[pair] for pair in pairs], stations, residuals)
         maps_key = context.keys.photometric(key)
         estimate = context.estimate_path(item)
         maps = context.map_files(item, "photometric")
@@ -102,6 +105,7 @@ class VoteStage(Stage[str, VoteTask]):
             estimate,
             is_voted,
             tuple(stations),
+            tuple(residuals),
             context.options.vote,
             context.options.normals,
             maps,
