@@ -5,7 +5,7 @@
 Each case renders a small block of twelve images (a village from the air; where there is sky, houses across a
 street), runs `colmap_sph run` with its default options and with those of each variant, and compares depth maps and
 cloud with exact depth. A peer's command gets an ordinary COLMAP dense workspace, whose folder takes the place of
-{workspace} in it; scored is what it leaves there: ``stereo/depth_maps/NAME.geometric.bin`` (or ``.photometric.bin``)
+{workspace} in it; scored is what it leaves there: ``stereo/depth_maps/NAME.geometric.bin`` (``.photometric.bin``)
 and ``fused.ply``, each where it exists. Everything is made in a temporary folder and removed.
 
 Depth maps are compared with what each pixel of the bent picture sees, the cloud with all that stands still, both
