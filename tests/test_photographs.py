@@ -204,7 +204,10 @@ def test_a_bent_picture_is_the_straight_one_through_its_field(bending):
     bent = syn.photograph([wall()], bent_camera, syn.Imperfections(), light=LIGHT).image
     x, y = pixel_grid()
     dx, dy = field_by_hand(bending, x, y)
-    again = cv2.remap(straight, *(np.float32(p - 0.5) for p in (x + dx, y + dy)), cv2.INTER_CUBIC)
+    # cv2 counts from the first pixel's centre.
+    across = (x + dx - 0.5).astype(np.float32)
+    down = (y + dy - 0.5).astype(np.float32)
+    again = cv2.remap(straight, across, down, cv2.INTER_CUBIC)
     inner = np.s_[8:-8, 8:-8]
     error = np.abs(again[inner].astype(float) - bent[inner]).mean()
     unmoved = np.abs(straight[inner].astype(float) - bent[inner]).mean()
@@ -246,7 +249,8 @@ def test_a_thing_at_the_edge_of_a_moving_view_is_not_lost():
     for x in (-4.6, -3.6, 3.6, 4.6):
         thing = syn.box((x, -1.5, WALL_DEPTH), (0.8, 3.0, 1.0), (GREY,))
         depth, _, _ = syn.exact_geometry([thing], real)
-        rays = real.rays(*(np.arange(size) + 0.5 for size in (WIDTH, HEIGHT)))
+        x_grid, y_grid = pixel_grid()
+        rays = real.rays(x_grid[0], y_grid[:, 0])
         expected = np.isfinite(thing.intersect(rays.origins, rays.directions)[0])
         assert expected.any()
         np.testing.assert_array_equal(depth > 0, expected)
@@ -336,10 +340,10 @@ def mean_shifts(model, cameras, points):
     return shifts
 
 
-@pytest.mark.parametrize("kind", ["rotation_error", "centre_error"])
-def test_disturbed_poses_move_projections_by_so_many_pixels(kind):
+@pytest.mark.parametrize("effects", [syn.Imperfections(rotation_error=0.8), syn.Imperfections(centre_error=0.8)])
+def test_disturbed_poses_move_projections_by_so_many_pixels(effects):
     model, cameras, points = model_of_a_ring()
-    disturb(model, syn.Imperfections(**{kind: 0.8}), seed=3)
+    disturb(model, effects, seed=3)
     shifts = mean_shifts(model, cameras, points)
     # 120 numbers know their spread to 6.5 %.
     assert np.sqrt(np.mean(np.square(shifts))) == pytest.approx(0.8, rel=0.2)
