@@ -14,6 +14,7 @@ without registration: poses that are wrong count.
 
 import argparse
 import shlex
+import signal
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -318,6 +319,8 @@ def main() -> None:
     parser.add_argument("--size", type=float, default=1.0, help="scale of the images' sides; 1 is 480 x 360")
     parser.add_argument("--threads", type=int, default=2)
     arguments = parser.parse_args()
+    # An ended benchmark leaves nothing behind, either.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     methods = [Method("default", ()), *(Method(name, words) for name, words in arguments.variant)]
     methods += [Method(name, words, is_peer=True) for name, words in arguments.peer]
     rows = []
