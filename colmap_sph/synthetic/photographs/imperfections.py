@@ -25,7 +25,10 @@ _BOUNDS: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True)
 class Imperfections:
-    """Strengths; none by default. What is random is drawn from the block's seed, for each image anew."""
+    """Strengths; none by default. What is random is drawn from the block's seed, for each image anew.
+
+    Noise that all pixels have alike and JPEG quality are `image_noise` and `jpeg_quality` of `CaptureOptions`.
+    """
 
     photon_noise: float = 0.0
     """Standard deviation of the noise at white, grey values of 255; it grows with the root of the light."""
