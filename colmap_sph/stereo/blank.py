@@ -23,18 +23,20 @@ _LEVELS = 4
 _SIDE = 7
 # Images with a shorter side than this hold no window of the coarsest scale that could be trusted.
 _LEAST_SIDE = 128
-# Noise is measured at half size, where JPEG has spared it, as what varies least: …
+# Noise is measured at half size, where JPEG has spared it, as what varies least: this percentile of windows, at
+# least what the rounding of JPEG may leave, at most what cameras make.
 _NOISE_LEVEL = 1
-# … this percentile of windows, at least what rounding to grey values leaves and at most what cameras make.
 _QUIETEST = 5
-_LEAST_NOISE = 0.3
+_LEAST_NOISE = 0.5
 _MOST_NOISE = 1.5
-# Blocks with so little or so much light are left out of that: their noise is cut off.
+# Local noise is the least of so many by so many pixels of the coarsest scale: some of them may hold an edge.
+_LOCAL_SIDE = 5
+# Pixels with so little or so much light are left out of that: their noise is cut off.
 _LEAST_GREY = 5
 _MOST_GREY = 250
 # What noise may reach in a window, in that of the quietest ones. It falls by half from scale to scale, after the
 # rounding of JPEG a little less.
-_MARGIN = 1.6
+_MARGIN = 1.4
 _FALL = 0.56
 # A blank region reaches beyond its coarse windows, which take in what is around it: by so many pixels of the next
 # coarser scale, …
@@ -43,8 +45,8 @@ _REACH = 2
 # times the noise, or than this share of the largest difference nearby. Windows there hold the edge of what stands
 # before it.
 _EDGE_REACH = 4
-_ALIKE = 5.0
-_EDGE_SHARE = 0.5
+_ALIKE = 4.0
+_EDGE_SHARE = 0.33
 # Within so many pixels around a pixel is what stands before it.
 _CONTRAST_REACH = 2
 # Rows that are worked on at a time, to bound the memory.
@@ -81,9 +83,9 @@ def blank_pixels(image: NDArray[np.uint8] | Float) -> Mask:
     scales = [image.astype(np.float32, copy=False)]
     while len(scales) < _LEVELS:
         scales.append(_half(scales[-1]))
-    noise = _noise(scales[_NOISE_LEVEL])
+    noise, local = _noise(scales)
     bounds = [_MARGIN * noise * _FALL ** (level - _NOISE_LEVEL) for level in range(_LEVELS)]
-    blank = _quiet(scales[-1], bounds[-1])
+    blank = _quiet(scales[-1], bounds[-1] / noise * local)
     for scale, bound in zip(scales[-2::-1], bounds[-2::-1], strict=True):
         if not blank.any():
             return np.zeros(image.shape, np.uint8)
@@ -106,11 +108,12 @@ def _next_finer(blank: Mask, shape: tuple[int, ...]) -> Mask:
     return np.asarray(doubled[: shape[0], : shape[1]], dtype=np.uint8)
 
 
-def _quiet(image: Float, bound: float) -> Mask:
+def _quiet(image: Float, bound: float | Float) -> Mask:
     """1 where any window that holds the pixel varies by no more than `bound`: others may hold something else."""
     quiet = np.empty(image.shape, np.uint8)
+    limit = np.broadcast_to(np.square(bound), image.shape)
     for band, wide, inner in _bands(image.shape[0], _SIDE):
-        quiet[band] = (_variance(image[wide]) <= bound**2)[inner]
+        quiet[band] = _variance(image[wide])[inner] <= limit[band]
     return np.asarray(cv2.dilate(quiet, np.ones((_SIDE, _SIDE), np.uint8)), dtype=np.uint8)
 
 
@@ -141,19 +144,29 @@ def _variance(image: Float) -> Float:
     return largest
 
 
-def _noise(image: Float) -> float:
-    """Standard deviation of pixels, grey values, in the quietest of the windows that tile an image."""
-    rows, columns = (size // _SIDE for size in image.shape)
-    image = image[: rows * _SIDE, : columns * _SIDE]
+def _noise(scales: list[Float]) -> tuple[float, Float]:
+    """Standard deviation of pixels, grey values, at the scale where noise is measured.
 
-    def mean(values: Float) -> Float:
-        return np.asarray(cv2.resize(values, (columns, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
-
-    variances = [mean(step * step) - mean(step) ** 2 for step in (_steps(image, 0), _steps(image, 1))]
-    grey = mean(image)
-    variance = np.maximum(*variances)[(grey > _LEAST_GREY) & (grey < _MOST_GREY)]
-    quietest = float(np.percentile(variance, _QUIETEST)) if variance.size else 0.0
-    return float(np.clip(np.sqrt(max(quietest, 0.0)), _LEAST_NOISE, _MOST_NOISE))
+    Returns
+    -------
+    noise : float
+        In the quietest windows of the image.
+    local : ndarray of the coarsest scale's shape
+        Around each of its pixels, where that is less, as an image without any blank place has no window with noise
+        alone; 0 where it is much more, so that there is texture, too fine for the coarsest scale.
+    """
+    image = scales[_NOISE_LEVEL]
+    variance = np.empty_like(image)
+    for band, wide, inner in _bands(image.shape[0], _SIDE):
+        variance[band] = _variance(image[wide])[inner]
+    some = (slice(_SIDE // 2, None, _SIDE),) * 2
+    lit = (image[some] > _LEAST_GREY) & (image[some] < _MOST_GREY)
+    quietest = float(np.percentile(variance[some][lit], _QUIETEST)) if lit.any() else 0.0
+    noise = float(np.clip(np.sqrt(quietest), _LEAST_NOISE, _MOST_NOISE))
+    mean = cv2.resize(variance, scales[-1].shape[::-1], interpolation=cv2.INTER_AREA)
+    local = np.clip(np.sqrt(cv2.erode(mean, np.ones((_LOCAL_SIDE, _LOCAL_SIDE), np.uint8))), _LEAST_NOISE, noise)
+    local[cv2.blur(mean, (_SIDE, _SIDE)) > (_MARGIN * noise) ** 2] = 0
+    return noise, local
 
 
 def _with_edges(image: Float, blank: Mask, noise: float) -> Mask:

@@ -89,6 +89,7 @@ def make_disparity_map(task: MatchTask) -> Facts:
         geometry.max_disparity,
         task.options,
         _thread.scratch,
+        infinity=-geometry.disparity_origin,
     )
     pair = PairDisparity(task.left.view.name, task.right.view.name, geometry, disparity)
     write_pair(task.target, pair, task.key)
