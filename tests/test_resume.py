@@ -386,11 +386,11 @@ def test_memory_refused_once(what: str, finished: Finished, monkeypatch: pytest.
     original = pkgutil.resolve_name(place)
     calls = []
 
-    def refused_first(*arguments: object) -> object:
+    def refused_first(*arguments: object, **keywords: object) -> object:
         calls.append(what)
         if len(calls) == 1:
             np.empty(1 << 60, np.uint8)
-        return original(*arguments)
+        return original(*arguments, **keywords)
 
     monkeypatch.setattr(place, refused_first)
     options = replace(OPTIONS, threads=1, matching=MatchingOptions(p1=12))

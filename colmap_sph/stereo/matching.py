@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
 from colmap_sph.stereo.kernels import backend
-from colmap_sph.stereo.offsets import remove_small_segments, smooth, to_disparity
+from colmap_sph.stereo.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
 from colmap_sph.stereo.search_ranges import MAX_DEPTH, STEP, num_levels, propagate, range_depth, whole_range
 
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
@@ -32,6 +32,11 @@ _UNSHARP = _CENSUS_STEPS * ((1 + _SHARPENING) * np.outer((0, 1, 0), (0, 1, 0)) -
 _BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
 # Segments of fewer pixels than this are removed at every level, however coarse.
 _LEAST_SEGMENT = 4
+# Sky is searched for where what is infinitely far away is no farther from the range than this share of its width:
+# nearer scenes, such as rooms, seldom see any, and find less on weak texture if more is searched.
+_NEAR_RANGE = 0.1
+# What poses that are not exact may add to the disparity of what is infinitely far away, pixels.
+_POSE_ERROR = 4
 _CONTENT = np.uint8(255)  # where an image has content, in masks; a level's pixel has where half of its four have
 _HALF_CONTENT = 128
 
@@ -67,6 +72,9 @@ class MatchingOptions:
     """The same above full resolution, where matches only say where to search."""
     min_segment: int = 200
     """Connected regions of fewer pixels than this are removed at full resolution."""
+    keep_blank: bool = False
+    """Match also what varies by no more than the image's noise, such as clear sky and blown-out walls; else it is
+    ignored, as if under a mask."""
     median_filter: bool = False
     """Take the median of 5 x 5 disparities at full resolution, as is done above it. Depth from many pairs is
     better without: how rough a disparity map is tells the vote how far to trust it."""
@@ -155,6 +163,8 @@ def match_pair(
     max_disparity: float,
     options: MatchingOptions,
     scratch: Scratch | None = None,
+    *,
+    infinity: float | None = None,
 ) -> NDArray[np.float32]:
     """Match the left image of a rectified pair in the right one.
 
@@ -167,6 +177,10 @@ def match_pair(
     options : MatchingOptions
     scratch : Scratch, optional
         Working memory to use again.
+    infinity : float, optional
+        Disparity of what is infinitely far away. Where the range nearly reaches it, matches are searched up to
+        there, and those beyond `min_disparity` dropped: clouds would else be matched to whatever looks most like
+        them in the range.
 
     Returns
     -------
@@ -196,6 +210,10 @@ def match_pair(
     most = int(np.ceil(-min_disparity)) + 1
     size = min(left.image.shape + right.image.shape)
     levels = num_levels(most - least, size, options.max_coarsest_disparities)
+    farthest = most
+    sky = _sky_offset(min_disparity, max_disparity, infinity)
+    if sky is not None:
+        most = int(np.ceil(sky)) + _POSE_ERROR
     lefts = _pyramid(left, levels)
     rights = _pyramid(right, levels)
     del left, right  # each level goes when it has been matched
@@ -210,11 +228,34 @@ def match_pair(
             depth = min(range_depth(low, high), searched)
             base = propagate(offset, shape, depth, low, high, options.range_radius)
         offset = _match_level(lefts.pop(), rights.pop(), base, depth, options, scratch, finest=level == 0)
+        if sky is not None:
+            _drop_beyond(offset, farthest, sky, level)
         if level > 0 or options.median_filter:
             smooth(offset)
         remove_small_segments(offset, max(options.min_segment >> level, _LEAST_SEGMENT))
     assert offset is not None
     return to_disparity(offset)
+
+
+def _sky_offset(min_disparity: float, max_disparity: float, infinity: float | None) -> float | None:
+    """Offset of what is infinitely far away, pixels, where that is to be searched for."""
+    if infinity is None:
+        return None
+    beyond = min_disparity - infinity
+    return -infinity if 0 < beyond <= _NEAR_RANGE * (max_disparity - min_disparity) else None
+
+
+def _drop_beyond(offset: NDArray[np.int32], farthest: int, sky: float, level: int) -> None:
+    """Invalidate, in place, a level's offsets beyond the farthest of the range.
+
+    Above full resolution those of the sky stay, so that the next level searches there; `farthest` and `sky` are in
+    pixels of full resolution.
+    """
+    pixel = SUBPIXEL / 2**level
+    beyond = offset > farthest * pixel
+    if level > 0:
+        beyond &= np.abs(offset - sky * pixel) > SUBPIXEL + _POSE_ERROR * pixel
+    offset[beyond] = INVALID
 
 
 def _pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:

@@ -22,6 +22,7 @@ from colmap_sph.project.masks import read_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX
 from colmap_sph.project.state.ownership import remove_array_files
 from colmap_sph.scene import View
+from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
@@ -116,12 +117,13 @@ def make_disparity_map(task: MatchTask) -> Facts:
 
 def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32], Ties]:
     disparity = match_pair(
-        _rectified(task.left, geometry, "left"),
-        _rectified(task.right, geometry, "right"),
+        _rectified(task, geometry, "left"),
+        _rectified(task, geometry, "right"),
         geometry.min_disparity,
         geometry.max_disparity,
         task.options,
         _thread.scratch,
+        infinity=-geometry.disparity_origin,
     )
     left, right = _photo(task.left), _photo(task.right)
     photos = (task.left.view, left.image), (task.right.view, right.image)
@@ -132,11 +134,26 @@ def _photo(file: PhotoFile) -> _Photo:
     return _photos.get(file_stamp(file.image), lambda: _Photo.read(file.image))
 
 
-def _rectified(photo: PhotoFile, geometry: RectifiedPair, side: Side) -> RectifiedImage:
+def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> RectifiedImage:
+    photo = task.left if side == "left" else task.right
     view = photo.view
-    mask_key = f"{file_stamp(photo.mask)} {view.width} {view.height}"
-    mask = _masks.get(mask_key, lambda: read_mask(photo.mask, view.width, view.height))
-    return RectifiedImage(*resample(_photo(photo).image, view, geometry, side, mask=mask))
+    image = _photo(photo).image
+    keep_blank = task.options.keep_blank
+    key = f"{file_stamp(photo.mask)} {view.width} {view.height} {file_stamp(photo.image)} {keep_blank}"
+    mask = _masks.get(key, lambda: _mask(photo, image, keep_blank))
+    return RectifiedImage(*resample(image, view, geometry, side, mask=mask))
+
+
+def _mask(
+    photo: PhotoFile, image: NDArray[np.uint8] | NDArray[np.float32], keep_blank: bool
+) -> NDArray[np.uint8] | None:
+    """255 where an image takes part in matching, else 0; None where all of it does."""
+    mask = read_mask(photo.mask, photo.view.width, photo.view.height)
+    blank = None if keep_blank else blank_pixels(image)
+    if blank is None or not blank.any():
+        return mask
+    counts = np.where(blank, np.uint8(0), np.uint8(255))
+    return counts if mask is None else np.minimum(counts, mask)
 
 
 class MatchStage(Stage[Pair, MatchTask]):
@@ -221,7 +238,8 @@ class MatchStage(Stage[Pair, MatchTask]):
         share = _RECTIFIED_SHARE * (finest * self.context.options.rectification.sampling) ** 2
         spare = int(max(gate.spare(share * _MATCH_BYTES * largest), gate.free / 8))
         scratch = min(_SCRATCH_BYTES, spare // (3 * self.context.options.num_threads))
-        filled = sum(view.num_pixels * grey_bytes(self.context.workspace.image_path(view.name)) for view in views)
+        paths = (self.context.workspace.image_path(view.name) for view in views)
+        filled = sum(view.num_pixels * (grey_bytes(path) + 1) for view, path in zip(views, paths, strict=True))
         return Kept(scratch, min(_CACHE_BYTES, spare // 6), 2, filled)
 
     @contextmanager

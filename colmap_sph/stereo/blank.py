@@ -1,0 +1,184 @@
+"""Which pixels of an image say nothing: clear sky, blown-out or evenly painted walls.
+
+What two images show of such a place is noise, or a shade that changes so slowly that it fits everywhere. What is
+matched there is made up, mostly by what stands beside it, and neighbouring images make up the same.
+
+Noise and texture differ by their scale: in an image of half the size noise is about half as strong, while the
+texture of surfaces is as strong or stronger. So a place is blank where at no scale anything varies by more than
+the image's own noise would.
+"""
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Float = NDArray[np.float32]
+Mask = NDArray[np.uint8]
+
+# Scales, each of half the size of the one before it. At the coarsest a window covers 56 pixels.
+_LEVELS = 4
+# Side of the window that is looked at, pixels of any scale.
+_SIDE = 7
+# Images with a shorter side than this hold no window of the coarsest scale that could be trusted.
+_LEAST_SIDE = 128
+# Noise is measured at half size, where JPEG has spared it, as what varies least: this percentile of windows, at
+# least what the rounding of JPEG may leave, at most what cameras make.
+_NOISE_LEVEL = 1
+_QUIETEST = 5
+_LEAST_NOISE = 0.5
+_MOST_NOISE = 1.5
+# Local noise is the least of so many by so many pixels of the coarsest scale: some of them may hold an edge.
+_LOCAL_SIDE = 5
+# Pixels with so little or so much light are left out of that: their noise is cut off.
+_LEAST_GREY = 5
+_MOST_GREY = 250
+# What noise may reach in a window, in that of the quietest ones. It falls by half from scale to scale, after the
+# rounding of JPEG a little less.
+_MARGIN = 1.4
+_FALL = 0.56
+# A blank region reaches beyond its coarse windows, which take in what is around it: by so many pixels of the next
+# coarser scale, …
+_REACH = 2
+# … and at full resolution by so many that look alike: whose grey values differ from its own by less than so many
+# times the noise, or than this share of the largest difference nearby. Windows there hold the edge of what stands
+# before it.
+_EDGE_REACH = 4
+_ALIKE = 4.0
+_EDGE_SHARE = 0.33
+# Within so many pixels around a pixel is what stands before it.
+_CONTRAST_REACH = 2
+# Rows that are worked on at a time, to bound the memory.
+_BAND_ROWS = 256
+
+
+def blank_pixels(image: NDArray[np.uint8] | Float) -> Mask:
+    """Find the pixels that say nothing.
+
+    Parameters
+    ----------
+    image : (H, W) uint8 or float32 ndarray
+        Grey values, 0..255.
+
+    Returns
+    -------
+    (H, W) uint8 ndarray
+        1 where a pixel is blank, else 0. Images with a side of less than 128 pixels have no such pixels.
+
+    Examples
+    --------
+    A textured wall below a sky that gets darker upwards, both with noise:
+
+    >>> rng = np.random.default_rng(0)
+    >>> picture = 120 + 300 * cv2.GaussianBlur(rng.standard_normal((200, 300)), (0, 0), 3)
+    >>> picture[:100] = np.linspace(180, 220, 100)[:, None]
+    >>> picture += rng.standard_normal(picture.shape)
+    >>> blank = blank_pixels(picture.astype(np.float32))
+    >>> float(blank[:96].mean()), float(blank[104:].mean())
+    (1.0, 0.0)
+    """
+    if min(image.shape) < _LEAST_SIDE:
+        return np.zeros(image.shape, np.uint8)
+    scales = [image.astype(np.float32, copy=False)]
+    while len(scales) < _LEVELS:
+        scales.append(_half(scales[-1]))
+    noise, local = _noise(scales)
+    bounds = [_MARGIN * noise * _FALL ** (level - _NOISE_LEVEL) for level in range(_LEVELS)]
+    blank = _quiet(scales[-1], bounds[-1] / noise * local)
+    for scale, bound in zip(scales[-2::-1], bounds[-2::-1], strict=True):
+        if not blank.any():
+            return np.zeros(image.shape, np.uint8)
+        blank = _next_finer(blank, scale.shape) & _quiet(scale, bound)
+    return _with_edges(scales[0], blank, noise)
+
+
+def _half(image: Float) -> Float:
+    """Half the size; odd rows and columns are doubled."""
+    height, width = image.shape
+    even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    half = (even.shape[1] // 2, even.shape[0] // 2)
+    return np.asarray(cv2.resize(even, half, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _next_finer(blank: Mask, shape: tuple[int, ...]) -> Mask:
+    """A scale's mask, with its reach, in pixels of the next finer scale."""
+    grown = cv2.dilate(blank, np.ones((2 * _REACH + 1,) * 2, np.uint8))
+    doubled = cv2.resize(grown, (2 * blank.shape[1], 2 * blank.shape[0]), interpolation=cv2.INTER_NEAREST)
+    return np.asarray(doubled[: shape[0], : shape[1]], dtype=np.uint8)
+
+
+def _quiet(image: Float, bound: float | Float) -> Mask:
+    """1 where any window that holds the pixel varies by no more than `bound`: others may hold something else."""
+    quiet = np.empty(image.shape, np.uint8)
+    limit = np.broadcast_to(np.square(bound), image.shape)
+    for band, wide, inner in _bands(image.shape[0], _SIDE):
+        quiet[band] = _variance(image[wide])[inner] <= limit[band]
+    return np.asarray(cv2.dilate(quiet, np.ones((_SIDE, _SIDE), np.uint8)), dtype=np.uint8)
+
+
+def _bands(height: int, margin: int) -> Iterator[tuple[slice, slice, slice]]:
+    """Bands of rows: the band, the same with a margin, and where in that the band lies."""
+    for first in range(0, height, _BAND_ROWS):
+        end = min(first + _BAND_ROWS, height)
+        start = max(first - margin, 0)
+        yield slice(first, end), slice(start, min(end + margin, height)), slice(first - start, end - start)
+
+
+def _steps(image: Float, axis: int) -> Float:
+    """Differences of neighbours along an axis, over √2: as large as the noise of a pixel."""
+    return np.diff(image, axis=axis, append=image.take([-1], axis)) * np.float32(np.sqrt(0.5))
+
+
+def _variance(image: Float) -> Float:
+    """Variance of steps in the window around each pixel, along the axis where it is larger.
+
+    Even slopes have none: they match anywhere.
+    """
+    window = (_SIDE, _SIDE)
+    largest = np.zeros(image.shape, np.float32)
+    for axis in (0, 1):
+        step = _steps(image, axis)
+        mean = cv2.blur(step, window)
+        np.maximum(largest, cv2.blur(step * step, window) - mean * mean, out=largest)
+    return largest
+
+
+def _noise(scales: list[Float]) -> tuple[float, Float]:
+    """Standard deviation of pixels, grey values, at the scale where noise is measured.
+
+    Returns
+    -------
+    noise : float
+        In the quietest windows of the image.
+    local : ndarray of the coarsest scale's shape
+        Around each of its pixels, where that is less, as an image without any blank place has no window with noise
+        alone; 0 where it is much more, so that there is texture, too fine for the coarsest scale.
+    """
+    image = scales[_NOISE_LEVEL]
+    variance = np.empty_like(image)
+    for band, wide, inner in _bands(image.shape[0], _SIDE):
+        variance[band] = _variance(image[wide])[inner]
+    some = (slice(_SIDE // 2, None, _SIDE),) * 2
+    lit = (image[some] > _LEAST_GREY) & (image[some] < _MOST_GREY)
+    quietest = float(np.percentile(variance[some][lit], _QUIETEST)) if lit.any() else 0.0
+    noise = float(np.clip(np.sqrt(quietest), _LEAST_NOISE, _MOST_NOISE))
+    mean = cv2.resize(variance, scales[-1].shape[::-1], interpolation=cv2.INTER_AREA)
+    local = np.clip(np.sqrt(cv2.erode(mean, np.ones((_LOCAL_SIDE, _LOCAL_SIDE), np.uint8))), _LEAST_NOISE, noise)
+    local[cv2.blur(mean, (_SIDE, _SIDE)) > (_MARGIN * noise) ** 2] = 0
+    return noise, local
+
+
+def _with_edges(image: Float, blank: Mask, noise: float) -> Mask:
+    """Blank pixels, and those near them that have their grey value rather than that of what stands before them."""
+    window = (2 * _EDGE_REACH + 1,) * 2
+    around = np.ones((2 * _CONTRAST_REACH + 1,) * 2, np.uint8)
+    widened = blank.copy()
+    for band, wide, inner in _bands(image.shape[0], _EDGE_REACH + _CONTRAST_REACH):
+        share = cv2.blur(blank[wide].astype(np.float32), window)
+        near = share > 0.5 / (window[0] * window[1])
+        mean = cv2.blur(image[wide] * blank[wide], window) / np.where(near, share, 1)
+        away = np.where(near, np.abs(image[wide] - mean), 0).astype(np.float32)
+        alike = away < np.maximum(_ALIKE * noise, _EDGE_SHARE * cv2.dilate(away, around))
+        widened[band] |= (near & alike)[inner]
+    return widened
