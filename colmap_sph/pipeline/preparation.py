@@ -22,6 +22,8 @@ from colmap_sph.pipeline.stages.undistort import UndistortStage
 from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.images.depth import common_ranges, describe_ranges
 from colmap_sph.project.masks import check_masks
+from colmap_sph.project.polishing.adjustment import reason_to_keep
+from colmap_sph.project.polishing.polished import is_users_model
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, has_model, image_names
 from colmap_sph.project.state.ownership import (
@@ -36,6 +38,7 @@ from colmap_sph.project.undistortion.marker import (
     adopt,
     check_made_from,
     check_ours,
+    has_given_model,
     is_model_changed,
     names_in_model,
     publish_model,
@@ -192,6 +195,12 @@ class Preparation:
             publish_model(self.workspace, self._marker, made, names)
         logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
 
+    def reason_to_keep_poses(self) -> str:
+        """Why the poses must not be polished, as the end of a sentence; empty where they may be."""
+        if self._found is not None and is_users_model(self.workspace):
+            return f"{self.workspace.sparse_dir} was changed since this program made it"
+        return reason_to_keep(self._originals.model, self._options.polish.poses)
+
     def scene(self, results: Mapping[str, Result]) -> Scene | None:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
         if not self._overwrite and self._is_model_there(sorted(results)):
@@ -210,7 +219,7 @@ class Preparation:
                 "%s was changed since this program made it; it is used as it is", self.workspace.sparse_dir
             )
             return True
-        return list(found.images) == list(names)
+        return list(found.images) == list(names) and has_given_model(self.workspace, found)
 
     def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
         """Undistort the model in a process of its own; return the folder where it is."""

@@ -47,6 +47,10 @@ class RunReport:
         Pairs matched.
     skipped_pairs : dict
         "left - right" → why the pair was not matched.
+    polishing : str
+        Where polished poses were asked for: what was done, or why not.
+    pose_movement : dict
+        Image name → how far polishing moved it, pixels (median over its sparse points); empty without.
     coverage : dict
         Image name → share of its pixels with a geometric depth.
     agreement : dict
@@ -79,6 +83,8 @@ class RunReport:
     pair_source: str = ""
     pairs: int = 0
     skipped_pairs: dict[str, str] = field(default_factory=dict)
+    polishing: str = ""
+    pose_movement: dict[str, float] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None

@@ -1,0 +1,191 @@
+"""Tracks and poses → whether there is anything to polish, and whether polished poses are better."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from colmap_sph.scene import Scene
+from colmap_sph.stereo.tracks import (
+    Tracks,
+    parallax_angles,
+    thickness,
+    track_errors,
+    triangulated,
+    views_together,
+)
+
+# Degrees: points farther away tell little but of rotations, and their distance nothing.
+_LEAST_PARALLAX = 1.0
+# Tracks that miss by so many times the median are mismatches; what is below so many pixels never is.
+_OUTLIER = 5.0
+_USUAL_ERROR = 1.5
+# Tracks per image that tell its pose, and ties that connect a pair.
+_TRACKS_PER_IMAGE = 15
+_CONNECTING_TIES = 10
+_LEAST_TOGETHER = 0.9
+# Ties and sparse points are one plane where their thickness is below this share of their extent.
+_PLANE = 0.002
+# Pixels: poses alone leave less than this, of a camera that is right.
+_MOST_LEFT = 1.0
+_MOST_MOVEMENT = 30.0
+# The model's own tracks may fit worse by this share: a rounding.
+_RISE = 0.02
+# Standard deviations by which more ties must fit better than worse.
+_SURE = 3.0
+
+
+def sound_tracks(tracks: Tracks, scene: Scene) -> Tracks:
+    """Tracks whose points lie in front of their cameras, not at infinity, and are no mismatches.
+
+    Parameters
+    ----------
+    tracks : Tracks
+    scene : Scene
+
+    Returns
+    -------
+    Tracks
+    """
+    if not len(tracks):
+        return tracks
+    points = triangulated(tracks, scene.views)
+    errors = track_errors(tracks, points, scene.views)
+    angles = parallax_angles(tracks, points, scene.views)
+    there = np.isfinite(errors) & (angles >= _LEAST_PARALLAX)
+    if not there.any():
+        return tracks.only(there)
+    limit = max(_OUTLIER * float(np.median(errors[there])), _USUAL_ERROR)
+    return tracks.only(there & (np.nan_to_num(errors, nan=np.inf) <= limit))
+
+
+def refusal(tracks: Tracks, scene: Scene, least_residual: float) -> str:
+    """Why poses cannot or need not be polished by these tracks; empty where they may be.
+
+    Parameters
+    ----------
+    tracks : Tracks
+        Sound ones.
+    scene : Scene
+    least_residual : float
+        Pixels.
+
+    Returns
+    -------
+    str
+        The end of a sentence.
+    """
+    number = len(scene.views)
+    if len(tracks) < _TRACKS_PER_IMAGE * number:
+        return f"there are too few ties between the images ({len(tracks)} tracks for {number} images)"
+    together = views_together(tracks, number, _CONNECTING_TIES)
+    if together.mean() < _LEAST_TOGETHER:
+        return f"ties connect only {together.sum()} of the {number} images with each other"
+    points = triangulated(tracks, scene.views)
+    known = scene.points[np.isfinite(scene.points).all(axis=1)]
+    if thickness(points) < _PLANE and thickness(known) < _PLANE:
+        return "all that the images have in common lies on one plane, which leaves directions open"
+    error = _median_error(tracks, scene)
+    if error < least_residual:
+        return f"they are good already: the rays of ties miss each other by {error:.2f} px"
+    return ""
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """How given and polished poses fit, all in pixels.
+
+    Attributes
+    ----------
+    before, after : float
+        Median error of tracks that had no part in the polishing.
+    sureness : float
+        Standard deviations by which more of these fit better than worse.
+    sparse_before, sparse_after : float
+        Reprojection error of the model's own tracks.
+    movement : float
+        Median over the images.
+    """
+
+    before: float
+    after: float
+    sureness: float
+    sparse_before: float
+    sparse_after: float
+    movement: float
+
+    @property
+    def words(self) -> str:
+        """What changed, as a sentence."""
+        return (
+            f"Ties that had no part in it fit to {self.after:.2f} px, before {self.before:.2f} px; the sparse "
+            f"points to {self.sparse_after:.2f} px, before {self.sparse_before:.2f} px."
+        )
+
+    def refusal(self, least_gain: float) -> str:
+        """Why the polished poses are not used, as the end of a sentence; empty where they are."""
+        if self.after > (1 - least_gain) * self.before or self.sureness < _SURE:
+            return (
+                "polished ones are not clearly better (ties that had no part in the adjustment fit to "
+                f"{self.after:.2f} px, before {self.before:.2f} px)"
+            )
+        if self.sparse_after > (1 + _RISE) * self.sparse_before:
+            return (
+                f"polished ones fit the sparse points worse ({self.sparse_after:.2f} px, before "
+                f"{self.sparse_before:.2f} px)"
+            )
+        if max(self.after, self.sparse_after) > _MOST_LEFT or self.movement > _MOST_MOVEMENT:
+            return (
+                f"other poses do not explain what is wrong (images would move by {self.movement:.1f} px, and "
+                f"{max(self.after, self.sparse_after):.2f} px would be left); check the cameras of the model"
+            )
+        return ""
+
+
+def judged(held_out: Tracks, before: Scene, after: Scene) -> Judgement:
+    """Compare poses by tracks that had no part in their adjustment, and by the model's own.
+
+    Parameters
+    ----------
+    held_out : Tracks
+    before, after : Scene
+        With the same views.
+
+    Returns
+    -------
+    Judgement
+    """
+    errors = [
+        track_errors(held_out, triangulated(held_out, scene.views), scene.views) for scene in (before, after)
+    ]
+    better = int((errors[1] < errors[0]).sum())
+    # As often better as worse by chance: binomial.
+    sureness = (2 * better - len(held_out)) / np.sqrt(max(len(held_out), 1))
+    sparse = [_sparse_error(scene) for scene in (before, after)]
+    moved = movements(before, after)
+    return Judgement(
+        *(float(np.nanmedian(part)) for part in errors),
+        float(sureness),
+        *sparse,
+        float(np.median(list(moved.values()))) if moved else 0.0,
+    )
+
+
+def movements(before: Scene, after: Scene) -> dict[str, float]:
+    """How far points move in each image that observes any, pixels (median), by its pose alone."""
+    moved = {}
+    for view, other in zip(before.views, after.views, strict=True):
+        points = before.points[view.point_indices]
+        if len(points):
+            distance = np.linalg.norm(other.project(points)[0] - view.project(points)[0], axis=1)
+            moved[view.name] = float(np.nanmedian(distance))
+    return moved
+
+
+def _median_error(tracks: Tracks, scene: Scene) -> float:
+    return float(np.median(track_errors(tracks, triangulated(tracks, scene.views), scene.views)))
+
+
+def _sparse_error(scene: Scene) -> float:
+    """Mean over the views of the median reprojection error of the sparse points; 0 without any."""
+    errors = [view.reprojection_error for view in scene.views if np.isfinite(view.reprojection_error)]
+    return float(np.mean(errors)) if errors else 0.0
