@@ -25,8 +25,8 @@ from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.pose_quality import Judgement, judged, movements, refusal, sound_tracks
-from colmap_sph.stereo.tracks import ImageTies, Tracks, image_coordinates, tracks_of_ties, triangulated
+from colmap_sph.stereo.poses.quality import Judgement, judged, movements, refusal, sound_tracks
+from colmap_sph.stereo.poses.tracks import ImageTies, Tracks, image_coordinates, tracks_of_ties, triangulated
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context

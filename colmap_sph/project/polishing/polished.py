@@ -1,9 +1,9 @@
 """The polished model in its workspace: in the place of the one that was undistorted, which is kept beside it.
 
-`sparse` holds the polished model, so that whoever goes on from the workspace finds the poses of its maps. The given
-one lies in our own folder, and takes its place again when a run does not ask for polishing. The marker says what
-each was when it was written. An interruption leaves a marker that is not finished, and the next run undistorts the
-model anew.
+`sparse` holds the polished model, so that whoever goes on from the workspace finds the poses of its maps. The
+given one lies in our own folder, and takes its place again when a run does not ask for polishing. The marker says
+what each was when it was written. An interruption leaves a marker that is not finished, and the next run
+undistorts the model anew.
 """
 
 import shutil

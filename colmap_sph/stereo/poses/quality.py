@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_sph.scene import Scene
-from colmap_sph.stereo.tracks import (
+from colmap_sph.stereo.poses.tracks import (
     Tracks,
     parallax_angles,
     thickness,
@@ -13,6 +13,7 @@ from colmap_sph.stereo.tracks import (
     triangulated,
     views_together,
 )
+from colmap_sph.stereo.rectified_pair import Float
 
 # Degrees: points farther away tell little but of rotations, and their distance nothing.
 _LEAST_PARALLAX = 1.0
@@ -154,19 +155,19 @@ def judged(held_out: Tracks, before: Scene, after: Scene) -> Judgement:
     -------
     Judgement
     """
-    errors = [
-        track_errors(held_out, triangulated(held_out, scene.views), scene.views) for scene in (before, after)
-    ]
+    errors = [_errors(held_out, scene) for scene in (before, after)]
     better = int((errors[1] < errors[0]).sum())
     # As often better as worse by chance: binomial.
     sureness = (2 * better - len(held_out)) / np.sqrt(max(len(held_out), 1))
     sparse = [_sparse_error(scene) for scene in (before, after)]
     moved = movements(before, after)
     return Judgement(
-        *(float(np.nanmedian(part)) for part in errors),
-        float(sureness),
-        *sparse,
-        float(np.median(list(moved.values()))) if moved else 0.0,
+        before=float(np.nanmedian(errors[0])),
+        after=float(np.nanmedian(errors[1])),
+        sureness=float(sureness),
+        sparse_before=sparse[0],
+        sparse_after=sparse[1],
+        movement=float(np.median(list(moved.values()))) if moved else 0.0,
     )
 
 
@@ -181,8 +182,12 @@ def movements(before: Scene, after: Scene) -> dict[str, float]:
     return moved
 
 
+def _errors(tracks: Tracks, scene: Scene) -> Float:
+    return track_errors(tracks, triangulated(tracks, scene.views), scene.views)
+
+
 def _median_error(tracks: Tracks, scene: Scene) -> float:
-    return float(np.median(track_errors(tracks, triangulated(tracks, scene.views), scene.views)))
+    return float(np.median(_errors(tracks, scene)))
 
 
 def _sparse_error(scene: Scene) -> float:
