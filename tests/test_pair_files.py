@@ -13,8 +13,8 @@ import pytest
 
 from colmap_sph.errors import DamageError, InputError, OutputError
 from colmap_sph.pipeline.stages.pair_files import (
+    facts_of_pair,
     is_estimate_there,
-    is_pair_there,
     read_estimate,
     read_pair,
     write_estimate,
@@ -25,6 +25,7 @@ from colmap_sph.project.state.array_file import Head, read_head, write_arrays
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
+from colmap_sph.stereo.ties import MAX_TIES
 
 HEIGHT, WIDTH = 6, 9
 
@@ -123,7 +124,7 @@ def test_damaged_file(tmp_path: Path, damage: str) -> None:
 
 def is_there(path: Path) -> bool:
     pair = make_pair(np.zeros((HEIGHT, WIDTH)))
-    return is_pair_there(path, "key", pair.left, pair.right, pair.geometry)
+    return facts_of_pair(path, "key", pair.left, pair.right, pair.geometry) is not None
 
 
 def test_a_pair_is_there_under_its_key_with_its_geometry(tmp_path: Path) -> None:
@@ -131,13 +132,13 @@ def test_a_pair_is_there_under_its_key_with_its_geometry(tmp_path: Path) -> None
     pair = make_pair(random_disparity(0, 50))
     write_pair(path, pair, "key")
     names = (pair.left, pair.right)
-    assert is_pair_there(path, "key", *names, pair.geometry)
-    assert not is_pair_there(path, "other", *names, pair.geometry)
-    assert not is_pair_there(path, "key", *names[::-1], pair.geometry)
+    assert facts_of_pair(path, "key", *names, pair.geometry)
+    assert not facts_of_pair(path, "other", *names, pair.geometry)
+    assert not facts_of_pair(path, "key", *names[::-1], pair.geometry)
     for field in fields(RectifiedPair):
         value = getattr(pair.geometry, field.name)
         other: dict[str, Any] = {field.name: "frame" if field.name == "surface" else value + 1}
-        assert not is_pair_there(path, "key", *names, replace(pair.geometry, **other)), field.name
+        assert not facts_of_pair(path, "key", *names, replace(pair.geometry, **other)), field.name
 
 
 @pytest.mark.parametrize("what", ["pipe", "device", "link", "folder"])
@@ -188,19 +189,27 @@ def numbers_with(changes: dict[int, float]) -> list[float]:
     """Scale, rotation and the other numbers of the geometry, some of them changed."""
     geometry = vars(make_pair(np.zeros((HEIGHT, WIDTH))).geometry)
     others = [value for value in geometry.values() if isinstance(value, (int, float))]
-    numbers = [0.0, 1 / 64, *geometry["rectified_from_world"].ravel(), *map(float, others)]
+    numbers = [0.0, 1 / 64, 1.0, 0.3, *geometry["rectified_from_world"].ravel(), *map(float, others)]
     for place, value in changes.items():
         numbers[place] = value
     return numbers
 
 
-def written(path: Path, *, kind: str = "pair", codes: np.ndarray | None = None, **changes: Any) -> None:
+def written(
+    path: Path,
+    *,
+    kind: str = "pair",
+    codes: np.ndarray | None = None,
+    ties: np.ndarray | None = None,
+    **changes: Any,
+) -> None:
     """Write a file with checksums that hold, whatever it says."""
     pair = make_pair(np.zeros((HEIGHT, WIDTH)))
     texts = [pair.left, pair.right, pair.geometry.surface]
     content: dict[str, Any] = {"texts": texts, "numbers": numbers_with({})}
     codes = np.zeros((HEIGHT, WIDTH), np.uint16) if codes is None else codes
-    write_arrays(path, kind, "key", [codes], **(content | changes))
+    arrays = [codes] if ties is None else [codes, ties]
+    write_arrays(path, kind, "key", arrays, **(content | changes))
 
 
 @pytest.mark.parametrize(
@@ -215,14 +224,21 @@ def written(path: Path, *, kind: str = "pair", codes: np.ndarray | None = None, 
         {"numbers": numbers_with({0: np.nan})},
         {"numbers": numbers_with({1: 0.0})},
         {"numbers": numbers_with({1: -1.0})},
-        {"numbers": numbers_with({11: np.inf})},
-        {"numbers": numbers_with({17: HEIGHT + 1.0})},
-        {"numbers": numbers_with({18: 1e300})},
-        {"numbers": numbers_with({18: -WIDTH})},
+        {"numbers": numbers_with({2: 0.0})},
+        {"numbers": numbers_with({2: 1.5})},
+        {"numbers": numbers_with({3: np.nan})},
+        {"numbers": numbers_with({13: np.inf})},
+        {"numbers": numbers_with({19: HEIGHT + 1.0})},
+        {"numbers": numbers_with({20: 1e300})},
+        {"numbers": numbers_with({20: -WIDTH})},
         {"codes": np.zeros((HEIGHT, WIDTH), np.float32)},
         {"codes": np.zeros((WIDTH, HEIGHT), np.uint16)},
         {"codes": np.zeros((HEIGHT, WIDTH, 2), np.uint16)},
         {"codes": np.zeros((0, WIDTH), np.uint16)},
+        {"ties": np.zeros((3, 4), np.float32)},
+        {"ties": np.zeros((MAX_TIES + 1, 5), np.float32)},
+        {"ties": np.zeros((3, 5), np.uint16)},
+        {"ties": np.zeros(15, np.float32)},
     ],
 )
 def test_content_of_no_pair_is_refused(tmp_path: Path, content: dict[str, Any]) -> None:

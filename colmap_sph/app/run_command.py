@@ -190,6 +190,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
             terminal.say(f"{name}: {reason}", label=f"{what} skipped:", style="yellow")
     for name, reason in report.incomplete.items():
         terminal.say(f"{name}: {reason}", label="incomplete:", style="yellow")
+    if report.imprecision:
+        terminal.say(report.imprecision, label="imprecise:", style="yellow")
     if report.doubts:
         terminal.say(report.doubts, label="disagreement:", style="yellow")
     if report.advice:

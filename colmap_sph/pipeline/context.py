@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -36,6 +36,8 @@ class Context:
     keys : Keys
     progress : Progress
     report : RunReport
+    details : mapping of str to float
+        Of each image that is there, see `image_detail`.
     """
 
     workspace: Workspace
@@ -44,6 +46,7 @@ class Context:
     keys: Keys
     progress: Progress = field(default_factory=Silent)
     report: RunReport = field(default_factory=RunReport)
+    details: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def stations(self) -> Stations:

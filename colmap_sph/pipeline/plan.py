@@ -124,7 +124,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     check_input(project, options)
     survey = Survey()
     foreseen = None
-    reason = ""
+    given = None
     to_make: set[str] = set()
     if project.model is None:
         dense = open_workspace(project)
@@ -134,7 +134,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         undistorted = preparation.undistort(survey, preparation.check(survey))
         to_make = {name for name, result in undistorted.items() if result.made}
         foreseen = preparation.scene(undistorted)
-        reason = preparation.reason_to_keep_poses()
+        given = preparation.given_model()
     folder = dense.sparse_dir if project.model is None else starting_model(dense)
     scene = anchored(read_scene(folder) if foreseen is None else foreseen)
     keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
@@ -145,8 +145,8 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     foreign = foreign_files(context.places, overwrite=overwrite)
     if foreign:
         logger.warning("Would get another name, as this program did not make it: %s", named(foreign))
-    if options.polish.is_wanted:
-        context = with_polished_poses(context, selection.unique_pairs(), survey, reason)
+    if given is not None and options.polish.is_wanted:
+        context = with_polished_poses(context, selection.unique_pairs(), survey, given)
     go_through_stages(context, selection.unique_pairs(), survey)
     stages = survey.stages
     pairs, _, maps, cloud = stages[-4:]

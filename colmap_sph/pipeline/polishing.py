@@ -13,7 +13,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.stages.facts import Polish
 from colmap_sph.pipeline.stages.match import MatchStage
-from colmap_sph.pipeline.stages.polish import PolishStage
+from colmap_sph.pipeline.stages.polish import GivenModel, PolishStage
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
@@ -31,7 +31,7 @@ class MatchToPolishStage(MatchStage):
 
 
 def with_polished_poses(
-    context: Context, pairs: Sequence[Pair], executor: "Executor", reason_to_keep: str = ""
+    context: Context, pairs: Sequence[Pair], executor: "Executor", given: GivenModel
 ) -> Context:
     """Polish the poses of the workspace's model, and return the context of what is to be matched.
 
@@ -43,16 +43,15 @@ def with_polished_poses(
     executor : callable
         What is done with each stage. One that only asks gets a context under whose keys there is no result, where
         it is not known yet what polishing comes to.
-    reason_to_keep : str
-        Why the poses must not be polished, as the end of a sentence.
+    given : GivenModel
 
     Returns
     -------
     Context
     """
-    if reason_to_keep:
-        return _told(context, Polish(f"The poses are kept as given: {reason_to_keep}."))
-    polish = _outcome(context, pairs, executor)
+    if given.reason_to_keep:
+        return _told(context, Polish(f"The poses are kept as given: {given.reason_to_keep}."))
+    polish = _outcome(context, pairs, executor, given)
     if polish is None:
         return replace(context, keys=Keys(context.workspace, context.options, fresh=True))
     context = _told(context, polish)
@@ -62,9 +61,9 @@ def with_polished_poses(
     return replace(context, scene=anchored(read_scene(context.workspace.sparse_dir)).only(names))
 
 
-def _outcome(context: Context, pairs: Sequence[Pair], executor: "Executor") -> Polish | None:
+def _outcome(context: Context, pairs: Sequence[Pair], executor: "Executor", given: GivenModel) -> Polish | None:
     """What polishing comes to, after matching the pairs where that is not known yet; None where it is not done."""
-    stage = PolishStage(context, pairs)
+    stage = PolishStage(context, given, pairs)
     known = stage.job(stage.items[0]).done
     if known is not None:
         return known.polish
@@ -72,7 +71,7 @@ def _outcome(context: Context, pairs: Sequence[Pair], executor: "Executor") -> P
     # What could not be matched now may be with other poses, and is told of then.
     context.report.skipped_pairs.clear()
     context.report.incomplete.clear()
-    (result,) = executor(PolishStage(context, pairs, matched.keys())).values()
+    (result,) = executor(PolishStage(context, given, pairs, matched.keys())).values()
     return result.facts.polish
 
 

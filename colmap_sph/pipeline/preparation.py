@@ -17,6 +17,7 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts, ImagePlaces
+from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.undistort import UndistortStage
 from colmap_sph.project.files import make_dir, scratch_folder
@@ -195,8 +196,12 @@ class Preparation:
             publish_model(self.workspace, self._marker, made, names)
         logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
 
-    def reason_to_keep_poses(self) -> str:
-        """Why the poses must not be polished, as the end of a sentence; empty where they may be."""
+    def given_model(self) -> GivenModel:
+        """What polishing has to know of the model as it was given."""
+        originals = self._originals
+        return GivenModel(originals.model_dir, originals.image_dir, self._reason_to_keep_poses())
+
+    def _reason_to_keep_poses(self) -> str:
         if self._found is not None and is_users_model(self.workspace):
             return f"{self.workspace.sparse_dir} was changed since this program made it"
         return reason_to_keep(self._originals.model, self._options.polish.poses)

@@ -9,9 +9,10 @@ import json
 import logging
 import resource
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import mean
 from typing import Any, Protocol
 
 from colmap_sph.errors import NoResultError, OptionError
@@ -23,11 +24,12 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, refuse_disagreement
-from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces
+from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
-from colmap_sph.pipeline.stages.match import MatchStage, row_residuals
+from colmap_sph.pipeline.stages.match import MatchStage
+from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.pipeline.workers import one_opencv_thread
@@ -45,6 +47,8 @@ from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
+from colmap_sph.stereo.rectification import sampling_of
+from colmap_sph.stereo.ties import filled_residuals
 
 logger = logging.getLogger(__name__)
 
@@ -133,8 +137,8 @@ def run_project(
             project, options, overwrite=overwrite, verify=verify, progress=progress, report=report
         )
         preparation.run(execute)
-        reason = preparation.reason_to_keep_poses()
-        if reason or not options.polish.is_wanted:
+        given = preparation.given_model()
+        if given.reason_to_keep or not options.polish.is_wanted:
             restore_given(dense)
         return reconstruct(
             dense,
@@ -143,7 +147,7 @@ def run_project(
             progress=progress,
             report=report,
             database=project.database(),
-            reason_to_keep=reason,
+            given=given,
             overwrite=overwrite,
             verify=verify,
         )
@@ -171,7 +175,7 @@ def reconstruct(
     report: RunReport | None = None,
     database: Path | None = None,
     expected: Collection[str] = (),
-    reason_to_keep: str = "",
+    given: GivenModel | None = None,
     overwrite: bool = False,
     verify: bool = False,
 ) -> RunReport:
@@ -188,8 +192,8 @@ def reconstruct(
         COLMAP's database, whose verified matches serve where the model has no tracks.
     expected : collection of str
         Names of images that are reported as skipped where the workspace's model does not have them.
-    reason_to_keep : str
-        Why the poses of the workspace's model must not be polished; see `with_polished_poses`.
+    given : GivenModel, optional
+        The model that the workspace's was undistorted from: its poses may be polished where the options say so.
     overwrite : bool
         Files that this program did not make, where maps and cloud go, get another name; without it they are
         refused.
@@ -204,7 +208,7 @@ def reconstruct(
     report = report or RunReport()
     make_dir(workspace.state_dir)
     with one_opencv_thread():
-        is_polishing = options.polish.is_wanted
+        is_polishing = given is not None and options.polish.is_wanted
         scene = anchored(read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         for name in sorted({*expected} - scene.index_of.keys()):
@@ -220,8 +224,8 @@ def reconstruct(
         take_places(context.places, overwrite=overwrite)
         if verify:
             _verify(context)
-        if is_polishing:
-            context = with_polished_poses(context, selection.unique_pairs(), execute, reason_to_keep)
+        if given is not None and is_polishing:
+            context = with_polished_poses(context, selection.unique_pairs(), execute, given)
         judge_reprojection(report, context.scene)
         go_through_stages(context, selection.unique_pairs(), execute)
         judge_agreement(report)
@@ -267,7 +271,9 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     check_numbers(context, pairs)
     matched = executor(MatchStage(context, pairs))
     pair_keys = keys_of(matched)
-    residuals = row_residuals(matched)
+    measured = {pair: result.facts.row_residual for pair, result in matched.items()}
+    judge_rows(context.report, context.scene, measured)
+    residuals = dict(zip(measured, filled_residuals(list(measured.values())), strict=True))
     votes = executor(VoteStage(context, pair_keys, residuals))
     maps = executor(ConfirmStage(context, residuals, votes))
     executor(fuse_stage(context, pair_keys, maps))
@@ -295,11 +301,22 @@ def with_good_images(
     there = [view for view in context.scene.views if view.name not in to_come]
     sizes = {view.name: (view.width, view.height) for view in there}
     places = ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
-    images: dict[str, str] = {}
-    if there:
-        images = keys_of(executor(CheckStage(context, sizes, places, verify=verify)))
+    checked = executor(CheckStage(context, sizes, places, verify=verify)) if there else {}
+    images = keys_of(checked)
+    details = details_of(checked)
+    if details:
+        _report_detail(context, details)
     keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
-    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys)
+    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
+
+
+def _report_detail(context: Context, details: Mapping[str, float]) -> None:
+    """Tell how much the images hold, and how finely they are therefore matched."""
+    sampling = context.options.rectification.sampling * mean(sampling_of(detail) for detail in details.values())
+    detail = mean(details.values())
+    context.report.detail = round(detail, 3)
+    context.report.sampling = round(sampling, 3)
+    logger.info("Images hold %.2f of their pixels' detail: pairs are sampled at %.2f", detail, sampling)
 
 
 def choose_pairs(

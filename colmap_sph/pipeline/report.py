@@ -41,6 +41,10 @@ class RunReport:
         that could not be read. The next run makes them again.
     stretched : str
         Which values became black and white in images of more than 8 bits, where these were changed.
+    detail : float or None
+        Samples per pixel that hold what the images show, on average, see `image_detail`.
+    sampling : float or None
+        Rectified pixels per pixel at which pairs are therefore matched.
     pair_source : str
         Where the pairs come from.
     pairs : int
@@ -51,6 +55,11 @@ class RunReport:
         Where polished poses were asked for: what was done, or why not.
     pose_movement : dict
         Image name → how far polishing moved it, pixels (median over its sparse points); empty without.
+    row_residual : float or None
+        How far the rows of rectified pairs disagree, pixels: the median of all pairs; None where no pair
+        has enough ties to tell.
+    row_residuals : dict
+        Image name → the same of its pairs.
     coverage : dict
         Image name → share of its pixels with a geometric depth.
     agreement : dict
@@ -62,6 +71,8 @@ class RunReport:
         The numbers behind it.
     doubts : str
         Which images agree with few sparse points, and what that means.
+    imprecision : str
+        Where rows of pairs disagree by more than pixels are worth: what that means, and what helps.
     refusal : str
         Where hardly any point agrees over all: why the results mean nothing.
     points : int
@@ -80,16 +91,21 @@ class RunReport:
     skipped_images: dict[str, str] = field(default_factory=dict)
     incomplete: dict[str, str] = field(default_factory=dict)
     stretched: str = ""
+    detail: float | None = None
+    sampling: float | None = None
     pair_source: str = ""
     pairs: int = 0
     skipped_pairs: dict[str, str] = field(default_factory=dict)
     polishing: str = ""
     pose_movement: dict[str, float] = field(default_factory=dict)
+    row_residual: float | None = None
+    row_residuals: dict[str, float] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None
     sparse_points: Agreement = field(default_factory=Agreement)
     doubts: str = ""
+    imprecision: str = ""
     refusal: str = ""
     points: int = 0
     advice: str = ""

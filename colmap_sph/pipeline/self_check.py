@@ -2,11 +2,13 @@
 
 import logging
 from collections.abc import Mapping
+from statistics import median
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.scene import Scene
+from colmap_sph.stereo.partners.pairing import Pair
 
 logger = logging.getLogger(__name__)
 
@@ -24,6 +26,10 @@ _FEWEST = 30
 _FAR_PIXELS = 4.0
 _FAR_SHARE = 0.01
 _MAX_NAMED = 10
+# Rows of pairs with good poses and lenses disagree by no more; by twice as much, the results suffer.
+_EXPECTED_PIXELS = 0.2
+_IMPRECISE_PIXELS = 0.4
+_NAMED_WORST = 3
 
 
 def judge_agreement(report: RunReport) -> None:
@@ -71,6 +77,41 @@ def judge_reprojection(report: RunReport, scene: Scene) -> None:
             "or the model's image coordinates are those of images of another size."
         )
         _doubt(report, words)
+
+
+def judge_rows(report: RunReport, scene: Scene, residuals: Mapping[Pair, float | None]) -> None:
+    """Put into the report how far the rows of pairs disagree, and what that means where it is much.
+
+    Parameters
+    ----------
+    report : RunReport
+    scene : Scene
+    residuals : mapping of (str, str) to float or None
+        Row residual of each pair, radians, as far as it is known.
+    """
+    of_images: dict[str, list[float]] = {}
+    of_pairs = []
+    for names, residual in residuals.items():
+        if residual is None:
+            continue
+        pixels = [residual * float(scene.view(name).K[0, 0]) for name in names]
+        of_pairs.append(max(pixels))
+        for name, value in zip(names, pixels, strict=True):
+            of_images.setdefault(name, []).append(value)
+    if not of_pairs:
+        return
+    report.row_residual = round(median(of_pairs), 3)
+    report.row_residuals = {name: round(median(values), 3) for name, values in sorted(of_images.items())}
+    logger.info("Rows of pairs disagree by %.2f pixels (median of %d)", report.row_residual, len(of_pairs))
+    if report.row_residual > _IMPRECISE_PIXELS:
+        worst = sorted(report.row_residuals.items(), key=lambda item: -item[1])[:_NAMED_WORST]
+        report.imprecision = (
+            f"Rows of pairs disagree by {report.row_residual:.2f} pixels ({_EXPECTED_PIXELS} expected): poses or "
+            "lens models are imprecise, and tolerances are wider by that. Most in "
+            + ", ".join(f"{name} ({value:.2f})" for name, value in worst)
+            + "."
+        )
+        logger.warning("%s", report.imprecision)
 
 
 def refuse_disagreement(report: RunReport) -> None:

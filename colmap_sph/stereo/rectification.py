@@ -23,6 +23,10 @@ _ROUNDED_BASELINE = 1e-12
 _LEAST_ACROSS = 0.2
 # cv2.remap takes no more rows or columns.
 _MAX_SIDE = 32766
+# Rectified pixels per sample that an image's detail asks for, as bilinear resampling takes some of it away and
+# windows are of whole pixels; and as many per pixel at most.
+_OVERSAMPLING = 1.45
+_MOST_SAMPLING = 1.4
 # Fewer rows or columns than this are not worth matching.
 _MIN_SIDE = 16
 
@@ -34,7 +38,8 @@ class RectificationOptions:
     surface: Surface = "spherical"
     """Surface the images are resampled to: a sphere around the baseline, or a plane (the classic "frame")."""
     sampling: float = 1.0
-    """Rectified pixels per pixel of the finer image."""
+    """Rectified pixels, as a factor on what the images' detail asks for: 1.4 per pixel where they are sharp, 0.5
+    where they are soft."""
     min_cosine: float = 0.1
     """Rays whose angle with the baseline has a smaller sine than this are left out: at 0.1, within 5.7° of the
     epipole."""
@@ -63,7 +68,18 @@ class RectificationOptions:
             )
 
 
-def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOptions) -> RectifiedPair:
+def sampling_of(detail: float) -> float:
+    """Rectified pixels per pixel of an image with this detail, see `image_detail`."""
+    return min(_OVERSAMPLING * detail, _MOST_SAMPLING)
+
+
+def rectify_pair(
+    scene: Scene,
+    left: View,
+    right: View,
+    options: RectificationOptions,
+    details: tuple[float, float] | None = None,
+) -> RectifiedPair:
     """Lay out the rectified images of a pair.
 
     Parameters
@@ -73,6 +89,9 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
     left, right : View
         The pair; which one is called left is free.
     options : RectificationOptions
+    details : (float, float), optional
+        What `image_detail` finds in the left and in the right image. Without it there is a rectified pixel, times
+        `sampling`, to a pixel.
 
     Returns
     -------
@@ -110,9 +129,12 @@ def rectify_pair(scene: Scene, left: View, right: View, options: RectificationOp
         extent = extent_on_sphere(rotation, left, right, points, options.min_cosine)
     else:
         extent = extent_on_plane(rotation, left, right, points, baseline)
-    scale = _finest_scale(left, right, points) * options.sampling
+    samplings = (1.0, 1.0) if details is None else (sampling_of(details[0]), sampling_of(details[1]))
+    scales = _scale(left, points), _scale(right, points)
+    scale = options.sampling * max(samplings[0] * scales[0], samplings[1] * scales[1])
+    scale = few_digits(scale, np.round)
     pair = _laid_out(options.surface, extent, baseline, scale, options)
-    _check_size(pair, left, right, options)
+    _check_size(pair, left, right, options.max_pixels_ratio * max(1.0, scale / max(scales)) ** 2)
     return pair
 
 
@@ -140,20 +162,16 @@ def _points_in_both(scene: Scene, left: View, right: View) -> Float:
     return points
 
 
-def _finest_scale(left: View, right: View, points: Float) -> float:
-    """Pixels per radian of the finer image, averaged over the overlap.
+def _scale(view: View, points: Float) -> float:
+    """Pixels per radian of an image, averaged over the overlap.
 
     A pixel at the angle α off axis has the solid angle cos³ α / f², so its mean side is cos^1.5 α / f.
     """
-    scales = []
-    for view in (left, right):
-        if len(points):
-            rays = points @ view.R.T + view.t
-            cosine = rays[:, 2] / np.linalg.norm(rays, axis=1)
-        else:
-            cosine = np.ones(1)
-        scales.append(float(np.sqrt(view.K[0, 0] * view.K[1, 1]) * np.mean(cosine**-1.5)))
-    return few_digits(max(scales), np.round)
+    cosine = np.ones(1)
+    if len(points):
+        rays = points @ view.R.T + view.t
+        cosine = rays[:, 2] / np.linalg.norm(rays, axis=1)
+    return float(np.sqrt(view.K[0, 0] * view.K[1, 1]) * np.mean(cosine**-1.5))
 
 
 def _laid_out(
@@ -189,15 +207,14 @@ def _off_zero(values: Range) -> float:
     return max(0.0, values[0], -values[1])
 
 
-def _check_size(pair: RectifiedPair, left: View, right: View, options: RectificationOptions) -> None:
+def _check_size(pair: RectifiedPair, left: View, right: View, max_ratio: float) -> None:
     """Raise `RectificationError` where the rectified images are too large or too small."""
     sides = (pair.height, pair.left_width, pair.right_width)
     pixels = pair.height * (pair.left_width + pair.right_width)
     originals = left.width * left.height + right.width * right.height
-    allowed = options.max_pixels_ratio * originals * max(1.0, options.sampling**2)
     if max(sides) > _MAX_SIDE:
         raise RectificationError(f"its rectified images would have more than {_MAX_SIDE} rows or columns")
-    if pixels > allowed:
+    if pixels > max_ratio * originals:
         raise RectificationError(
             f"its rectified images would have {pixels / originals:.1f} times the pixels of the originals"
         )

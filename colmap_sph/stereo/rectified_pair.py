@@ -10,7 +10,8 @@ ray is (x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described
 array coordinate = (angle or tangent) · scale − origin, with pixel centres at whole array coordinates.
 """
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -61,6 +62,22 @@ class RectifiedPair:
     right_width: int
     min_disparity: float
     max_disparity: float
+
+    def resampled(self, factor: float) -> "RectifiedPair":
+        """The same pair with so many times the rows and columns."""
+        return replace(
+            self,
+            columns_per_radian=self.columns_per_radian * factor,
+            rows_per_radian=self.rows_per_radian * factor,
+            row_origin=self.row_origin * factor,
+            left_origin=self.left_origin * factor,
+            right_origin=self.right_origin * factor,
+            height=math.ceil((self.height - 1) * factor) + 1,
+            left_width=math.ceil((self.left_width - 1) * factor) + 1,
+            right_width=math.ceil((self.right_width - 1) * factor) + 1,
+            min_disparity=self.min_disparity * factor,
+            max_disparity=self.max_disparity * factor,
+        )
 
     @property
     def disparity_origin(self) -> float:

@@ -25,6 +25,8 @@ _BAND_ROWS = 32
 _SURVEY_ROWS = 16
 # Partners that bring the planes near in the rounds before the last.
 _FIRST_PARTNERS = 3
+# Standard deviation of a match on a smooth surface, pixels.
+_MATCH_SIGMA = 0.2
 # Arrays of equations, and sources of one call; see `depth.h`.
 _EQUATIONS = 12
 _SOURCES = 32
@@ -86,6 +88,7 @@ def refine_maps(
     depth: NDArray[np.float32],
     sources: Sequence[tuple[View, NDArray[np.uint8]]],
     options: RefinementOptions,
+    residual: float = 0.0,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Refine a view's maps, in place, on the images of its partners.
 
@@ -101,12 +104,17 @@ def refine_maps(
     sources : sequence of (View, (h, w) uint8 ndarray)
         Partners and their grey images.
     options : RefinementOptions
+    residual : float
+        Row residual of the view's pairs, radians: imprecise poses pull planes to where the images of this view's
+        partners meet, and not those of the next view's. The freer a plane the less it has in common with the maps
+        of others, so it gets less freedom.
 
     Returns
     -------
     normals, depth
         The parameters; where there was none, there is none.
     """
+    options = replace(options, depth_freedom=options.depth_freedom * _trust(residual * float(view.K[0, 0])))
     partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
     if options.rounds:
         partners = _most_telling(view, image, estimate, normals, depth, partners, options)
@@ -129,6 +137,11 @@ def refine_maps(
             _native.refine_planes(equations, sigma, slope_sigma, planes)
             normals[rows], depth[rows] = _maps_of_planes(view, planes, rows)
     return normals, depth
+
+
+def _trust(residual: float) -> float:
+    """What images say of a depth that their rows agree on to so many pixels, against those of perfect poses."""
+    return _MATCH_SIGMA**2 / (_MATCH_SIGMA**2 + residual**2)
 
 
 def _most_telling(

@@ -28,6 +28,11 @@ MAX_TIES = 300
 MIN_TIES = 30
 """Fewer ties tell too little of a pair."""
 
+MAX_RESIDUAL = 0.35
+"""Rows that disagree by more rectified pixels, root mean square, show windows that are too different to match."""
+# A pair keeps so much of its rows and columns, however imprecise its poses are.
+_LEAST = 0.25
+
 # A corner is looked for in every cell of an image; so many cells along its longer side.
 _CELLS = 64
 _CORNER_WINDOW = 5
@@ -98,6 +103,25 @@ def row_residual(ties: Ties) -> float | None:
     kept = np.abs(shifts) <= _OUTLIER * scale
     noise = max(_NOISE_FLOOR**2, float(np.mean(ties.sigma[kept].astype(float) ** 2)))
     return round(float(np.sqrt(max(float(np.mean(shifts[kept] ** 2)) - noise, 0.0))), 2)
+
+
+def tolerable_sampling(residual: float, trial: float) -> float:
+    """How much of a pair's rows and columns to keep, so that what its rows disagree by does not hide matches.
+
+    Parameters
+    ----------
+    residual : float
+        Row residual, pixels, when the pair was matched at the share `trial` of its rows and columns.
+    trial : float
+
+    Returns
+    -------
+    float
+        0.25 to 1.
+    """
+    if residual <= MAX_RESIDUAL * trial:
+        return 1.0
+    return round(max(MAX_RESIDUAL * trial / residual, _LEAST), 2)
 
 
 def find_corners(image: NDArray[np.uint8] | NDArray[np.float32]) -> Float:

@@ -20,9 +20,10 @@ from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.given.image_places import tell_problems
 from colmap_sph.project.images.decoding import is_jpeg
 from colmap_sph.project.images.depth import ValueSample, sample_values
-from colmap_sph.project.images.reading import image_problem
+from colmap_sph.project.images.reading import image_problem, read_grey
 from colmap_sph.project.state.records import read_json
 from colmap_sph.project.workspace import checked_name
+from colmap_sph.stereo.detail import image_detail
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -36,21 +37,27 @@ _MAX_BYTES = 1 << 30
 _SECONDS = 0.012
 _JPEG_BYTES = 12.0
 _OTHER_BYTES = 25.0
+# The same of measuring its detail: per megapixel to read it again, and for the measuring.
+_READ_SECONDS = 0.01
+_DETAIL_SECONDS = 0.03
+_DETAIL_BYTES = 40e6
 
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image and the size that it must have: (width, height) in pixels."""
+    """An image, the size that it must have, (width, height) in pixels, and whether its detail is asked for."""
 
     path: Path
     size: Size
+    wants_detail: bool
 
 
 @dataclass(frozen=True)
 class ImageFacts(Facts):
-    """What is known of an image: a sample of its values, if it has more than 8 bits."""
+    """Of an image: a sample of its values, if it has more than 8 bits, and its detail, if that was measured."""
 
     sample: ValueSample | None = None
+    detail: float | None = None
 
 
 def check_image(task: ImageFile) -> ImageFacts:
@@ -58,17 +65,19 @@ def check_image(task: ImageFile) -> ImageFacts:
     problem = image_problem(task.path, *task.size)
     if problem is not None:
         raise InputError(f"{task.path} {problem}")
-    return ImageFacts(sample=sample_values(task.path))
+    detail = image_detail(read_grey(task.path)) if task.wants_detail else None
+    return ImageFacts(sample=sample_values(task.path), detail=detail)
 
 
 @dataclass(frozen=True)
 class Known:
-    """Of an image that was found good: its size, the digest of its content, when that was read, and its sample."""
+    """Of an image that was found good: its size, the digest of its content, when that was read, and its facts."""
 
     size: Size
     digest: str
     stamp: tuple[int, ...]
     sample: ValueSample | None = None
+    detail: float | None = None
 
 
 class KnownFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -131,7 +140,7 @@ class ImagePlaces:
 
 
 class CheckStage(Stage[str, ImageFile]):
-    """Checks images. Its results have the digests of their contents as keys.
+    """Checks images, and measures the detail of undistorted ones. Its keys are the digests of their contents.
 
     Parameters
     ----------
@@ -155,6 +164,7 @@ class CheckStage(Stage[str, ImageFile]):
     ) -> None:
         super().__init__(context, sorted(sizes))
         self.name = f"check {places.what}"  # type: ignore[misc]
+        self._wants_detail = places.what == "images"
         self._sizes = sizes
         self._places = places
         self._bad: dict[str, str] = {}
@@ -165,7 +175,7 @@ class CheckStage(Stage[str, ImageFile]):
 
     def job(self, item: str) -> Job[ImageFile]:
         """See `Stage.job`."""
-        image = ImageFile(self._places.path(item), self._sizes[item])
+        image = ImageFile(self._places.path(item), self._sizes[item], self._wants_detail)
         problem = image_problem(image.path, *image.size, decode=False)
         if problem is not None:
             raise InputError(f"{image.path} {problem}")
@@ -176,11 +186,17 @@ class CheckStage(Stage[str, ImageFile]):
         self._seen[item] = Known(image.size, digest, stamp)
         facts = None
         if known is not None and (known.digest, known.size) == (digest, image.size):
-            facts = ImageFacts(sample=known.sample)
+            facts = ImageFacts(sample=known.sample, detail=known.detail)
+        return Job(digest, facts, self._cost(image), image)
+
+    def _cost(self, image: ImageFile) -> Cost:
         pixels = image.size[0] * image.size[1]
+        seconds = _SECONDS * pixels / 1e6
         memory = (_JPEG_BYTES if is_jpeg(image.path) else _OTHER_BYTES) * pixels
-        cost = Cost(_SECONDS * pixels / 1e6, memory, 0.0)
-        return Job(digest, facts, cost, image)
+        if image.wants_detail:
+            seconds += _READ_SECONDS * pixels / 1e6 + _DETAIL_SECONDS
+            memory += _DETAIL_BYTES
+        return Cost(seconds, memory, 0.0)
 
     def skip(self, item: str, reason: str) -> None:
         """See `Stage.skip`."""
@@ -191,7 +207,7 @@ class CheckStage(Stage[str, ImageFile]):
         """Tell what is wrong with bad images, and keep what is known of the good ones."""
         self.tell_problems()
         good = {
-            name: replace(self._seen[name], sample=result.facts.sample)
+            name: replace(self._seen[name], sample=result.facts.sample, detail=result.facts.detail)
             for name, result in results.items()
             if isinstance(result.facts, ImageFacts)
         }
@@ -212,6 +228,15 @@ class CheckStage(Stage[str, ImageFile]):
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
         """None: it makes no files."""
         return 0, 0
+
+
+def details_of(results: Mapping[str, Result]) -> dict[str, float]:
+    """Detail of each image of which it is known."""
+    return {
+        name: result.facts.detail
+        for name, result in results.items()
+        if isinstance(result.facts, ImageFacts) and result.facts.detail is not None
+    }
 
 
 def _stamp_of(path: Path) -> tuple[int, ...]:

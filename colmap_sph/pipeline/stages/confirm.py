@@ -1,6 +1,6 @@
 """Third stage: every image's depth is confirmed by its partners' and refined on their images: geometric maps."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,11 +82,23 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     planes = fit_normals(view, confirmed, task.normal_options)
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
-        planes = refine_maps(view, _image(task.reference), confirmed, *planes, sources, task.refinement_options)
+        planes = refine_maps(
+            view,
+            _image(task.reference),
+            confirmed,
+            *planes,
+            sources,
+            task.refinement_options,
+            _usual(task.residuals),
+        )
     mask = read_mask(task.mask, view.width, view.height)
     normals, depth = planes
     agreement = Agreement(*compare_with_sparse(view, depth, task.sights, mask))
     return task.maps.write(normals, depth, task.key, agreement)
+
+
+def _usual(residuals: Sequence[float]) -> float:
+    return float(np.median(residuals)) if residuals else 0.0
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:

@@ -27,7 +27,7 @@ from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectification import rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
-from colmap_sph.stereo.ties import filled_residuals, find_corners, find_ties
+from colmap_sph.stereo.ties import Ties, find_corners, find_ties, row_residual, tolerable_sampling
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+# Where sparse points project to within so many pixels, poses are precise, and no trial tells more. Else there is
+# one at so many rectified pixels per pixel.
+_PRECISE_POSES = 0.35
+_TRIAL_SAMPLING = 0.4
 # Processor seconds per megapixel of both rectified images.
 _SECONDS = 0.1
 # Bytes on disk per left rectified pixel.
@@ -80,11 +84,15 @@ class PhotoFile:
 
 @dataclass(frozen=True, eq=False)
 class MatchTask:
-    """A pair to match, with the bytes of scratch memory a thread may keep, and where its disparity map goes."""
+    """A pair to match, with the bytes of scratch memory a thread may keep, and where its disparity map goes.
+
+    Where poses may be imprecise, the pair is matched at the share `trial` of its rows and columns first.
+    """
 
     left: PhotoFile
     right: PhotoFile
     geometry: RectifiedPair
+    trial: float
     options: MatchingOptions
     scratch_bytes: int
     target: Path
@@ -93,9 +101,19 @@ class MatchTask:
 
 def make_disparity_map(task: MatchTask) -> Facts:
     """Rectify and match a pair; writes its disparity map and ties."""
-    geometry = task.geometry
     if getattr(_thread, "scratch", None) is None or _thread.scratch.max_bytes != task.scratch_bytes:
         _thread.scratch = Scratch(task.scratch_bytes)
+    share = 1.0
+    if task.trial < 1:
+        _, ties = _match(task, task.geometry.resampled(task.trial))
+        share = tolerable_sampling(row_residual(ties) or 0.0, task.trial)
+    geometry = task.geometry.resampled(share)
+    disparity, ties = _match(task, geometry)
+    pair = PairDisparity(task.left.view.name, task.right.view.name, geometry, disparity)
+    return write_pair(task.target, pair, task.key, ties, share)
+
+
+def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32], Ties]:
     disparity = match_pair(
         _rectified(task.left, geometry, "left"),
         _rectified(task.right, geometry, "right"),
@@ -104,11 +122,9 @@ def make_disparity_map(task: MatchTask) -> Facts:
         task.options,
         _thread.scratch,
     )
-    pair = PairDisparity(task.left.view.name, task.right.view.name, geometry, disparity)
     left, right = _photo(task.left), _photo(task.right)
     photos = (task.left.view, left.image), (task.right.view, right.image)
-    ties = find_ties(*photos, geometry, disparity, left.corners)
-    return write_pair(task.target, pair, task.key, ties)
+    return disparity, find_ties(*photos, geometry, disparity, left.corners)
 
 
 def _photo(file: PhotoFile) -> _Photo:
@@ -132,6 +148,7 @@ class MatchStage(Stage[Pair, MatchTask]):
         super().__init__(context, pairs)
         self._scratch_bytes = _SCRATCH_BYTES
         self._unfit: set[Pair] = set()
+        self._usual_detail = float(np.median([*context.details.values()] or [1.0]))
 
     def job(self, item: Pair) -> Job[MatchTask]:
         """See `Stage.job`; `RectificationError` for a pair that cannot be rectified."""
@@ -152,6 +169,7 @@ class MatchStage(Stage[Pair, MatchTask]):
             self._photo(left),
             self._photo(right),
             geometry,
+            self._trial(left, right, geometry),
             context.options.matching,
             self._scratch_bytes,
             target,
@@ -161,10 +179,22 @@ class MatchStage(Stage[Pair, MatchTask]):
 
     def _geometry(self, left: View, right: View) -> RectifiedPair:
         try:
-            return rectify_pair(self.context.scene, left, right, self.context.options.rectification)
+            details = (self._detail(left), self._detail(right))
+            return rectify_pair(self.context.scene, left, right, self.context.options.rectification, details)
         except RectificationError:
             self._unfit.add((left.name, right.name))
             raise
+
+    def _detail(self, view: View) -> float:
+        """Detail of an image; of one that is not there yet, that of those that are, or what a sharp one has."""
+        return self.context.details.get(view.name, self._usual_detail)
+
+    def _trial(self, left: View, right: View, geometry: RectifiedPair) -> float:
+        """Share of the rows and columns at which to find out how precise the poses are; 1 where that is known."""
+        if all(view.reprojection_error <= _PRECISE_POSES for view in (left, right)):
+            return 1.0
+        pixels_per_radian = max(float(view.K[0, 0]) for view in (left, right))
+        return min(_TRIAL_SAMPLING * pixels_per_radian / geometry.columns_per_radian, 1.0)
 
     def _photo(self, view: View) -> PhotoFile:
         workspace = self.context.workspace
@@ -212,9 +242,3 @@ class MatchStage(Stage[Pair, MatchTask]):
             reason = next(iter(report.skipped_pairs.values()), "no pair")
             raise NoResultError(f"None of the {len(self.items)} pairs could be matched ({reason}).")
         report.pairs = len(results)
-
-
-def row_residuals(matched: Mapping[Pair, Result]) -> dict[Pair, float]:
-    """Row residual of each pair, radians; pairs with too few ties have the median of all, and none too much."""
-    measured = filled_residuals([result.facts.row_residual for result in matched.values()])
-    return dict(zip(matched, measured, strict=True))

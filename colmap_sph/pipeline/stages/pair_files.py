@@ -25,14 +25,16 @@ _FINEST_STEP = 1 / 64
 _CODES = 65535
 _NUMBERS = [field.name for field in fields(RectifiedPair) if field.name not in ("surface", "rectified_from_world")]
 _WHOLE_NUMBERS = ("height", "left_width", "right_width")
-# Before the geometry: the least disparity, the step between two codes, and the row residual, or this where there
-# are too few ties for one.
-_OWN_NUMBERS = 3
+# Before the geometry: the least disparity, the step between two codes, the share of the rows and columns planned
+# that it has, and the row residual, or this where there are too few ties for one.
+_OWN_NUMBERS = 4
 _UNKNOWN = -1.0
 _TIE_COLUMNS = 5
 
 
-def write_pair(path: Path, pair: PairDisparity, key: str = "", ties: Ties | None = None) -> Facts:
+def write_pair(
+    path: Path, pair: PairDisparity, key: str = "", ties: Ties | None = None, share: float = 1.0
+) -> Facts:
     """Write a pair's disparity map and its ties; `OutputError` where that fails.
 
     Parameters
@@ -43,6 +45,8 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "", ties: Ties | None
     key : str
         What `facts_of_pair` shall find.
     ties : Ties, optional
+    share : float
+        Of the rows and columns of the geometry that `facts_of_pair` will ask for, see `RectifiedPair.resampled`.
 
     Returns
     -------
@@ -58,9 +62,9 @@ def write_pair(path: Path, pair: PairDisparity, key: str = "", ties: Ties | None
     ties = ties or Ties.none()
     residual = row_residual(ties)
     table = np.column_stack([ties.left, ties.right, ties.sigma])
-    numbers = [least, step, _UNKNOWN if residual is None else residual, *_numbers_of(pair.geometry)]
-    arrays = [codes, table] if len(ties) else [codes]  # no array of a file is empty
-    write_arrays(path, _PAIR, key, arrays, texts=texts, numbers=numbers)
+    own = [least, step, share, _UNKNOWN if residual is None else residual]
+    arrays: list[NDArray[Any]] = [codes, table] if len(ties) else [codes]  # no array of a file is empty
+    write_arrays(path, _PAIR, key, arrays, texts=texts, numbers=[*own, *_numbers_of(pair.geometry)])
     return _facts(residual, pair.geometry)
 
 
@@ -89,6 +93,8 @@ def _read(path: Path) -> tuple[Head, Sequence[NDArray[Any]]]:
 def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: RectifiedPair) -> Facts | None:
     """Say what is known of the disparity map of this pair, made under this key; None where it must be made.
 
+    It may have fewer rows and columns than planned, as the file says.
+
     Only the head of the file is read.
     """
     head = read_head(path)
@@ -96,11 +102,14 @@ def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: Rectifi
         head is None
         or (head.kind, head.key, head.texts) != (_PAIR, key, _texts_of(left, right, geometry))
         or not _has_scale(head)
-        or head.numbers[_OWN_NUMBERS:] != tuple(_numbers_of(geometry))
-        or head.arrays != tuple(_array_types(head, geometry))
     ):
         return None
-    residual = head.numbers[2]
+    *_, share, residual = head.numbers[:_OWN_NUMBERS]
+    geometry = geometry.resampled(share)
+    if head.numbers[_OWN_NUMBERS:] != tuple(_numbers_of(geometry)):
+        return None
+    if head.arrays != tuple(_array_types(head, geometry)):
+        return None
     return _facts(None if residual < 0 else residual, geometry)
 
 
@@ -157,15 +166,15 @@ def _array_types(head: Head, geometry: RectifiedPair) -> list[ArrayType]:
     """Of what a pair's file must hold: disparities, and a table of ties where it has one."""
     types: list[ArrayType] = [(np.dtype("<u2"), (geometry.height, geometry.left_width))]
     if len(head.arrays) > 1:
-        rows = min(head.arrays[1][1][0], MAX_TIES)
+        rows = min(*head.arrays[1][1][:1], MAX_TIES)
         types.append((np.dtype("<f4"), (rows, _TIE_COLUMNS)))
     return types
 
 
 def _has_scale(head: Head) -> bool:
-    """Whether there are a least disparity, a step above 0, and a row residual."""
+    """Whether there are a least disparity, a step above 0, a share of rows and columns, and a row residual."""
     own = head.numbers[:_OWN_NUMBERS]
-    return len(own) == _OWN_NUMBERS and bool(np.isfinite(own).all()) and own[1] > 0
+    return len(own) == _OWN_NUMBERS and bool(np.isfinite(own).all()) and own[1] > 0 and 0 < own[2] <= 1
 
 
 def _texts_of(left: str, right: str, geometry: RectifiedPair) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ What is accepted is decided by ties that had no part in the adjustment, and by t
 
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,19 +16,30 @@ from colmap_sph.errors import InputError
 from colmap_sph.pipeline.stages.facts import Facts, Polish
 from colmap_sph.pipeline.stages.pair_files import read_pair, read_ties
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
-from colmap_sph.project.files import make_dir, scratch_folder
+from colmap_sph.project.files import make_dir, remove, scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
+from colmap_sph.project.polishing.cameras import bends, refined_cameras, straightened_pixels
 from colmap_sph.project.polishing.options import PolishOptions
 from colmap_sph.project.polishing.polished import keep_given, known_outcome, publish_polished, starting_model
 from colmap_sph.project.scene_reader import scene_of_model
 from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.poses.quality import Judgement, judged, movements, refusal, sound_tracks
-from colmap_sph.stereo.poses.tracks import ImageTies, Tracks, image_coordinates, tracks_of_ties, triangulated
+from colmap_sph.stereo.poses.quality import Judgement, common_bends, judged, movements, refusal, sound_tracks
+from colmap_sph.stereo.poses.tracks import (
+    ImageTies,
+    Tracks,
+    image_coordinates,
+    track_errors,
+    tracks_of_ties,
+    triangulated,
+)
 
 if TYPE_CHECKING:
+    from pycolmap import Reconstruction
+
     from colmap_sph.pipeline.context import Context
 
 # Processor seconds, and bytes in use, per image of the model.
@@ -36,13 +47,31 @@ _SECONDS = 0.4
 _BYTES = 4e6
 
 
+@dataclass(frozen=True)
+class GivenModel:
+    """The model that a run was given, of the original images.
+
+    Attributes
+    ----------
+    model_dir, image_dir : Path
+    reason_to_keep : str
+        Why its poses must not be polished, as the end of a sentence; empty where they may be.
+    """
+
+    model_dir: Path
+    image_dir: Path
+    reason_to_keep: str = ""
+
+
 @dataclass(frozen=True, eq=False)
 class PolishTask:
     """The model to polish, the disparity maps whose ties tell how, and where the result goes."""
 
     workspace: Workspace
+    given: GivenModel
     pairs: Mapping[Pair, Path]
     options: PolishOptions
+    undistortion: UndistortionOptions
     key: str
 
 
@@ -63,12 +92,14 @@ def polish_poses(task: PolishTask) -> Facts:
     if adjusted is None:
         return _kept(task, "their adjustment does not converge")
     after = scene_of_model(adjusted, folder)
-    judgement = judged(tracks.only(is_held_out), scene, after)
+    held_out = tracks.only(is_held_out)
+    judgement = judged(held_out, scene, after)
+    advice = _advice(task, tracks, scene, judgement)
     reason = judgement.refusal(task.options.least_gain)
     if reason:
-        return _kept(task, reason)
+        return _kept(task, reason, advice)
     moved = movements(scene, after)
-    polish = Polish(_success(judgement, moved), is_polished=True, movement=moved)
+    polish = Polish(_success(judgement, moved), is_polished=True, movement=moved, advice=advice)
     with scratch_folder(workspace.polishing_scratch_dir):
         made = workspace.polishing_scratch_dir / "polished"
         make_dir(made)
@@ -77,6 +108,7 @@ def polish_poses(task: PolishTask) -> Facts:
     return Facts(polish=polish)
 
 
+_BENT_SHARE = 0.05
 HELD_OUT = 5
 """Of so many tracks one has no part in the adjustment."""
 
@@ -102,10 +134,62 @@ def _observations(tracks: Tracks, scene: Scene) -> Observations:
     return Observations(names, tracks.track, tracks.view, tracks.pixels, points)
 
 
-def _kept(task: PolishTask, reason: str) -> Facts:
-    polish = Polish(f"The poses are kept as given: {reason}.")
+def _kept(task: PolishTask, reason: str, advice: str = "") -> Facts:
+    polish = Polish(f"The poses are kept as given: {reason}.", advice=advice)
     keep_given(task.workspace, task.key, asdict(polish))
     return Facts(polish=polish)
+
+
+def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
+    """What to do about images that are bent alike; where it was asked for, that it was done."""
+    bent = [bend for bend in common_bends(tracks, scene) if bend.share > _BENT_SHARE]
+    if task.options.cameras:
+        return _with_refined_cameras(task, tracks, scene, judgement)
+    return " ".join(
+        f"The {len(bend.views)} images with the camera of {scene.views[bend.views[0]].name} are bent alike, by "
+        f"{bend.pixels:.2f} px beyond what poses can take up: its lens model is imprecise; try --polish-cameras."
+        for bend in bent
+    )
+
+
+def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
+    """Refine the cameras of the original model, and leave it in the workspace where it is better."""
+    is_held_out = np.arange(len(tracks)) % HELD_OUT == 0
+    given = load_model(task.given.model_dir)
+    observations = _observations(tracks.only(~is_held_out), scene)
+    refined = refined_cameras(given, observations, task.undistortion.for_colmap())
+    error = np.inf
+    if refined is not None:
+        error = _error_with_cameras(task, given, refined, tracks.only(is_held_out), scene)
+    before = min(judgement.before, judgement.after)
+    if refined is None or error > (1 - task.options.least_gain) * before:
+        return f"The cameras are kept as given: refined ones are not clearly better ({error:.2f} px)."
+    target = task.workspace.refined_model_dir
+    remove(target)
+    make_dir(target)
+    refined.write_binary(target)
+    bent = ", ".join(f"camera {number} by {pixels:.2f} px" for number, pixels in bends(given, refined).items())
+    return (
+        f"Cameras were refined ({bent}): ties that had no part in it fit to {error:.2f} px, before "
+        f"{before:.2f} px. "
+        f"Use them in another run: colmap_sph run --model {target} --images {task.given.image_dir} --output "
+        f"{task.workspace.root.with_name(task.workspace.root.name + '_refined')}"
+    )
+
+
+def _error_with_cameras(
+    task: PolishTask, given: "Reconstruction", refined: "Reconstruction", tracks: Tracks, scene: Scene
+) -> float:
+    """Median error of tracks by refined cameras and their poses, pixels of the undistorted images."""
+    options = task.undistortion.for_colmap()
+    pixels = tracks.pixels.copy()
+    views = []
+    for index, view in enumerate(scene.views):
+        here = tracks.view == index
+        pose, pixels[here] = straightened_pixels(given, refined, view.name, tracks.pixels[here], view.K, options)
+        views.append(replace(view, R=pose[:, :3].copy(), t=pose[:, 3].copy()))
+    moved = Tracks(tracks.track, tracks.view, pixels)
+    return float(np.nanmedian(track_errors(moved, triangulated(moved, views), views)))
 
 
 def _success(judgement: Judgement, moved: Mapping[str, float]) -> str:
@@ -123,6 +207,7 @@ class PolishStage(Stage[str, PolishTask]):
     ----------
     context : Context
         Of the given model.
+    given : GivenModel
     pairs : sequence of (str, str)
         Pairs of image names that were to be matched.
     matched : collection of (str, str)
@@ -133,8 +218,11 @@ class PolishStage(Stage[str, PolishTask]):
     whole = True
     make = staticmethod(polish_poses)
 
-    def __init__(self, context: "Context", pairs: Sequence[Pair], matched: Collection[Pair] = ()) -> None:
+    def __init__(
+        self, context: "Context", given: GivenModel, pairs: Sequence[Pair], matched: Collection[Pair] = ()
+    ) -> None:
         super().__init__(context, ["the sparse model"])
+        self._given = given
         self._pairs = pairs
         self._matched = matched
 
@@ -143,7 +231,9 @@ class PolishStage(Stage[str, PolishTask]):
         context = self.context
         key = context.keys.polish(self._pairs, starting_model(context.workspace))
         paths = {pair: context.pair_path(*pair) for pair in self._matched}
-        task = PolishTask(context.workspace, paths, context.options.polish, key)
+        task = PolishTask(
+            context.workspace, self._given, paths, context.options.polish, context.options.undistortion, key
+        )
         number = len(context.scene.views)
         cost = Cost(_SECONDS * number, _BYTES * number, 0.0)
         return Job(key, self._known(key), cost, task)

@@ -1,4 +1,4 @@
-"""One distortion for each camera, adjusted on request: the original model and tracks → that model with new cameras.
+"""The original model and tracks → that model with a new distortion for each of its cameras, on request.
 
 Focal lengths stay: where a scene hardly tells them, a free one runs away, and images still fit each other.
 """
@@ -67,14 +67,42 @@ def distorted(camera: pycolmap.Camera, pixels: Float, options: pycolmap.Undistor
     return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))).reshape(-1, 2)
 
 
-def straightened(camera: pycolmap.Camera, pixels: Float, K: Float) -> Float:
-    """(n, 2) image coordinates that a pinhole with calibration K has for those of a camera."""
-    rays = np.asarray(camera.cam_from_img(pixels)).reshape(-1, 2)
-    return rays * K[[0, 1], [0, 1]] + K[:2, 2]
+def straightened_pixels(
+    given: pycolmap.Reconstruction,
+    refined: pycolmap.Reconstruction,
+    name: str,
+    pixels: Float,
+    K: Float,
+    options: pycolmap.UndistortCameraOptions,
+) -> tuple[Float, Float]:
+    """What refined cameras make of coordinates in an undistorted image.
+
+    Parameters
+    ----------
+    given, refined : pycolmap.Reconstruction
+        The original model, and the same with other cameras and poses.
+    name : str
+        Of the image.
+    pixels : (n, 2) float64 ndarray
+    K : (3, 3) float64 ndarray
+        Of the undistorted image.
+    options : pycolmap.UndistortCameraOptions
+
+    Returns
+    -------
+    pose : (3, 4) float64 ndarray
+        ``[R | t]`` of the image in `refined`.
+    pixels : (n, 2) float64 ndarray
+        Where a pinhole with calibration K in the refined place sees them.
+    """
+    image = next(image for image in refined.images.values() if image.name == name)
+    original = distorted(cameras_of_images(given)[name], pixels, options)
+    rays = np.asarray(refined.camera(image.camera_id).cam_from_img(original)).reshape(-1, 2)
+    return np.asarray(image.cam_from_world().matrix()), rays * K[[0, 1], [0, 1]] + K[:2, 2]
 
 
 def bends(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> Mapping[int, float]:
-    """By how many pixels (root mean square over the image) each camera maps otherwise, less a shift of the image."""
+    """By how many pixels (root mean square over its image) each camera maps otherwise, less a shift."""
     found = {}
     for camera_id, camera in sorted(after.cameras.items()):
         u, v = np.meshgrid(np.linspace(0, camera.width, 9), np.linspace(0, camera.height, 9))

@@ -3,11 +3,13 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.poses.tracks import (
     Tracks,
     parallax_angles,
+    reprojection_errors,
     thickness,
     track_errors,
     triangulated,
@@ -31,6 +33,14 @@ _MOST_LEFT = 1.0
 _MOST_MOVEMENT = 30.0
 # The model's own tracks may fit worse by this share: a rounding.
 _RISE = 0.02
+# Pixels: no bundle adjustment leaves so much.
+_BROKEN = 3.0
+# A field common to a camera's images: cells along each side, observations in one that give it a mean, images, and
+# observations in all.
+_BENT_CELLS = 6
+_BENT_PER_CELL = 10
+_BENT_IMAGES = 4
+_BENT_TIES = 400
 # Standard deviations by which more ties must fit better than worse.
 _SURE = 3.0
 
@@ -85,6 +95,12 @@ def refusal(tracks: Tracks, scene: Scene, least_residual: float) -> str:
     known = scene.points[np.isfinite(scene.points).all(axis=1)]
     if thickness(points) < _PLANE and thickness(known) < _PLANE:
         return "all that the images have in common lies on one plane, which leaves directions open"
+    sparse = _sparse_error(scene)
+    if sparse > _BROKEN:
+        return (
+            f"its sparse points lie {sparse:.1f} px from where images observe them, so that not only poses are "
+            "wrong; check cameras and images of the model"
+        )
     error = _median_error(tracks, scene)
     if error < least_residual:
         return f"they are good already: the rays of ties miss each other by {error:.2f} px"
@@ -169,6 +185,77 @@ def judged(held_out: Tracks, before: Scene, after: Scene) -> Judgement:
         sparse_after=sparse[1],
         movement=float(np.median(list(moved.values()))) if moved else 0.0,
     )
+
+
+@dataclass(frozen=True)
+class Bend:
+    """What all images of one camera are bent by alike.
+
+    Attributes
+    ----------
+    views : tuple of int
+        Indices of its images.
+    pixels : float
+        Root mean square of the field that residuals of ties have in common.
+    share : float
+        Of their variance, by images that had no part in the field.
+    """
+
+    views: tuple[int, ...]
+    pixels: float
+    share: float
+
+
+def common_bends(tracks: Tracks, scene: Scene) -> list[Bend]:
+    """Look for fields of residuals that the images of a camera have in common: what its model does not know.
+
+    Poses take up what they can of a bend, so that it is larger than what is found here. The field of every other
+    image is compared with the residuals of those between, so that what is common to none has no share.
+
+    Parameters
+    ----------
+    tracks : Tracks
+    scene : Scene
+
+    Returns
+    -------
+    list of Bend
+        One for each camera (size and calibration) with enough images and ties.
+    """
+    points = triangulated(tracks, scene.views)
+    residuals = reprojection_errors(tracks, points, scene.views)
+    lengths = np.linalg.norm(residuals, axis=1)
+    good = lengths < _OUTLIER * np.nanmedian(lengths)
+    cameras: dict[tuple[object, ...], list[int]] = {}
+    for index, view in enumerate(scene.views):
+        cameras.setdefault((view.width, view.height, *view.K.ravel()), []).append(index)
+    bends = []
+    for views in cameras.values():
+        halves = [good & np.isin(tracks.view, views[start::2]) for start in (0, 1)]
+        if len(views) < _BENT_IMAGES or min(half.sum() for half in halves) < _BENT_TIES:
+            continue
+        cells = _cells(tracks, scene, views[0])
+        fields = [_field(cells[half], residuals[half]) for half in halves]
+        left = [residuals[halves[k]] - fields[1 - k][cells[halves[k]]] for k in (0, 1)]
+        rest = np.sum([(part**2).sum() for part in left])
+        total = np.sum([(residuals[half] ** 2).sum() for half in halves])
+        both = (fields[0] + fields[1]) / 2
+        bends.append(Bend(tuple(views), float(np.sqrt((both**2).sum(axis=1).mean())), float(1 - rest / total)))
+    return bends
+
+
+def _cells(tracks: Tracks, scene: Scene, view: int) -> NDArray[np.int64]:
+    """(m,) cell of the image in which each observation lies."""
+    size = np.array([scene.views[view].width, scene.views[view].height])
+    cell = np.clip((tracks.pixels / size * _BENT_CELLS).astype(np.int64), 0, _BENT_CELLS - 1)
+    return np.asarray(cell[:, 1] * _BENT_CELLS + cell[:, 0])
+
+
+def _field(cells: NDArray[np.int64], residuals: Float) -> Float:
+    """(cells, 2) mean residual of each cell; 0 where there are few."""
+    number = np.bincount(cells, minlength=_BENT_CELLS**2)
+    sums = [np.bincount(cells, residuals[:, axis], _BENT_CELLS**2) for axis in (0, 1)]
+    return np.where(number[:, None] >= _BENT_PER_CELL, np.stack(sums, axis=1) / np.maximum(number, 1)[:, None], 0)
 
 
 def movements(before: Scene, after: Scene) -> dict[str, float]:
