@@ -18,7 +18,7 @@ from colmap_sph.pipeline.stages.pair_files import read_pair, read_ties
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
 from colmap_sph.project.files import make_dir, remove, scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
-from colmap_sph.project.polishing.cameras import bends, refined_cameras, straightened_pixels
+from colmap_sph.project.polishing.cameras import bends, refined_cameras, straightened
 from colmap_sph.project.polishing.options import PolishOptions
 from colmap_sph.project.polishing.polished import keep_given, known_outcome, publish_polished, starting_model
 from colmap_sph.project.scene_reader import scene_of_model
@@ -38,8 +38,6 @@ from colmap_sph.stereo.poses.tracks import (
 )
 
 if TYPE_CHECKING:
-    from pycolmap import Reconstruction
-
     from colmap_sph.pipeline.context import Context
 
 # Processor seconds, and bytes in use, per image of the model.
@@ -160,7 +158,13 @@ def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgem
     refined = refined_cameras(given, observations, task.undistortion.for_colmap())
     error = np.inf
     if refined is not None:
-        error = _error_with_cameras(task, given, refined, tracks.only(is_held_out), scene)
+        held_out = tracks.only(is_held_out)
+        options = task.undistortion.for_colmap()
+        calibrations = [view.K for view in scene.views]
+        poses, pixels = straightened(given, refined, _observations(held_out, scene), calibrations, options)
+        views = [replace(view, R=pose[:, :3], t=pose[:, 3]) for view, pose in zip(scene.views, poses, strict=True)]
+        moved = Tracks(held_out.track, held_out.view, pixels)
+        error = float(np.nanmedian(track_errors(moved, triangulated(moved, views), views)))
     before = min(judgement.before, judgement.after)
     if refined is None or error > (1 - task.options.least_gain) * before:
         return f"The cameras are kept as given: refined ones are not clearly better ({error:.2f} px)."
@@ -175,21 +179,6 @@ def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgem
         f"Use them in another run: colmap_sph run --model {target} --images {task.given.image_dir} --output "
         f"{task.workspace.root.with_name(task.workspace.root.name + '_refined')}"
     )
-
-
-def _error_with_cameras(
-    task: PolishTask, given: "Reconstruction", refined: "Reconstruction", tracks: Tracks, scene: Scene
-) -> float:
-    """Median error of tracks by refined cameras and their poses, pixels of the undistorted images."""
-    options = task.undistortion.for_colmap()
-    pixels = tracks.pixels.copy()
-    views = []
-    for index, view in enumerate(scene.views):
-        here = tracks.view == index
-        pose, pixels[here] = straightened_pixels(given, refined, view.name, tracks.pixels[here], view.K, options)
-        views.append(replace(view, R=pose[:, :3].copy(), t=pose[:, 3].copy()))
-    moved = Tracks(tracks.track, tracks.view, pixels)
-    return float(np.nanmedian(track_errors(moved, triangulated(moved, views), views)))
 
 
 def _success(judgement: Judgement, moved: Mapping[str, float]) -> str:

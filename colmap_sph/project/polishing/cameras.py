@@ -67,38 +67,45 @@ def distorted(camera: pycolmap.Camera, pixels: Float, options: pycolmap.Undistor
     return np.asarray(camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))).reshape(-1, 2)
 
 
-def straightened_pixels(
+def straightened(
     given: pycolmap.Reconstruction,
     refined: pycolmap.Reconstruction,
-    name: str,
-    pixels: Float,
-    K: Float,
+    observations: Observations,
+    calibrations: Sequence[Float],
     options: pycolmap.UndistortCameraOptions,
-) -> tuple[Float, Float]:
-    """What refined cameras make of coordinates in an undistorted image.
+) -> tuple[list[Float], Float]:
+    """What refined cameras make of coordinates in undistorted images.
 
     Parameters
     ----------
     given, refined : pycolmap.Reconstruction
         The original model, and the same with other cameras and poses.
-    name : str
-        Of the image.
-    pixels : (n, 2) float64 ndarray
-    K : (3, 3) float64 ndarray
-        Of the undistorted image.
+    observations : Observations
+        Image coordinates in the undistorted images.
+    calibrations : sequence of (3, 3) float64 ndarray
+        Of each of these.
     options : pycolmap.UndistortCameraOptions
+        How they were undistorted.
 
     Returns
     -------
-    pose : (3, 4) float64 ndarray
-        ``[R | t]`` of the image in `refined`.
-    pixels : (n, 2) float64 ndarray
-        Where a pinhole with calibration K in the refined place sees them.
+    poses : list of (3, 4) float64 ndarray
+        ``[R | t]`` of each image in `refined`.
+    pixels : (m, 2) float64 ndarray
+        Where pinholes of these calibrations in the refined places see the same.
     """
-    image = next(image for image in refined.images.values() if image.name == name)
-    original = distorted(cameras_of_images(given)[name], pixels, options)
-    rays = np.asarray(refined.camera(image.camera_id).cam_from_img(original)).reshape(-1, 2)
-    return np.asarray(image.cam_from_world().matrix()), rays * K[[0, 1], [0, 1]] + K[:2, 2]
+    images = {image.name: image for image in refined.images.values()}
+    cameras = cameras_of_images(given)
+    pixels = observations.pixels.copy()
+    poses = []
+    for index, name in enumerate(observations.names):
+        here = observations.image == index
+        original = distorted(cameras[name], pixels[here], options)
+        rays = np.asarray(refined.camera(images[name].camera_id).cam_from_img(original)).reshape(-1, 2)
+        K = calibrations[index]
+        pixels[here] = rays * K[[0, 1], [0, 1]] + K[:2, 2]
+        poses.append(np.array(images[name].cam_from_world().matrix()))
+    return poses, pixels
 
 
 def bends(before: pycolmap.Reconstruction, after: pycolmap.Reconstruction) -> Mapping[int, float]:

@@ -14,8 +14,9 @@ class PolishOptions:
     """How poses and cameras of the sparse model are polished on ties between the images, and all matched again."""
 
     poses: Polishing = "off"
-    """on: adjust the poses where ties of the matched pairs show that they are imprecise and that this helps;
-    always: also rigs, models in map coordinates and such without tracks. Alone --polish-poses means on."""
+    """Adjust the poses of the sparse model where ties of the matched pairs show that they are imprecise and that
+    this helps (on, or the option without a value), or also those of rigs, of models in map coordinates and of
+    models without tracks (always)."""
     cameras: bool = False
     """Also adjust lens distortion and principal point, one for each camera, and write that model to
     colmap_sph/refined in the workspace, for another run."""

@@ -27,7 +27,7 @@ _TRACKS_PER_IMAGE = 15
 _CONNECTING_TIES = 10
 _LEAST_TOGETHER = 0.9
 # Ties and sparse points are one plane where their thickness is below this share of their extent.
-_PLANE = 0.002
+_PLANE = 0.005
 # Pixels: poses alone leave less than this, of a camera that is right.
 _MOST_LEFT = 1.0
 _MOST_MOVEMENT = 30.0
@@ -91,10 +91,6 @@ def refusal(tracks: Tracks, scene: Scene, least_residual: float) -> str:
     together = views_together(tracks, number, _CONNECTING_TIES)
     if together.mean() < _LEAST_TOGETHER:
         return f"ties connect only {together.sum()} of the {number} images with each other"
-    points = triangulated(tracks, scene.views)
-    known = scene.points[np.isfinite(scene.points).all(axis=1)]
-    if thickness(points) < _PLANE and thickness(known) < _PLANE:
-        return "all that the images have in common lies on one plane, which leaves directions open"
     sparse = _sparse_error(scene)
     if sparse > _BROKEN:
         return (
@@ -121,6 +117,8 @@ class Judgement:
         Reprojection error of the model's own tracks.
     movement : float
         Median over the images.
+    thickness : float
+        Of the points of ties and of the sparse points, whichever is more, in units of their extent.
     """
 
     before: float
@@ -129,6 +127,7 @@ class Judgement:
     sparse_before: float
     sparse_after: float
     movement: float
+    thickness: float
 
     @property
     def words(self) -> str:
@@ -140,6 +139,8 @@ class Judgement:
 
     def refusal(self, least_gain: float) -> str:
         """Why the polished poses are not used, as the end of a sentence; empty where they are."""
+        if self.thickness < _PLANE:
+            return "all that the images have in common lies on one plane, which leaves directions open"
         if self.after > (1 - least_gain) * self.before or self.sureness < _SURE:
             return (
                 "polished ones are not clearly better (ties that had no part in the adjustment fit to "
@@ -184,6 +185,7 @@ def judged(held_out: Tracks, before: Scene, after: Scene) -> Judgement:
         sparse_before=sparse[0],
         sparse_after=sparse[1],
         movement=float(np.median(list(moved.values()))) if moved else 0.0,
+        thickness=max(thickness(triangulated(held_out, after.views)), thickness(after.points)),
     )
 
 

@@ -168,6 +168,7 @@ def views_together(tracks: Tracks, num_views: int, least: int) -> NDArray[np.boo
 
 def thickness(points: Float) -> float:
     """How far points lie off their common plane, in units of their extent (root mean squares); 0 for under 4."""
+    points = points[np.isfinite(points).all(axis=1)]
     if len(points) < 4:
         return 0.0
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
