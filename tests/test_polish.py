@@ -250,3 +250,42 @@ def test_poses_that_are_good_are_kept(project: Path) -> None:
 def test_a_workspace_of_the_user_is_not_polished(project: Path) -> None:
     with pytest.raises(OptionError, match="--model"):
         colmap_sph.run(workspace=project / "dense", options=ON)
+
+
+# ---- cameras ------------------------------------------------------------------------------------------------
+
+
+def wrong_lens(model: pycolmap.Reconstruction) -> None:
+    """The lens of pictures without distortion has some, says the model."""
+    for camera in model.cameras.values():
+        f, _, cx, cy = camera.params
+        camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL
+        camera.params = [f, cx, cy, 0.3]
+
+
+def test_cameras_are_refined_into_a_model_of_their_own(project: Path) -> None:
+    change_model(project, wrong_lens)
+    given = (project / "sparse/0/cameras.bin").read_bytes()
+    report = run(project, replace(OFF, polish=PolishOptions("on", cameras=True)))
+    assert "Cameras were refined" in report.polishing
+    refined = project / "dense/colmap_sph/refined"
+    assert f"--model {refined} --images {project / 'images'}" in report.polishing
+    for camera in pycolmap.Reconstruction(refined).cameras.values():
+        k1, k2 = camera.params[4:6]
+        corner = np.array([1.0, 1.0]) @ np.array([camera.width, camera.height]) ** 2 / 4 / camera.params[0] ** 2
+        # At the corner, of the 0.3 that were wrong.
+        assert abs(k1 + k2 * corner) < 0.1
+        assert camera.params[:4].tolist() == [camera.params[0], camera.params[0], 80, 60]
+    assert (project / "sparse/0/cameras.bin").read_bytes() == given
+
+
+def test_right_cameras_are_kept(project: Path) -> None:
+    shutil.rmtree(project / "dense")
+    report = run(project, replace(OFF, polish=PolishOptions("on", cameras=True)))
+    assert "The cameras are kept as given" in report.polishing
+    assert not (project / "dense/colmap_sph/refined").exists()
+
+
+def test_cameras_alone_are_refused() -> None:
+    with pytest.raises(OptionError, match="poses"):
+        PolishOptions(cameras=True).check()

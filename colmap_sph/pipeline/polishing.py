@@ -76,7 +76,7 @@ def _outcome(context: Context, pairs: Sequence[Pair], executor: "Executor", give
 
 
 def _told(context: Context, polish: Polish) -> Context:
-    logger.info("%s", polish.words)
     context.report.polishing = f"{polish.words} {polish.advice}".strip()
+    logger.info("%s", context.report.polishing)
     context.report.pose_movement = dict(polish.movement)
     return context

@@ -16,11 +16,17 @@ from colmap_sph.errors import InputError
 from colmap_sph.pipeline.stages.facts import Facts, Polish
 from colmap_sph.pipeline.stages.pair_files import read_pair, read_ties
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
-from colmap_sph.project.files import make_dir, remove, scratch_folder
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
 from colmap_sph.project.polishing.cameras import bends, refined_cameras, straightened
 from colmap_sph.project.polishing.options import PolishOptions
-from colmap_sph.project.polishing.polished import keep_given, known_outcome, publish_polished, starting_model
+from colmap_sph.project.polishing.polished import (
+    keep_given,
+    known_outcome,
+    publish_polished,
+    starting_model,
+    write_model,
+)
 from colmap_sph.project.scene_reader import scene_of_model
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.undistortion import UndistortionOptions
@@ -100,8 +106,7 @@ def polish_poses(task: PolishTask) -> Facts:
     polish = Polish(_success(judgement, moved), is_polished=True, movement=moved, advice=advice)
     with scratch_folder(workspace.polishing_scratch_dir):
         made = workspace.polishing_scratch_dir / "polished"
-        make_dir(made)
-        adjusted.write_binary(made)
+        write_model(adjusted, made)
         publish_polished(workspace, made, task.key, asdict(polish))
     return Facts(polish=polish)
 
@@ -169,9 +174,7 @@ def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgem
     if refined is None or error > (1 - task.options.least_gain) * before:
         return f"The cameras are kept as given: refined ones are not clearly better ({error:.2f} px)."
     target = task.workspace.refined_model_dir
-    remove(target)
-    make_dir(target)
-    refined.write_binary(target)
+    write_model(refined, target)
     bent = ", ".join(f"camera {number} by {pixels:.2f} px" for number, pixels in bends(given, refined).items())
     return (
         f"Cameras were refined ({bent}): ties that had no part in it fit to {error:.2f} px, before "

@@ -75,7 +75,7 @@ def adjusted_model(
         Not changed.
     observations : Observations
     refine_distortion : bool
-        Whether distortion and principal point of each camera are adjusted, too; focal lengths stay.
+        Whether the distortion of each camera is adjusted, too; focal length and principal point stay.
 
     Returns
     -------
@@ -130,7 +130,7 @@ def _options(*, refine_distortion: bool) -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = False
-    options.refine_principal_point = refine_distortion
+    options.refine_principal_point = False
     options.refine_extra_params = refine_distortion
     options.refine_sensor_from_rig = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1

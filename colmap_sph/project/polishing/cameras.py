@@ -1,6 +1,7 @@
 """The original model and tracks → that model with a new distortion for each of its cameras, on request.
 
-Focal lengths stay: where a scene hardly tells them, a free one runs away, and images still fit each other.
+Focal lengths and principal points stay: where a scene hardly tells them, free ones run away, and images still fit
+each other.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,7 +29,7 @@ Float = NDArray[np.float64]
 def refined_cameras(
     given: pycolmap.Reconstruction, observations: Observations, options: pycolmap.UndistortCameraOptions
 ) -> pycolmap.Reconstruction | None:
-    """Adjust distortion and principal point of each camera of a model, with its poses.
+    """Adjust the distortion of each camera of a model, with its poses.
 
     Parameters
     ----------

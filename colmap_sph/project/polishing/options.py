@@ -18,7 +18,7 @@ class PolishOptions:
     this helps (on, or the option without a value), or also those of rigs, of models in map coordinates and of
     models without tracks (always)."""
     cameras: bool = False
-    """Also adjust lens distortion and principal point, one for each camera, and write that model to
+    """Also adjust the lens distortion of each camera, and write that model to
     colmap_sph/refined in the workspace, for another run."""
     least_residual: float = 0.15
     """Poses are left as they are where rows of the pairs disagree by fewer pixels than this."""
