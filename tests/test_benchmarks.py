@@ -207,3 +207,37 @@ def test_variants_of_the_ablation_are_options_of_the_program(capsys, tmp_path):
     for options in importlib.import_module("ablation")._VARIANTS.values():
         assert cli.main(["run", "--model", str(tmp_path / "none"), *options]) == 2
         assert "none does not exist" in capsys.readouterr().err
+
+
+# ---- robustness --------------------------------------------------------------------------------------------
+
+
+def test_one_case_of_the_robustness_benchmark():
+    """Ours, a variant, and a peer that makes nothing."""
+    command = [sys.executable, str(SCRIPTS / "bench_robustness.py"), "--only", "clouds", "--strengths", "2"]
+    command += ["--size", "0.3", "--variant", "few pairs=--num-pairs 2", "--peer"]
+    command += [
+        f"idle={sys.executable} -c 'import pathlib; assert pathlib.Path(\"{{workspace}}/sparse\").is_dir()'"
+    ]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    header, _, *runs = [line.strip("| ").split(" | ") for line in done.stdout.splitlines() if line.startswith("|")]
+    ours, variant, idle = (dict(zip(header, run, strict=True)) for run in runs)
+    assert [run["method"] for run in (ours, variant, idle)] == ["default", "few pairs", "idle"]
+    for run in (ours, variant):
+        assert run["case"] == "clouds" and run["strength"] == "0.5 of the blue"
+        assert 10 < float(run["coverage %"]) < 100
+        assert 0 <= float(run["< 1 GSD %"]) <= float(run["< 2 GSD %"]) <= 100
+        accuracy = [float(share) for share in run["accuracy 1 / 2 / 4 GSD"].split(" / ")]
+        assert 0 < accuracy[0] <= accuracy[1] <= accuracy[2] <= 100
+        assert float(run["processor, s"]) > 0
+    assert ours["coverage %"] != variant["coverage %"]
+    assert (idle["coverage %"], idle["of sky %"], idle["F"]) == ("0.0", "0.00", "-")
+
+
+def test_a_peer_that_fails_has_a_row_that_says_so(capsys):
+    robustness = importlib.import_module("bench_robustness")
+    failing = robustness.Method("broken", (sys.executable, "-c", "raise SystemExit('out of fuel')"), is_peer=True)
+    (row,) = robustness.rows_of("none, street", 0, 0.2, [failing], 1)
+    assert row[:4] == ["none, street", "0", "broken", "failed"]
+    assert "ended with exit code 1: out of fuel" in capsys.readouterr().err

@@ -21,6 +21,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.reconstruct import with_good_images
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import _MATCH_BYTES, MatchStage
@@ -160,7 +161,7 @@ def test_stages_one_by_one(project: Path) -> None:
     workspace = prepare(project / "sparse/0", project / "stages")
     scene = anchored(read_scene(workspace.sparse_dir))
     selection = select_pairs(scene, FEW_PAIRS.pairs)
-    context = Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS))
+    context = with_good_images(Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS)), execute)
     pair_keys = keys_of(execute(MatchStage(context, selection.unique_pairs())))
     assert list(pair_keys) == selection.unique_pairs()
     votes = execute(VoteStage(context, pair_keys))

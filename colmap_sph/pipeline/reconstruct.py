@@ -312,7 +312,7 @@ def with_good_images(
 
 def _report_detail(context: Context, details: Mapping[str, float]) -> None:
     """Tell how much the images hold, and how finely they are therefore matched."""
-    sampling = context.options.rectification.sampling * mean(sampling_of(detail) for detail in details.values())
+    sampling = context.options.rectification.sampling * mean(map(sampling_of, details.values()))
     detail = mean(details.values())
     context.report.detail = round(detail, 3)
     context.report.sampling = round(sampling, 3)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Float = NDArray[np.floating[Any]]
+Float = NDArray[np.float64]
 
 # The spectrum is that of square tiles, so many at most, which overlap by half where the image has few.
 _TILE = 128
@@ -60,58 +60,63 @@ def image_detail(image: NDArray[Any]) -> float:
 
     Examples
     --------
-    >>> texture = np.cumsum(np.cumsum(np.random.default_rng(0).normal(size=(512, 512)), axis=0), axis=1)
-    >>> image_detail(np.zeros((512, 512), np.uint8))
+    A surface without any texture:
+
+    >>> image_detail(np.full((480, 640), 128, np.uint8))
     0.25
     """
     tiles = _tiles(image)
     if len(tiles) < _FEWEST_TILES:
         return 1.0
-    power, frequency = _band_powers(tiles)
-    noise = _noise_of(power, frequency, tiles.mean(axis=(1, 2)))
-    texture = np.maximum(power - noise[:, None, None], 0)
-    amount = np.sqrt((texture * frequency**2)[:, :, :_TEXTURE_BANDS].mean(axis=2))
-    total = amount.sum(axis=0)
-    details = []
-    for direction in range(_DIRECTIONS):
-        if not total[direction] > 0:
-            return _LEAST
-        weights = amount[:, direction] / total[direction]
-        # The mean of logarithms, as a few strong edges are not what most pixels show.
-        mean = np.exp(weights @ np.log(power[:, direction] + _ROUNDING))
-        floor = np.exp(weights @ np.log(noise + _ROUNDING))
-        signal = np.maximum(mean - floor, 0)
-        gradients = signal**2 / mean * frequency**2
-        if not gradients.sum() > 0:
-            return _LEAST
-        details.append(4 * float(gradients @ frequency / gradients.sum()))
-    return max(float(np.round(np.exp(np.mean(np.log(details))) * _STEPS)) / _STEPS, _LEAST)
+    frequency = (_BAND_EDGES[:-1] + _BAND_EDGES[1:]) / (2 * _TILE)
+    power = _band_powers(tiles)
+    noise = _noise_of(power, frequency, np.array([tile.mean() for tile in tiles]))
+    details = [_detail_along(power[:, direction], noise, frequency) for direction in range(_DIRECTIONS)]
+    detail = float(np.exp(np.mean(np.log(details))))
+    return max(round(detail * _STEPS) / _STEPS, _LEAST)
 
 
-def _tiles(image: NDArray[Any]) -> Float:
-    """(n, 128, 128) tiles spread over the image."""
-    if min(image.shape) < _TILE:
-        return np.empty((0, _TILE, _TILE), np.float32)
-    tiles = np.lib.stride_tricks.sliding_window_view(image, (_TILE, _TILE))[::_STEP, ::_STEP]
-    count = tiles.shape[0] * tiles.shape[1]
-    chosen = np.linspace(0, count - 1, min(count, _MOST_TILES)).round().astype(int)
-    return tiles[np.unravel_index(chosen, tiles.shape[:2])].astype(np.float32)
+def _detail_along(power: Float, noise: Float, frequency: Float) -> float:
+    """Detail along one direction, from the (n, bands) power and (n,) noise of the tiles."""
+    texture = np.maximum(power - noise[:, None], 0)
+    weights = np.sqrt((texture * frequency**2)[:, :_TEXTURE_BANDS].mean(axis=1))
+    if not weights.any():
+        return _LEAST
+    weights /= weights.sum()
+    # The mean of logarithms, as a few strong edges are not what most pixels show.
+    mean = np.exp(weights @ np.log(power + _ROUNDING))
+    signal = np.maximum(mean - np.exp(weights @ np.log(noise + _ROUNDING)), 0)
+    gradients = signal**2 / mean * frequency**2
+    if not gradients.any():
+        return _LEAST
+    return max(4 * float(gradients @ frequency / gradients.sum()), _LEAST)
 
 
-def _band_powers(tiles: Float) -> tuple[Float, Float]:
-    """(n, directions, bands) mean power, grey values squared, and the bands' frequency, cycles per pixel."""
-    window = np.hanning(_TILE + 2)[1:-1].astype(np.float32)
-    window /= np.sqrt(np.mean(window**2))
-    spectra = np.fft.rfft2((tiles - tiles.mean(axis=(1, 2), keepdims=True)) * np.outer(window, window))
-    power = (spectra.real**2 + spectra.imag**2).reshape(len(tiles), -1) / _TILE**2
+def _tiles(image: NDArray[Any]) -> list[NDArray[Any]]:
+    """Tiles (128, 128) spread over the image."""
+    height, width = image.shape
+    corners = [(y, x) for y in range(0, height - _TILE + 1, _STEP) for x in range(0, width - _TILE + 1, _STEP)]
+    chosen = np.linspace(0, len(corners) - 1, min(len(corners), _MOST_TILES)).round().astype(int)
+    return [image[y : y + _TILE, x : x + _TILE] for y, x in (corners[index] for index in chosen)]
+
+
+def _band_powers(tiles: list[NDArray[Any]]) -> Float:
+    """(n, directions, bands) mean power of each tile, grey values squared."""
+    window = np.hanning(_TILE + 2)[1:-1]
+    window /= np.sqrt(np.mean(window**2)) * _TILE**0.5
     rows = np.fft.fftfreq(_TILE)[:, None]
     columns = np.fft.rfftfreq(_TILE)
-    band = np.digitize(np.hypot(rows, columns).ravel() * _TILE, _BAND_EDGES) - 1
-    direction = np.round(np.degrees(np.arctan2(rows, columns)).ravel() / (180 / _DIRECTIONS)) % _DIRECTIONS
-    means = np.empty((len(tiles), _DIRECTIONS, len(_BAND_EDGES) - 1), np.float32)
-    for index in np.ndindex(means.shape[1:]):
-        means[:, *index] = power[:, (direction == index[0]) & (band == index[1])].mean(axis=1)
-    return means, (_BAND_EDGES[:-1] + _BAND_EDGES[1:]) / (2 * _TILE)
+    direction = np.round(np.degrees(np.arctan2(rows, columns)) / (180 / _DIRECTIONS)) % _DIRECTIONS
+    band = np.digitize(np.hypot(rows, columns) * _TILE, _BAND_EDGES) - 1
+    bands = len(_BAND_EDGES) - 1
+    used = (band >= 0) & (band < bands)
+    member = (direction * bands + band)[used].astype(int)
+    count = np.bincount(member)
+    powers = []
+    for tile in tiles:
+        spectrum = np.fft.rfft2((tile - tile.mean()) * np.outer(window, window))[used]
+        powers.append(np.bincount(member, spectrum.real**2 + spectrum.imag**2) / count)
+    return np.reshape(powers, (len(tiles), _DIRECTIONS, bands))
 
 
 def _noise_of(power: Float, frequency: Float, brightness: Float) -> Float:
@@ -129,4 +134,5 @@ def _noise_of(power: Float, frequency: Float, brightness: Float) -> Float:
         lower, upper = (float((spectrum * frequency**2)[end].mean()) for end in ends)
         white = min(max((upper - lower) / growth, 0), float(spectrum[ends[1]].mean()))
         points.append((float(brightness[blankest].mean()), white))
-    return _MARGIN * np.interp(brightness, *zip(*sorted(points), strict=True))
+    light, noise = np.transpose(sorted(points))
+    return np.asarray(_MARGIN * np.interp(brightness, light, noise))

@@ -6,6 +6,7 @@ the pull of what the depth maps already know. This is multi-photo geometrically 
 Baltsavias, 1988): it uses all images at once, while the disparity maps saw two at a time.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -141,7 +142,7 @@ def refine_maps(
 
 def _trust(residual: float) -> float:
     """What images say of a depth that their rows agree on to so many pixels, against those of perfect poses."""
-    return _MATCH_SIGMA**2 / (_MATCH_SIGMA**2 + residual**2)
+    return _MATCH_SIGMA / math.hypot(_MATCH_SIGMA, residual)
 
 
 def _most_telling(

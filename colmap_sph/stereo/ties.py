@@ -28,7 +28,7 @@ MAX_TIES = 300
 MIN_TIES = 30
 """Fewer ties tell too little of a pair."""
 
-MAX_RESIDUAL = 0.35
+MAX_RESIDUAL = 0.45
 """Rows that disagree by more rectified pixels, root mean square, show windows that are too different to match."""
 # A pair keeps so much of its rows and columns, however imprecise its poses are.
 _LEAST = 0.25

@@ -2,34 +2,19 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
-import numpy.typing as npt
 
-from colmap_sph.errors import OptionError, OutputError
+from colmap_sph.errors import OptionError
+from colmap_sph.synthetic.capture import Capture, CaptureOptions, Progress, write_capture
 from colmap_sph.synthetic.light import Light, ShadowMap
-from colmap_sph.synthetic.model import (
-    SparsePoints,
-    build_reconstruction,
-    sample_sparse_points,
-    write_reconstruction,
-)
 from colmap_sph.synthetic.pairs import look_at, pinhole
 from colmap_sph.synthetic.primitives import FloatArray
 from colmap_sph.synthetic.rays import Camera
-from colmap_sph.synthetic.render import render
 from colmap_sph.synthetic.village import Village, build_village
-
-logger = logging.getLogger(__name__)
-
-# COLMAP's fusion takes a depth map's value at the integer (col, row), not at the pixel's centre.
-TRUTH_ORIGIN = 0.0
 
 _OBLIQUE_ANGLE = np.radians(45.0)
 # Name and horizontal viewing direction, as penta-camera blocks call them.
@@ -39,13 +24,9 @@ _RELIEF = 22.0
 
 
 @dataclass(frozen=True)
-class BlockOptions:
+class BlockOptions(CaptureOptions):
     """Size and shape of the demo block."""
 
-    width: int = 640
-    """Width of a picture in pixels."""
-    height: int = 480
-    """Height of a picture in pixels."""
     flying_height: float = 100.0
     """Height of the cameras above the mean ground in metres."""
     nadir_gsd: float = 0.13
@@ -66,24 +47,10 @@ class BlockOptions:
     """Number of buildings (fewer where there is no room)."""
     trees: int = 100
     """Number of trees (fewer where there is no room)."""
-    points: int = 5000
-    """Number of sparse points, each seen in three or more pictures."""
-    keypoint_noise: float = 0.3
-    """Standard deviation of the keypoints about the exact projections, pixels."""
-    image_noise: float = 1.5
-    """Standard deviation of the sensor noise, grey levels of 255."""
-    supersample: int = 2
-    """Rays per pixel in each direction."""
-    jpeg_quality: int = 95
-    """Quality of the JPEG pictures."""
-    seed: int = 1
-    """Seed of everything random: the same seed gives the same block."""
 
-    def check(self) -> None:
-        """Raise OptionError naming every value out of its bounds."""
-        bounds: Mapping[str, tuple[float, float]] = {
-            "width": (32, 8192),
-            "height": (32, 8192),
+    def bounds(self) -> Mapping[str, tuple[float, float]]:
+        """As `CaptureOptions.bounds`."""
+        return {
             "flying_height": (50.0, 1000.0),
             "nadir_gsd": (0.02, 1.0),
             "oblique_gsd": (0.02, 1.0),
@@ -94,72 +61,20 @@ class BlockOptions:
             "oblique_images": (0, 50),
             "buildings": (0, 200),
             "trees": (0, 500),
-            "points": (10, 1_000_000),
-            "keypoint_noise": (0.0, 10.0),
-            "image_noise": (0.0, 50.0),
-            "supersample": (1, 8),
-            "jpeg_quality": (1, 100),
-            "seed": (0, 2**32 - 1),
+            **super().bounds(),
         }
-        wrong = {
-            name: f"{name} = {getattr(self, name)} (allowed: {low} to {high})"
-            for name, (low, high) in bounds.items()
-            if not low <= getattr(self, name) <= high
-        }
-        if wrong:
-            raise OptionError("demo block options out of bounds: " + ", ".join(wrong.values()), *wrong)
 
 
 @dataclass(frozen=True)
-class DemoBlock:
-    """A block on disk and what is known about it.
+class DemoBlock(Capture):
+    """A block on disk and what is known about it; its GSD is that of the vertical pictures.
 
     Attributes
     ----------
-    root : Path
-        Holds `images/NAME.jpg`, `sparse/0` and `truth/NAME.npz`.
-    names : tuple of str
-        Image names, sorted.
-    cameras : tuple of Camera
-        One per image.
-    sparse : SparsePoints
-        Exact points and projections (the model's keypoints carry noise).
     village : Village
-    gsd : float
-        Ground sampling distance of the vertical pictures, metres.
     """
 
-    root: Path
-    names: tuple[str, ...]
-    cameras: tuple[Camera, ...]
-    sparse: SparsePoints
     village: Village
-    gsd: float
-
-    @property
-    def images_dir(self) -> Path:
-        """Folder of the pictures."""
-        return self.root / "images"
-
-    @property
-    def sparse_dir(self) -> Path:
-        """Folder of the COLMAP model."""
-        return self.root / "sparse" / "0"
-
-    @property
-    def truth_dir(self) -> Path:
-        """Folder of the exact depth and normals."""
-        return self.root / "truth"
-
-    def truth(self, name: str) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-        """Exact depth (H, W), 0 = none, and normals (H, W, 3) of an image at COLMAP's fusion origin."""
-        return read_truth(self.truth_dir / f"{name}.npz")
-
-
-def read_truth(path: Path) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
-    """Read the exact depth (H, W) and normals (H, W, 3) of one image from `truth/NAME.npz`."""
-    with np.load(path) as arrays:
-        return arrays["depth"], arrays["normals"].astype(np.float32)
 
 
 def demo_cameras(options: BlockOptions) -> dict[str, Camera]:
@@ -206,80 +121,12 @@ def _ground_corners(cameras: Mapping[str, Camera]) -> FloatArray:
     return np.concatenate(corners)
 
 
-def _write_view(
-    root: Path, name: str, camera: Camera, village: Village, light: Light, options: BlockOptions, number: int
-) -> npt.NDArray[np.uint8]:
-    """Render one picture and write it and its truth; returns the RGB picture."""
-    rendering = render(
-        village.surfaces,
-        camera.K,
-        camera.R,
-        camera.t,
-        camera.width,
-        camera.height,
-        origin=TRUTH_ORIGIN,
-        supersample=options.supersample,
-        light=light,
-        noise=options.image_noise,
-        seed=(options.seed, number),
-    )
-    path = root / "images" / name
-    quality = [cv2.IMWRITE_JPEG_QUALITY, options.jpeg_quality]
-    if not cv2.imwrite(str(path), np.ascontiguousarray(rendering.image[..., ::-1]), quality):
-        raise OutputError(f"cannot write {path}: check the disk space and the folder's permissions")
-    # Half precision keeps a unit vector to 0.03 degrees in half the space.
-    np.savez(
-        root / "truth" / f"{name}.npz",
-        depth=rendering.depth.astype(np.float32),
-        normals=rendering.normals.astype(np.float16),
-    )
-    return rendering.image
-
-
-def _write_views(
-    root: Path,
-    cameras: Mapping[str, Camera],
-    village: Village,
-    options: BlockOptions,
-    threads: int,
-    progress: Callable[[int, int], None] | None,
-) -> list[npt.NDArray[np.uint8]]:
-    """Render and write all pictures in a pool of threads; returns them in the order of the cameras."""
-    sun = Light().sun
-    shadows = ShadowMap.cast(village.surfaces, sun, _ground_corners(cameras), options.nadir_gsd)
-    light = Light(sun, shadows=shadows)
-    pictures = []
-    with ThreadPoolExecutor(threads) as pool:
-        jobs = [
-            pool.submit(_write_view, root, name, camera, village, light, options, number)
-            for number, (name, camera) in enumerate(cameras.items())
-        ]
-        try:
-            for done, job in enumerate(jobs, start=1):
-                pictures.append(job.result())
-                if progress is not None:
-                    progress(done, len(jobs))
-        except BaseException:
-            pool.shutdown(cancel_futures=True)
-            raise
-    return pictures
-
-
-def _point_colours(sparse: SparsePoints, pictures: list[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:
-    """RGB of every point in the last picture that shows it."""
-    colours = np.zeros((len(sparse.points), 3), dtype=np.uint8)
-    for picture, places, rows in zip(pictures, sparse.observations, sparse.point_indices, strict=True):
-        column, row = np.floor(places).astype(np.int64).T
-        colours[rows] = picture[row, column]
-    return colours
-
-
 def make_demo_block(
     output: Path,
     options: BlockOptions | None = None,
     *,
     threads: int = 1,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> DemoBlock:
     """Render the demo block and write it to disk.
 
@@ -309,25 +156,17 @@ def make_demo_block(
     if threads < 1:
         raise OptionError(f"threads = {threads} (allowed: 1 or more)")
     cameras = demo_cameras(options)
-    names = tuple(cameras)
-    try:
-        for folder in ("images", "truth"):
-            (output / folder).mkdir(parents=True, exist_ok=True)
-        village = build_village(options.nadir_gsd, options.buildings, options.trees, options.seed)
-        pictures = _write_views(output, cameras, village, options, threads, progress)
-    except OSError as error:
-        raise OutputError(f"cannot write the demo block to {output}: {error}") from error
-    rng = np.random.default_rng((options.seed, len(names)))
-    sparse = sample_sparse_points(village.surfaces, tuple(cameras.values()), options.points, rng)
-    model = build_reconstruction(
-        names,
-        tuple(cameras.values()),
-        sparse,
-        colours=_point_colours(sparse, pictures),
-        keypoint_noise=options.keypoint_noise,
-        rng=rng,
+    village = build_village(options.nadir_gsd, options.buildings, options.trees, options.seed)
+    sun = Light().sun
+    shadows = ShadowMap.cast(village.surfaces, sun, _ground_corners(cameras), options.nadir_gsd)
+    capture = write_capture(
+        output,
+        cameras,
+        village.surfaces,
+        Light(sun, shadows=shadows),
+        options,
+        gsd=options.nadir_gsd,
+        threads=threads,
+        progress=progress,
     )
-    block = DemoBlock(output, names, tuple(cameras.values()), sparse, village, options.nadir_gsd)
-    write_reconstruction(model, block.sparse_dir)
-    logger.info("demo block: %d pictures, %d points in %s", len(names), len(sparse.points), output)
-    return block
+    return DemoBlock(**vars(capture), village=village)

@@ -1,4 +1,4 @@
-"""Sun, sky and cast shadows; brightness does not depend on the viewer, so pictures stay comparable."""
+"""Sun, sky light, cast shadows, and highlights on request, the only part that depends on the viewer."""
 
 from __future__ import annotations
 
@@ -100,12 +100,18 @@ class Light:
         Share of the sky and of the sun at perpendicular incidence.
     shadows : ShadowMap, optional
         Shadows cast between surfaces; without it every face turned to the sun is lit.
+    specular : float
+        Brightness of the sun's mirror image on all surfaces, of 1; it moves with the viewer (Phong's model).
+    shininess : float
+        Exponent of the cosine between the mirrored ray and the sun: the larger, the smaller is the highlight.
     """
 
     sun: tuple[float, float, float] = (-0.45, -0.55, 0.85)
     ambient: float = 0.56
     direct: float = 0.66
     shadows: ShadowMap | None = None
+    specular: float = 0.0
+    shininess: float = 12.0
 
     def brightness(self, points: FloatArray, normals: FloatArray) -> Float32Array:
         """RGB factor (N, 3) at points (3, N) with outward unit normals (3, N)."""
@@ -118,3 +124,19 @@ class Light:
         warm = np.array([1.03, 1.00, 0.93], dtype=np.float32) * np.float32(self.direct)
         factor: Float32Array = sky + sunlight[:, None] * warm
         return factor
+
+    def highlight(self, points: FloatArray, normals: FloatArray, rays: FloatArray) -> Float32Array:
+        """White (N, 1) that the sun's mirror image adds.
+
+        Points, outward unit normals and viewing directions are (3, N).
+        """
+        towards = np.asarray(self.sun) / np.linalg.norm(self.sun)
+        viewing = rays / np.linalg.norm(rays, axis=0)
+        mirrored = viewing - 2.0 * np.sum(viewing * normals, axis=0) * normals
+        incidence = np.maximum(np.einsum("i,in->n", towards, normals), 0.0)
+        cosine = np.maximum(np.einsum("i,in->n", towards, mirrored), 0.0)
+        white: Float32Array = (self.specular * cosine**self.shininess * (incidence > 0)).astype(np.float32)
+        if self.shadows is not None:
+            white *= self.shadows.lit(points, incidence)
+        column: Float32Array = white[:, None]
+        return column

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -40,7 +40,11 @@ class SparsePoints:
 
 
 def _candidates(
-    surfaces: Sequence[Surface], cameras: Sequence[Camera], count: int, rng: np.random.Generator
+    surfaces: Sequence[Surface],
+    cameras: Sequence[Camera],
+    count: int,
+    rng: np.random.Generator,
+    blank: Collection[int],
 ) -> tuple[FloatArray, FloatArray]:
     """Points (N, 3) and world normals (N, 3) behind random places of every picture."""
     points = []
@@ -49,6 +53,8 @@ def _candidates(
         image = rng.uniform([0.0, 0.0], [camera.width, camera.height], (count, 2))
         hits = trace_points(surfaces, camera, image)
         for number in np.unique(hits.surface[hits.surface >= 0]):
+            if number in blank:
+                continue
             chosen = hits.surface == number
             place = camera.back_project(image[chosen], hits.distance[chosen])
             normal = surfaces[number].normals(place.T, hits.face[chosen]).T
@@ -75,16 +81,24 @@ def visible(
     (N,) bool ndarray
     """
     image, depth = camera.project(points)
-    seen: npt.NDArray[np.bool_] = (depth > 0) & np.all(
-        (image > _BORDER) & (image < np.array([camera.width, camera.height]) - _BORDER), axis=1
-    )
+    seen: npt.NDArray[np.bool_] = (depth > 0) & _inside(camera, image)
     towards = camera.centre - points
     cosine = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)
     seen &= cosine > np.cos(_MAX_INCIDENCE)
     places = np.flatnonzero(seen)
     nearest = trace_points(surfaces, camera, image[places]).distance
     seen[places] = np.abs(nearest - depth[places]) < _SAME_DEPTH * depth[places]
+    places = np.flatnonzero(seen)
+    seen[places] = _inside(camera, camera.observe(points[places]))
     return seen
+
+
+def _inside(camera: Camera, image: FloatArray) -> npt.NDArray[np.bool_]:
+    """Whether image coordinates (N, 2) lie in the picture, but for a border."""
+    inside: npt.NDArray[np.bool_] = np.all(
+        (image > _BORDER) & (image < np.array([camera.width, camera.height]) - _BORDER), axis=1
+    )
+    return inside
 
 
 def sample_sparse_points(
@@ -94,6 +108,8 @@ def sample_sparse_points(
     rng: np.random.Generator,
     *,
     min_track_length: int = 3,
+    blank: Collection[int] = (),
+    moving: Sequence[Sequence[Surface]] | None = None,
 ) -> SparsePoints:
     """Sample surface points that at least `min_track_length` cameras see.
 
@@ -105,18 +121,28 @@ def sample_sparse_points(
         Number of points wanted; fewer where cameras overlap little.
     rng : numpy.random.Generator
     min_track_length : int
+    blank : collection of int
+        Numbers of surfaces without texture: no point can be found on them.
+    moving : sequence of sequence of Surface, one per camera, optional
+        What else stands before each camera, and hides points.
 
     Returns
     -------
     SparsePoints
     """
-    points, normals = _candidates(surfaces, cameras, 2 * count // len(cameras) + 1, rng)
-    seen = np.stack([visible(surfaces, camera, points, normals) for camera in cameras])
+    points, normals = _candidates(surfaces, cameras, 2 * count // len(cameras) + 1, rng, blank)
+    others = moving or [()] * len(cameras)
+    seen = np.stack(
+        [
+            visible((*surfaces, *before), camera, points, normals)
+            for camera, before in zip(cameras, others, strict=True)
+        ]
+    )
     kept = rng.permutation(np.flatnonzero(seen.sum(axis=0) >= min_track_length))[:count]
     points = points[kept]
     seen = seen[:, kept]
     indices = tuple(np.flatnonzero(row) for row in seen)
-    observations = tuple(camera.project(points[rows])[0] for camera, rows in zip(cameras, indices, strict=True))
+    observations = tuple(camera.observe(points[rows]) for camera, rows in zip(cameras, indices, strict=True))
     return SparsePoints(points, observations, indices)
 
 

@@ -44,6 +44,10 @@ class Camera:
         """Camera centre (3,) in the world."""
         return -self.R.T @ self.t
 
+    def rays(self, x: FloatArray, y: FloatArray) -> Rays:
+        """Rays through the grid of image coordinates x (W,) and y (H,), pixels."""
+        return PinholeRays(self, x, y, grid=True)
+
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Image coordinates (N, 2) and z-depth (N,) of world points (N, 3)."""
         in_camera = points @ self.R.T + self.t
@@ -51,6 +55,10 @@ class Camera:
             homogeneous = in_camera @ self.K.T
             image = homogeneous[:, :2] / homogeneous[:, 2:]
         return image, in_camera[:, 2]
+
+    def observe(self, points: FloatArray) -> FloatArray:
+        """Image coordinates (N, 2) at which world points (N, 3) appear."""
+        return self.project(points)[0]
 
     def back_project(self, image: FloatArray, depth: FloatArray) -> FloatArray:
         """World points (N, 3) at image coordinates (N, 2) and z-depth (N,)."""
@@ -83,6 +91,19 @@ class Rays:
         """Index of the rays within a rectangle of those coordinates; None if there is none."""
         raise NotImplementedError
 
+    def depth(self, distance: FloatArray) -> FloatArray:
+        """z-depth (...) in the camera of the rays' points at parameters (...), infinite ones stay."""
+        return distance
+
+    def points(self, distance: FloatArray, places: npt.NDArray[np.int64]) -> FloatArray:
+        """World points (3, N) on the rays of flat indices `places`, at parameters (N,)."""
+        directions = self.directions.reshape(3, -1)[:, places]
+        if self.origins.size == 3:
+            return self.origins.reshape(3, 1) + distance * directions
+        origins = np.broadcast_to(self.origins, self.directions.shape).reshape(3, -1)[:, places]
+        points: FloatArray = origins + distance * directions
+        return points
+
     def windows(self, hulls: Sequence[FloatArray]) -> list[Index | None]:
         """Index of the rays that may meet the convex hull of each set of points (M, 3)."""
         if not hulls:
@@ -111,7 +132,8 @@ def _take(array: FloatArray, index: Index) -> FloatArray:
     return array if constant else array[(slice(None), *index)]
 
 
-def _grid_window(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray) -> Index | None:
+def grid_window(x: FloatArray, y: FloatArray, low: FloatArray, high: FloatArray) -> Index | None:
+    """Index of the part of a grid of ascending x and y that lies between two corners; None if nothing does."""
     left, right = np.searchsorted(x, [low[0], high[0]])
     top, bottom = np.searchsorted(y, [low[1], high[1]])
     return (slice(top, bottom), slice(left, right)) if left < right and top < bottom else None
@@ -147,7 +169,7 @@ class OrthographicRays(Rays):
         return points @ self.axes[:2].T, np.full(len(points), np.inf)
 
     def window(self, low: FloatArray, high: FloatArray) -> Index | None:
-        return _grid_window(self.x, self.y, low, high)
+        return grid_window(self.x, self.y, low, high)
 
 
 class PinholeRays(Rays):
@@ -182,7 +204,7 @@ class PinholeRays(Rays):
 
     def window(self, low: FloatArray, high: FloatArray) -> Index | None:
         if self.grid:
-            return _grid_window(self.x, self.y, low, high)
+            return grid_window(self.x, self.y, low, high)
         inside = (self.x >= low[0]) & (self.x <= high[0]) & (self.y >= low[1]) & (self.y <= high[1])
         places = np.flatnonzero(inside)
         return (places,) if places.size else None

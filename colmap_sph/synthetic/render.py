@@ -15,8 +15,10 @@ import numpy.typing as npt
 
 from colmap_sph.errors import OptionError
 from colmap_sph.synthetic.light import Light
+from colmap_sph.synthetic.photographs.optics import sensor_readings
+from colmap_sph.synthetic.photographs.sky import Sky
 from colmap_sph.synthetic.primitives import FloatArray, Surface
-from colmap_sph.synthetic.rays import Camera, Hits, PinholeRays, Rays, trace
+from colmap_sph.synthetic.rays import Camera, Hits, Rays, trace
 from colmap_sph.synthetic.texture import Float32Array
 
 # Rays traced at once: enough to make NumPy's overhead small, few enough for 150 MB.
@@ -54,19 +56,21 @@ def _groups(number: npt.NDArray[np.int16]) -> list[tuple[int, npt.NDArray[np.int
     return [(int(flat[part[0]]), part) for part in np.split(order, edges) if part.size and flat[part[0]] >= 0]
 
 
-def _band_colour(surfaces: Sequence[Surface], rays: Rays, light: Light) -> Float32Array:
+def _band_colour(surfaces: Sequence[Surface], rays: Rays, light: Light, sky: Sky | None) -> Float32Array:
     """Displayed RGB (..., 3) in [0, 1] along every ray."""
     hits = trace(surfaces, rays)
     colour = np.empty((hits.surface.size, 3), dtype=np.float32)
     colour[:] = _SKY
     directions = rays.directions.reshape(3, -1)
-    centre = rays.origins.reshape(3, 1)
+    if sky is not None:
+        nothing = hits.surface.ravel() < 0
+        colour[nothing] = sky.colour(directions[:, nothing])
     distance = hits.distance.ravel()
     face = hits.face.ravel()
     for number, places in _groups(hits.surface):
         surface = surfaces[number]
         faces = face[places]
-        points = centre + distance[places] * directions[:, places]
+        points = rays.points(distance[places], places)
         normals = surface.normals(points, faces)
         coordinates = surface.texture_coordinates(points, faces)
         shade = light.brightness(points, normals)
@@ -74,14 +78,38 @@ def _band_colour(surfaces: Sequence[Surface], rays: Rays, light: Light) -> Float
         for material in np.unique(used):
             chosen = slice(None) if len(surface.materials) == 1 else used == material
             shade[chosen] *= surface.materials[material].colour(coordinates[:, chosen])
+        if light.specular > 0:
+            shade += light.highlight(points, normals, directions[:, places])
         colour[places] = shade
     return np.clip(colour, 0.0, 1.0).reshape(*hits.surface.shape, 3)
 
 
-def _picture(
-    surfaces: Sequence[Surface], camera: Camera, supersample: int, light: Light
-) -> npt.NDArray[np.float32]:
-    """Displayed RGB (H, W, 3) in [0, 255], the mean of supersample x supersample rays per pixel."""
+def exact_picture(
+    surfaces: Sequence[Surface],
+    camera: Camera,
+    *,
+    supersample: int = 2,
+    light: Light | None = None,
+    sky: Sky | None = None,
+) -> Float32Array:
+    """What arrives at a sensor: every pixel the mean over its area.
+
+    Parameters
+    ----------
+    surfaces : sequence of Surface
+    camera : Camera
+    supersample : int
+        Rays per pixel in each direction.
+    light : Light, optional
+    sky : Sky, optional
+        What is seen where no surface is met; one colour without it.
+
+    Returns
+    -------
+    (H, W, 3) float32 ndarray
+        Displayed RGB in 0 ... 255.
+    """
+    light = light or Light()
     width, height = camera.width, camera.height
     x = (np.arange(width * supersample) + 0.5) / supersample
     band = max(_BAND_RAYS // (width * supersample**2), 1)
@@ -89,7 +117,7 @@ def _picture(
     for top in range(0, height, band):
         bottom = min(top + band, height)
         y = (np.arange(top * supersample, bottom * supersample) + 0.5) / supersample
-        colour = _band_colour(surfaces, PinholeRays(camera, x, y, grid=True), light)
+        colour = _band_colour(surfaces, camera.rays(x, y), light, sky)
         blocks = colour.reshape(bottom - top, supersample, width, supersample, 3)
         picture[top:bottom] = 255.0 * blocks.mean(axis=(1, 3))
     return picture
@@ -98,12 +126,11 @@ def _picture(
 def _normals_in_camera(surfaces: Sequence[Surface], camera: Camera, rays: Rays, hits: Hits) -> FloatArray:
     normals = np.zeros((3, hits.surface.size))
     directions = rays.directions.reshape(3, -1)
-    centre = rays.origins.reshape(3, 1)
     distance = hits.distance.ravel()
     face = hits.face.ravel()
     for number, places in _groups(hits.surface):
         towards = directions[:, places]
-        outward = surfaces[number].normals(centre + distance[places] * towards, face[places])
+        outward = surfaces[number].normals(rays.points(distance[places], places), face[places])
         outward = np.where(np.sum(outward * towards, axis=0) > 0, -outward, outward)
         normals[:, places] = np.einsum("ij,jn->in", camera.R, outward)
     return np.ascontiguousarray(normals.T).reshape(*hits.surface.shape, 3)
@@ -132,9 +159,9 @@ def exact_geometry(
     """
     x: FloatArray = np.arange(camera.width, dtype=np.float64) + origin
     y: FloatArray = np.arange(camera.height, dtype=np.float64) + origin
-    rays = PinholeRays(camera, x, y, grid=True)
+    rays = camera.rays(x, y)
     hits = trace(surfaces, rays)
-    depth = np.where(np.isfinite(hits.distance), hits.distance, 0.0)
+    depth = np.where(np.isfinite(hits.distance), rays.depth(hits.distance), 0.0)
     return depth, _normals_in_camera(surfaces, camera, rays, hits), hits.surface
 
 
@@ -190,10 +217,7 @@ def render(
         )
     K, R, t = (np.asarray(array, dtype=np.float64) for array in (K, R, t))
     camera = Camera(K, R, t, width, height)
-    picture = _picture(scene, camera, supersample, light or Light())
-    if noise > 0:
-        rng = np.random.default_rng(seed)
-        picture += np.float32(noise) * rng.standard_normal(picture.shape, dtype=np.float32)
-    image = np.clip(np.rint(picture), 0, 255).astype(np.uint8)
+    picture = exact_picture(scene, camera, supersample=supersample, light=light)
+    image = sensor_readings(picture, noise, 0.0, np.random.default_rng(seed))
     depth, normals, surface = exact_geometry(scene, camera, origin=origin)
     return Rendering(image, depth, normals, surface)

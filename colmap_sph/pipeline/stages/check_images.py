@@ -37,10 +37,9 @@ _MAX_BYTES = 1 << 30
 _SECONDS = 0.012
 _JPEG_BYTES = 12.0
 _OTHER_BYTES = 25.0
-# The same of measuring its detail: per megapixel to read it again, and for the measuring.
+# Seconds to measure its detail: per megapixel to read it again, and beside that.
 _READ_SECONDS = 0.01
 _DETAIL_SECONDS = 0.03
-_DETAIL_BYTES = 40e6
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,6 @@ class CheckStage(Stage[str, ImageFile]):
         memory = (_JPEG_BYTES if is_jpeg(image.path) else _OTHER_BYTES) * pixels
         if image.wants_detail:
             seconds += _READ_SECONDS * pixels / 1e6 + _DETAIL_SECONDS
-            memory += _DETAIL_BYTES
         return Cost(seconds, memory, 0.0)
 
     def skip(self, item: str, reason: str) -> None:

@@ -24,7 +24,7 @@ from colmap_sph.project.state.ownership import remove_array_files
 from colmap_sph.scene import View
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.rectification import rectify_pair
+from colmap_sph.stereo.rectification import rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
 from colmap_sph.stereo.ties import Ties, find_corners, find_ties, row_residual, tolerable_sampling
@@ -48,7 +48,8 @@ _MATCH_BYTES = 44.0
 # … while an image is read and rectified: per pixel of its own, and per left rectified pixel of both.
 _READ_BYTES = 11.0
 _RECTIFIED_BYTES = 10.0
-# Rectified pixels of a large pair per pixel of its images, with a margin for what arrays do not count.
+# Rectified pixels of a large pair per pixel of its images at a sampling of 1, with a margin for what arrays do not
+# count.
 _RECTIFIED_SHARE = 1.4
 # Scratch memory of a thread and bytes of a cache: more is no faster.
 _SCRATCH_BYTES = 256 << 20
@@ -216,7 +217,9 @@ class MatchStage(Stage[Pair, MatchTask]):
         """Scratch memory and caches take of what the largest pair leaves, but never starve."""
         views = self.context.scene.views
         largest = max(view.num_pixels for view in views)
-        spare = int(max(gate.spare(_RECTIFIED_SHARE * _MATCH_BYTES * largest), gate.free / 8))
+        finest = max(sampling_of(self._detail(view)) for view in views)
+        share = _RECTIFIED_SHARE * (finest * self.context.options.rectification.sampling) ** 2
+        spare = int(max(gate.spare(share * _MATCH_BYTES * largest), gate.free / 8))
         scratch = min(_SCRATCH_BYTES, spare // (3 * self.context.options.num_threads))
         filled = sum(view.num_pixels * grey_bytes(self.context.workspace.image_path(view.name)) for view in views)
         return Kept(scratch, min(_CACHE_BYTES, spare // 6), 2, filled)
