@@ -108,6 +108,7 @@ def test_help_of_run_explains_every_option(capsys: pytest.CaptureFixture[str]) -
     assert len(places) > 50
     for place in places:
         short = {"pairs.num_pairs": "num-pairs", "undistortion.max_image_size": "max-image-size"}
+        short |= {"polish.poses": "polish-poses", "polish.cameras": "polish-cameras"}
         name = f"--{short.get(place, place.replace('_', '-'))}"
         words_of_option = r"(\S+ ){3,}?"
         default = "" if place == "fusion.mask_path" else "Default: "
@@ -129,6 +130,13 @@ def test_every_text_of_the_help_is_a_sentence() -> None:
         (["--num-pairs", "3"], ["--pairs.num-pairs", "3"]),
         (["--num_pairs=3"], ["--pairs.num-pairs=3"]),
         (["--max-image-size", "-1"], ["--undistortion.max-image-size", "-1"]),
+        (["--polish-poses"], ["--polish.poses", "on"]),
+        (["--polish-poses", "always"], ["--polish.poses", "always"]),
+        (["--polish-poses=off", "--polish-cameras", "True"], ["--polish.poses=off", "--polish.cameras", "True"]),
+        (
+            ["--polish_poses", "--polish-cameras", "--threads", "2"],
+            ["--polish.poses", "on", "--polish.cameras", "True", "--threads", "2"],
+        ),
         (
             ["--sampling", "1.2", "--rectification=frame"],
             ["--rectification.sampling", "1.2", "--rectification.surface=frame"],

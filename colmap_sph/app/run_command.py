@@ -175,6 +175,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
         facts.append(("values", report.stretched))
     facts.append(("agreement", _agreement(report)))
     facts.append(("pairs", f"{report.pairs} matched ({report.pair_source})"))
+    if report.polishing:
+        facts.append(("poses", report.polishing))
     facts.append(("cloud", f"{report.points:,} points in {workspace.fused_path}"))
     if any(report.reused.values()):
         kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)

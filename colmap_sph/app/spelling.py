@@ -2,7 +2,12 @@
 
 from collections.abc import Sequence
 
-SHORT = {"undistortion.max_image_size": "--max-image-size", "pairs.num_pairs": "--num-pairs"}
+SHORT = {
+    "undistortion.max_image_size": "--max-image-size",
+    "pairs.num_pairs": "--num-pairs",
+    "polish.poses": "--polish-poses",
+    "polish.cameras": "--polish-cameras",
+}
 """Options of stages which everybody uses, by their place in the records."""
 
 EVERYDAY = (
@@ -20,6 +25,8 @@ EVERYDAY = (
 )
 """What `run --help` shows."""
 
+# What options mean that are typed without a value.
+_ALONE = {"--polish.poses": "on", "--polish.cameras": "True"}
 # Spellings of earlier versions, and what they are called now.
 _RENAMED = {
     "--min-triangulation-angle": "--pairs.min-triangulation-angle",
@@ -56,12 +63,15 @@ def in_full(arguments: Sequence[str]) -> list[str]:
     Short and earlier spellings are replaced, and a first argument that is no option is the model.
     """
     full = {flag: f"--{place.replace('_', '-')}" for place, flag in SHORT.items()} | _RENAMED
-    spelled = []
-    for argument in arguments:
+    spelled: list[str] = []
+    for argument in [*arguments, "--"]:
+        if spelled and spelled[-1] in _ALONE and argument.startswith("-"):
+            spelled.append(_ALONE[spelled[-1]])
         flag, equals, value = argument.partition("=")
         if flag.startswith("--"):
             flag = flag.replace("_", "-")
             argument = full.get(flag, flag) + equals + value
         spelled.append(argument)
+    spelled.pop()
     is_named = any(argument.partition("=")[0] == "--model" for argument in spelled)
     return ["--model", *spelled] if spelled and not spelled[0].startswith("-") and not is_named else spelled

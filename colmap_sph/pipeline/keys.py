@@ -20,6 +20,7 @@ _MAKERS = {
         "known images": "check_images",
         "undistorted": "undistort",
         "pair": "match",
+        "polish": "polish",
         "vote": "vote",
         "geometric": "confirm",
         "cloud": "fuse",
@@ -109,6 +110,18 @@ class Keys:
         masks = [self._mask(view.name) for view in (left, right)]
         cameras = [_camera(view) for view in (left, right)]
         return self._key("pair", images, masks, cameras, geometry, self._options.matching)
+
+    def polish(self, pairs: Sequence[tuple[str, str]], model_dir: Path) -> str:
+        """Of the polished model, from the pairs to match and the folder of the given model."""
+        names = sorted({name for pair in pairs for name in pair})
+        return self._key(
+            "polish",
+            self._programs["pair"],
+            [(name, self._image(name), self._mask(name)) for name in names],
+            pairs,
+            [] if self.fresh else [file_digest(path) for path in model_files(model_dir)],
+            (self._options.rectification, self._options.matching, self._options.polish),
+        )
 
     def vote(
         self, view: View, pair_keys: Sequence[str], stations: Sequence[int], residuals: Sequence[float]

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.control_groups import processors
 from colmap_sph.pipeline.memory import budget, parse_memory
+from colmap_sph.project.polishing import PolishOptions
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
@@ -36,6 +37,7 @@ class RunOptions:
     pairs: PairOptions = field(default_factory=PairOptions)
     rectification: RectificationOptions = field(default_factory=RectificationOptions)
     matching: MatchingOptions = field(default_factory=MatchingOptions)
+    polish: PolishOptions = field(default_factory=PolishOptions)
     vote: VoteOptions = field(default_factory=VoteOptions)
     confirm: ConfirmOptions = field(default_factory=ConfirmOptions)
     normals: NormalOptions = field(default_factory=NormalOptions)

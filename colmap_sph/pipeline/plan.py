@@ -16,6 +16,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions, num_cores
+from colmap_sph.pipeline.polishing import with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import (
     check_input,
@@ -27,6 +28,7 @@ from colmap_sph.pipeline.reconstruct import (
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
 from colmap_sph.project.files import free_space
+from colmap_sph.project.polishing.polished import starting_model
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import foreign_files, named
@@ -122,6 +124,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     check_input(project, options)
     survey = Survey()
     foreseen = None
+    given = None
     to_make: set[str] = set()
     if project.model is None:
         dense = open_workspace(project)
@@ -131,7 +134,9 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         undistorted = preparation.undistort(survey, preparation.check(survey))
         to_make = {name for name, result in undistorted.items() if result.made}
         foreseen = preparation.scene(undistorted)
-    scene = anchored(read_scene(dense.sparse_dir) if foreseen is None else foreseen)
+        given = preparation.given_model()
+    folder = dense.sparse_dir if project.model is None else starting_model(dense)
+    scene = anchored(read_scene(folder) if foreseen is None else foreseen)
     keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
     to_come = scene.index_of if foreseen is not None else to_make
     context = with_good_images(Context(dense, scene, options, keys), survey, to_come=to_come)
@@ -140,6 +145,8 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     foreign = foreign_files(context.places, overwrite=overwrite)
     if foreign:
         logger.warning("Would get another name, as this program did not make it: %s", named(foreign))
+    if given is not None and options.polish.is_wanted:
+        context = with_polished_poses(context, selection.unique_pairs(), survey, given)
     go_through_stages(context, selection.unique_pairs(), survey)
     stages = survey.stages
     pairs, _, maps, cloud = stages[-4:]

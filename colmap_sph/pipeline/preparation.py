@@ -17,11 +17,14 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts, ImagePlaces
+from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.undistort import UndistortStage
 from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.images.depth import common_ranges, describe_ranges
 from colmap_sph.project.masks import check_masks
+from colmap_sph.project.polishing.adjustment import reason_to_keep
+from colmap_sph.project.polishing.polished import is_users_model
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, has_model, image_names
 from colmap_sph.project.state.ownership import (
@@ -36,6 +39,7 @@ from colmap_sph.project.undistortion.marker import (
     adopt,
     check_made_from,
     check_ours,
+    has_given_model,
     is_model_changed,
     names_in_model,
     publish_model,
@@ -192,6 +196,16 @@ class Preparation:
             publish_model(self.workspace, self._marker, made, names)
         logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
 
+    def given_model(self) -> GivenModel:
+        """What polishing has to know of the model as it was given."""
+        originals = self._originals
+        return GivenModel(originals.model_dir, originals.image_dir, self._reason_to_keep_poses())
+
+    def _reason_to_keep_poses(self) -> str:
+        if self._found is not None and is_users_model(self.workspace):
+            return f"{self.workspace.sparse_dir} was changed since this program made it"
+        return reason_to_keep(self._originals.model, self._options.polish.poses)
+
     def scene(self, results: Mapping[str, Result]) -> Scene | None:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
         if not self._overwrite and self._is_model_there(sorted(results)):
@@ -210,7 +224,7 @@ class Preparation:
                 "%s was changed since this program made it; it is used as it is", self.workspace.sparse_dir
             )
             return True
-        return list(found.images) == list(names)
+        return list(found.images) == list(names) and has_given_model(self.workspace, found)
 
     def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
         """Undistort the model in a process of its own; return the folder where it is."""

@@ -21,6 +21,7 @@ from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.polishing import with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
@@ -28,6 +29,7 @@ from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, det
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
+from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.pipeline.workers import one_opencv_thread
@@ -35,6 +37,7 @@ from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
+from colmap_sph.project.polishing.polished import restore_given, starting_model
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import damaged_files, discard_results, named, results_of, take_places
@@ -134,6 +137,9 @@ def run_project(
             project, options, overwrite=overwrite, verify=verify, progress=progress, report=report
         )
         preparation.run(execute)
+        given = preparation.given_model()
+        if given.reason_to_keep or not options.polish.is_wanted:
+            restore_given(dense)
         return reconstruct(
             dense,
             options,
@@ -141,6 +147,7 @@ def run_project(
             progress=progress,
             report=report,
             database=project.database(),
+            given=given,
             overwrite=overwrite,
             verify=verify,
         )
@@ -153,6 +160,11 @@ def check_input(project: Project, options: RunOptions) -> None:
     check_links(Workspace(project.root), is_given=project.workspace is not None)
     if project.model is None and options.undistortion != UndistortionOptions():
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
+    if project.model is None and options.polish.is_wanted:
+        raise OptionError(
+            "--polish-poses replaces the model in the workspace, and the one in --workspace is yours; give the "
+            "sparse model that it was undistorted from as --model, or leave out --polish-poses."
+        )
 
 
 def reconstruct(
@@ -163,6 +175,7 @@ def reconstruct(
     report: RunReport | None = None,
     database: Path | None = None,
     expected: Collection[str] = (),
+    given: GivenModel | None = None,
     overwrite: bool = False,
     verify: bool = False,
 ) -> RunReport:
@@ -179,6 +192,8 @@ def reconstruct(
         COLMAP's database, whose verified matches serve where the model has no tracks.
     expected : collection of str
         Names of images that are reported as skipped where the workspace's model does not have them.
+    given : GivenModel, optional
+        The model that the workspace's was undistorted from: its poses may be polished where the options say so.
     overwrite : bool
         Files that this program did not make, where maps and cloud go, get another name; without it they are
         refused.
@@ -193,7 +208,8 @@ def reconstruct(
     report = report or RunReport()
     make_dir(workspace.state_dir)
     with one_opencv_thread():
-        scene = anchored(read_scene(workspace.sparse_dir))
+        is_polishing = given is not None and options.polish.is_wanted
+        scene = anchored(read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         for name in sorted({*expected} - scene.index_of.keys()):
             report.skipped_images.setdefault(name, "the model has no possible pose or calibration of it")
@@ -204,12 +220,13 @@ def reconstruct(
             selection = choose_pairs(workspace, scene, options, database)
             report.pair_source = selection.source
             progress.advance()
-        scene = wanted_scene(scene, selection)
-        judge_reprojection(report, scene)
-        context = replace(context, scene=scene)
+        context = replace(context, scene=wanted_scene(scene, selection))
         take_places(context.places, overwrite=overwrite)
         if verify:
             _verify(context)
+        if given is not None and is_polishing:
+            context = with_polished_poses(context, selection.unique_pairs(), execute, given)
+        judge_reprojection(report, context.scene)
         go_through_stages(context, selection.unique_pairs(), execute)
         judge_agreement(report)
     _write_report(context)

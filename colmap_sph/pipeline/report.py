@@ -51,6 +51,10 @@ class RunReport:
         Pairs matched.
     skipped_pairs : dict
         "left - right" → why the pair was not matched.
+    polishing : str
+        Where polished poses were asked for: what was done, or why not.
+    pose_movement : dict
+        Image name → how far polishing moved it, pixels (median over its sparse points); empty without.
     row_residual : float or None
         How far the rows of rectified pairs disagree, pixels: the median of all pairs; None where no pair
         has enough ties to tell.
@@ -92,6 +96,8 @@ class RunReport:
     pair_source: str = ""
     pairs: int = 0
     skipped_pairs: dict[str, str] = field(default_factory=dict)
+    polishing: str = ""
+    pose_movement: dict[str, float] = field(default_factory=dict)
     row_residual: float | None = None
     row_residuals: dict[str, float] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)

@@ -92,6 +92,21 @@ class Workspace:
         return self.state_dir / "undistortion.json"
 
     @property
+    def given_model_dir(self) -> Path:
+        """The model of the undistorted images as it was given, where `sparse` holds a polished one."""
+        return self.state_dir / "given"
+
+    @property
+    def refined_model_dir(self) -> Path:
+        """The original model with refined cameras, where that was asked for."""
+        return self.state_dir / "refined"
+
+    @property
+    def polishing_scratch_dir(self) -> Path:
+        """While poses are polished: the model so far."""
+        return self.state_dir / ".polishing.tmp"
+
+    @property
     def undistortion_scratch_dir(self) -> Path:
         """While images are undistorted: what there is of the workspace so far."""
         return self.state_dir / ".undistorting.tmp"

@@ -35,6 +35,28 @@ class Agreement:
 
 
 @dataclass(frozen=True)
+class Polish:
+    """What polishing the poses of a model came to.
+
+    Attributes
+    ----------
+    words : str
+        What was done or why not, in sentences.
+    is_polished : bool
+        Whether the workspace's model is the polished one.
+    movement : mapping of str to float
+        Image name → how far its points moved in it, pixels (median); empty where nothing moved.
+    advice : str
+        What would help more, in sentences.
+    """
+
+    words: str
+    is_polished: bool = False
+    movement: Mapping[str, float] = field(default_factory=dict)
+    advice: str = ""
+
+
+@dataclass(frozen=True)
 class Facts:
     """What is known of a result without reading it.
 
@@ -52,6 +74,8 @@ class Facts:
     row_residual : float or None
         Of a pair: how far rows of its rectified images disagree, radians (see `ties`); None where too few ties
         tell.
+    polish : Polish or None
+        Where the stage polishes poses.
     """
 
     coverage: float = 0.0
@@ -59,3 +83,4 @@ class Facts:
     points: int = 0
     unread: Mapping[str, str] = field(default_factory=dict)
     row_residual: float | None = None
+    polish: Polish | None = None

@@ -46,6 +46,10 @@ class Marker:
         Sorted names of the images in the model of the workspace; empty until that is complete.
     files : dict
         Digest of each file of the workspace's model as it was written, by its name.
+    given : dict
+        Where that is a polished model: the same of the one it was made from, which is kept.
+    polish : dict
+        The key under which the model was polished last, and the outcome; see `polishing.polished`.
     version : int
         Of the program's marker: what version 1 lists is other things.
     has_masks : bool
@@ -56,6 +60,8 @@ class Marker:
     options: dict[str, Any]
     images: tuple[str, ...] = ()
     files: dict[str, str] = field(default_factory=dict)
+    given: dict[str, str] = field(default_factory=dict)
+    polish: dict[str, Any] = field(default_factory=dict)
     version: int = _VERSION
     has_masks: bool = False
 
@@ -169,7 +175,9 @@ def adopt(workspace: Workspace, marker: Marker) -> Marker:
     for path in (*(workspace.root / name for name in _SCRIPTS), _old_scratch(workspace)):
         remove(path)
     names = tuple(names_in_model(workspace))
-    marker = replace(marker, images=names, files=_digests(workspace.sparse_dir), version=_VERSION, has_masks=False)
+    marker = replace(
+        marker, images=names, files=model_digests(workspace.sparse_dir), version=_VERSION, has_masks=False
+    )
     write_marker(workspace, marker)
     return marker
 
@@ -183,12 +191,12 @@ def names_in_model(workspace: Workspace) -> list[str]:
 
 def is_model_changed(workspace: Workspace, marker: Marker) -> bool:
     """Whether the workspace has model files which are not as this program wrote them."""
-    return marker.is_finished and not _digests(workspace.sparse_dir).items() <= marker.files.items()
+    return marker.is_finished and not model_digests(workspace.sparse_dir).items() <= marker.files.items()
 
 
 def set_model_aside(workspace: Workspace, marker: Marker) -> None:
     """Give model files that are not as this program wrote them other names."""
-    for name, digest in _digests(workspace.sparse_dir).items():
+    for name, digest in model_digests(workspace.sparse_dir).items():
         if marker.is_finished and marker.files.get(name) != digest:
             path = workspace.sparse_dir / name
             logger.warning("%s is not what this program wrote there; it is now %s", path, set_aside(path).name)
@@ -196,7 +204,7 @@ def set_model_aside(workspace: Workspace, marker: Marker) -> None:
 
 def remove_model(workspace: Workspace) -> None:
     """Remove the model, which is this program's, and the list of pairs unless the user wrote it."""
-    for path in _model_files(workspace.sparse_dir):
+    for path in (*_model_files(workspace.sparse_dir), *_model_files(workspace.given_model_dir)):
         remove(path)
     if _is_default_pair_list(workspace.patch_match_cfg_path):
         remove(workspace.patch_match_cfg_path)
@@ -217,8 +225,8 @@ def publish_model(workspace: Workspace, marker: Marker, made: Path, names: Seque
     names : sequence of str
         Sorted names of its images.
     """
-    write_marker(workspace, replace(marker, images=(), files={}))
-    files = _digests(made)
+    write_marker(workspace, replace(marker, images=(), files={}, given={}, polish={}))
+    files = model_digests(made)
     make_dir(workspace.sparse_dir)
     make_dir(workspace.stereo_dir)
     for path in _model_files(workspace.sparse_dir):
@@ -249,12 +257,17 @@ def _is_default_pair_list(path: Path) -> bool:
     return all(source == _SOURCES for source in sources.values())
 
 
+def has_given_model(workspace: Workspace, marker: Marker) -> bool:
+    """Whether the model from which the workspace's was polished is there; so it is without any polishing."""
+    return not marker.given or model_digests(workspace.given_model_dir) == marker.given
+
+
 def _model_files(folder: Path) -> list[Path]:
     paths = (folder / f"{stem}{end}" for stem in (*MODEL_FILES, *RIG_FILES) for end in (".bin", ".txt"))
     return [path for path in paths if path.is_file()]
 
 
-def _digests(folder: Path) -> dict[str, str]:
+def model_digests(folder: Path) -> dict[str, str]:
     """Digests of the model's files in a folder, by name."""
     digests = {}
     for path in _model_files(folder):

@@ -1,0 +1,240 @@
+"""Between matching and matching again: the ties of all pairs → the sparse model with better poses, if they are.
+
+What is accepted is decided by ties that had no part in the adjustment, and by the model's own tracks.
+"""
+
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import msgspec
+import numpy as np
+
+from colmap_sph.errors import InputError
+from colmap_sph.pipeline.stages.facts import Facts, Polish
+from colmap_sph.pipeline.stages.pair_files import read_pair, read_ties
+from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
+from colmap_sph.project.files import scratch_folder
+from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
+from colmap_sph.project.polishing.cameras import bends, refined_cameras, straightened
+from colmap_sph.project.polishing.options import PolishOptions
+from colmap_sph.project.polishing.polished import (
+    keep_given,
+    known_outcome,
+    publish_polished,
+    starting_model,
+    write_model,
+)
+from colmap_sph.project.scene_reader import scene_of_model
+from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene
+from colmap_sph.stereo.partners.pairing import Pair
+from colmap_sph.stereo.poses.quality import Judgement, common_bends, judged, movements, refusal, sound_tracks
+from colmap_sph.stereo.poses.tracks import (
+    ImageTies,
+    Tracks,
+    image_coordinates,
+    track_errors,
+    tracks_of_ties,
+    triangulated,
+)
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+
+# Processor seconds, and bytes in use, per image of the model.
+_SECONDS = 0.4
+_BYTES = 4e6
+
+
+@dataclass(frozen=True)
+class GivenModel:
+    """The model that a run was given, of the original images.
+
+    Attributes
+    ----------
+    model_dir, image_dir : Path
+    reason_to_keep : str
+        Why its poses must not be polished, as the end of a sentence; empty where they may be.
+    """
+
+    model_dir: Path
+    image_dir: Path
+    reason_to_keep: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class PolishTask:
+    """The model to polish, the disparity maps whose ties tell how, and where the result goes."""
+
+    workspace: Workspace
+    given: GivenModel
+    pairs: Mapping[Pair, Path]
+    options: PolishOptions
+    undistortion: UndistortionOptions
+    key: str
+
+
+def polish_poses(task: PolishTask) -> Facts:
+    """Polish the poses of a workspace's model; puts the polished one into its place where it is better."""
+    workspace = task.workspace
+    folder = starting_model(workspace)
+    given = load_model(folder)
+    scene = scene_of_model(given, folder)
+    tracks = tracks_of_ties(_ties(task.pairs, scene), scene.index_of)
+    tracks = sound_tracks(tracks, scene)
+    reason = refusal(tracks, scene, task.options.least_residual)
+    if reason:
+        return _kept(task, reason)
+    is_held_out = np.arange(len(tracks)) % HELD_OUT == 0
+    used = tracks.only(~is_held_out)
+    adjusted = adjusted_model(given, _observations(used, scene))
+    if adjusted is None:
+        return _kept(task, "their adjustment does not converge")
+    after = scene_of_model(adjusted, folder)
+    held_out = tracks.only(is_held_out)
+    judgement = judged(held_out, scene, after)
+    advice = _advice(task, tracks, scene, judgement)
+    reason = judgement.refusal(task.options.least_gain)
+    if reason:
+        return _kept(task, reason, advice)
+    moved = movements(scene, after)
+    polish = Polish(_success(judgement, moved), is_polished=True, movement=moved, advice=advice)
+    with scratch_folder(workspace.polishing_scratch_dir):
+        made = workspace.polishing_scratch_dir / "polished"
+        write_model(adjusted, made)
+        publish_polished(workspace, made, task.key, asdict(polish))
+    return Facts(polish=polish)
+
+
+_BENT_SHARE = 0.05
+HELD_OUT = 5
+"""Of so many tracks one has no part in the adjustment."""
+
+
+def _ties(pairs: Mapping[Pair, Path], scene: Scene) -> dict[Pair, ImageTies]:
+    """Ties of all pairs, in image coordinates; a pair whose file cannot be read has none."""
+    ties = {}
+    for pair, path in pairs.items():
+        with suppress(InputError):
+            geometry = read_pair(path).geometry
+            found = read_ties(path)
+            left, right = (scene.view(name) for name in pair)
+            ties[pair] = ImageTies(
+                image_coordinates(left, geometry, "left", found.left),
+                image_coordinates(right, geometry, "right", found.right),
+            )
+    return ties
+
+
+def _observations(tracks: Tracks, scene: Scene) -> Observations:
+    points = triangulated(tracks, scene.views) + scene.origin
+    names = [view.name for view in scene.views]
+    return Observations(names, tracks.track, tracks.view, tracks.pixels, points)
+
+
+def _kept(task: PolishTask, reason: str, advice: str = "") -> Facts:
+    polish = Polish(f"The poses are kept as given: {reason}.", advice=advice)
+    keep_given(task.workspace, task.key, asdict(polish))
+    return Facts(polish=polish)
+
+
+def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
+    """What to do about images that are bent alike; where it was asked for, that it was done."""
+    bent = [bend for bend in common_bends(tracks, scene) if bend.share > _BENT_SHARE]
+    if task.options.cameras:
+        return _with_refined_cameras(task, tracks, scene, judgement)
+    return " ".join(
+        f"The {len(bend.views)} images with the camera of {scene.views[bend.views[0]].name} are bent alike, by "
+        f"{bend.pixels:.2f} px beyond what poses can take up: its lens model is imprecise; try --polish-cameras."
+        for bend in bent
+    )
+
+
+def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
+    """Refine the cameras of the original model, and leave it in the workspace where it is better."""
+    is_held_out = np.arange(len(tracks)) % HELD_OUT == 0
+    given = load_model(task.given.model_dir)
+    observations = _observations(tracks.only(~is_held_out), scene)
+    refined = refined_cameras(given, observations, task.undistortion.for_colmap())
+    error = np.inf
+    if refined is not None:
+        held_out = tracks.only(is_held_out)
+        options = task.undistortion.for_colmap()
+        calibrations = [view.K for view in scene.views]
+        poses, pixels = straightened(given, refined, _observations(held_out, scene), calibrations, options)
+        views = [replace(view, R=pose[:, :3], t=pose[:, 3]) for view, pose in zip(scene.views, poses, strict=True)]
+        moved = Tracks(held_out.track, held_out.view, pixels)
+        error = float(np.nanmedian(track_errors(moved, triangulated(moved, views), views)))
+    before = min(judgement.before, judgement.after)
+    if refined is None or error > (1 - task.options.least_gain) * before:
+        return f"The cameras are kept as given: refined ones are not clearly better ({error:.2f} px)."
+    target = task.workspace.refined_model_dir
+    write_model(refined, target)
+    bent = ", ".join(f"camera {number} by {pixels:.2f} px" for number, pixels in bends(given, refined).items())
+    return (
+        f"Cameras were refined ({bent}): ties that had no part in it fit to {error:.2f} px, before "
+        f"{before:.2f} px. "
+        f"Use them in another run: colmap_sph run --model {target} --images {task.given.image_dir} --output "
+        f"{task.workspace.root.with_name(task.workspace.root.name + '_refined')}"
+    )
+
+
+def _success(judgement: Judgement, moved: Mapping[str, float]) -> str:
+    farthest = max(moved, key=lambda name: moved[name])
+    return (
+        f"The poses were polished: images moved by {np.median(list(moved.values())):.2f} px (median) to "
+        f"{moved[farthest]:.2f} px ({farthest}). {judgement.words}"
+    )
+
+
+class PolishStage(Stage[str, PolishTask]):
+    """Polishes the poses of the scene's model; its one item is the model.
+
+    Parameters
+    ----------
+    context : Context
+        Of the given model.
+    given : GivenModel
+    pairs : sequence of (str, str)
+        Pairs of image names that were to be matched.
+    matched : collection of (str, str)
+        Those of them that were: their ties tell.
+    """
+
+    name = "polish poses"
+    whole = True
+    make = staticmethod(polish_poses)
+
+    def __init__(
+        self, context: "Context", given: GivenModel, pairs: Sequence[Pair], matched: Collection[Pair] = ()
+    ) -> None:
+        super().__init__(context, ["the sparse model"])
+        self._given = given
+        self._pairs = pairs
+        self._matched = matched
+
+    def job(self, item: str) -> Job[PolishTask]:
+        """See `Stage.job`."""
+        context = self.context
+        key = context.keys.polish(self._pairs, starting_model(context.workspace))
+        paths = {pair: context.pair_path(*pair) for pair in self._matched}
+        task = PolishTask(
+            context.workspace, self._given, paths, context.options.polish, context.options.undistortion, key
+        )
+        number = len(context.scene.views)
+        cost = Cost(_SECONDS * number, _BYTES * number, 0.0)
+        return Job(key, self._known(key), cost, task)
+
+    def _known(self, key: str) -> Facts | None:
+        outcome = None if self.context.keys.fresh else known_outcome(self.context.workspace, key)
+        if outcome is None:
+            return None
+        try:
+            return Facts(polish=msgspec.convert(outcome, Polish))
+        except msgspec.ValidationError:
+            return None

@@ -1,0 +1,1 @@
+"""Matched pairs → how good the poses are, and what better ones need."""
