@@ -24,8 +24,8 @@ from colmap_sph.project.state import array_file
 from colmap_sph.project.state.array_file import Head, read_head, write_arrays
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.poses.ties import MAX_TIES
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair
-from colmap_sph.stereo.ties import MAX_TIES
 
 HEIGHT, WIDTH = 6, 9
 

@@ -162,11 +162,11 @@ def test_stages_one_by_one(project: Path) -> None:
     scene = anchored(read_scene(workspace.sparse_dir))
     selection = select_pairs(scene, FEW_PAIRS.pairs)
     context = with_good_images(Context(workspace, scene, FEW_PAIRS, Keys(workspace, FEW_PAIRS)), execute)
-    pair_keys = keys_of(execute(MatchStage(context, selection.unique_pairs())))
-    assert list(pair_keys) == selection.unique_pairs()
-    votes = execute(VoteStage(context, pair_keys))
-    maps = execute(ConfirmStage(context, pair_keys, votes))
-    execute(fuse_stage(context, pair_keys, maps))
+    matched = execute(MatchStage(context, selection.unique_pairs()))
+    assert list(matched) == selection.unique_pairs()
+    votes = execute(VoteStage(context, matched))
+    maps = execute(ConfirmStage(context, matched, votes))
+    execute(fuse_stage(context, keys_of(matched), maps))
     report = context.report
     assert results(project / "stages") == results(project / "whole")
     assert report.coverage == whole.coverage

@@ -81,10 +81,10 @@ def test_another_process_makes_the_same(project: Path, tmp_path: Path) -> None:
     context.workspace.create_stereo_dirs(NAMES)
     pairs = select_pairs(context.scene, OPTIONS.pairs).unique_pairs()
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-        pair_keys = keys_of(make_elsewhere(MatchStage(context, pairs), pool))
-        votes = make_elsewhere(VoteStage(context, pair_keys), pool)
-        maps = make_elsewhere(ConfirmStage(context, pair_keys, votes), pool)
-        make_elsewhere(fuse_stage(context, pair_keys, maps), pool)
+        matched = make_elsewhere(MatchStage(context, pairs), pool)
+        votes = make_elsewhere(VoteStage(context, matched), pool)
+        maps = make_elsewhere(ConfirmStage(context, matched, votes), pool)
+        make_elsewhere(fuse_stage(context, keys_of(matched), maps), pool)
     assert made(tmp_path / "dense") == made(project / "dense")
     assert len(made(project / "dense")) == 4 * len(NAMES) + 2
     # And a run that finds these results takes them for its own.
@@ -96,10 +96,10 @@ def finished_stages(project: Path) -> list[Stage[Any, Any]]:
     context = context_of(project, project / "dense")
     pairs = select_pairs(context.scene, OPTIONS.pairs).unique_pairs()
     stages: list[Stage[Any, Any]] = [MatchStage(context, pairs)]
-    pair_keys = keys_of(execute(stages[-1]))
-    stages.append(VoteStage(context, pair_keys))
-    stages.append(ConfirmStage(context, pair_keys, execute(stages[-1])))
-    stages.append(fuse_stage(context, pair_keys, execute(stages[-1])))
+    matched = execute(stages[-1])
+    stages.append(VoteStage(context, matched))
+    stages.append(ConfirmStage(context, matched, execute(stages[-1])))
+    stages.append(fuse_stage(context, keys_of(matched), execute(stages[-1])))
     return stages
 
 

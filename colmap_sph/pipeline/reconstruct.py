@@ -48,7 +48,6 @@ from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
 from colmap_sph.stereo.rectification import sampling_of
-from colmap_sph.stereo.ties import filled_residuals
 
 logger = logging.getLogger(__name__)
 
@@ -270,13 +269,11 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
     """
     check_numbers(context, pairs)
     matched = executor(MatchStage(context, pairs))
-    pair_keys = keys_of(matched)
     measured = {pair: result.facts.row_residual for pair, result in matched.items()}
     judge_rows(context.report, context.scene, measured)
-    residuals = dict(zip(measured, filled_residuals(list(measured.values())), strict=True))
-    votes = executor(VoteStage(context, pair_keys, residuals))
-    maps = executor(ConfirmStage(context, residuals, votes))
-    executor(fuse_stage(context, pair_keys, maps))
+    votes = executor(VoteStage(context, matched))
+    maps = executor(ConfirmStage(context, matched, votes))
+    executor(fuse_stage(context, keys_of(matched), maps))
 
 
 def with_good_images(

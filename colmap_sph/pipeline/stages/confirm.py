@@ -14,7 +14,7 @@ from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate
-from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of, residuals_of
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import read_whole_grey
 from colmap_sph.project.masks import read_mask
@@ -115,12 +115,12 @@ class ConfirmStage(Stage[str, ConfirmTask]):
     name = "confirm depth"
     make = staticmethod(make_geometric_maps)
 
-    def __init__(self, context: "Context", residuals: Mapping[Pair, float], votes: Mapping[str, Result]) -> None:
+    def __init__(self, context: "Context", matched: Mapping[Pair, Result], votes: Mapping[str, Result]) -> None:
         super().__init__(context, [view.name for view in context.scene.views if view.name in votes])
         self._vote_keys = keys_of(votes)
         self._voted = {name: result.facts.coverage for name, result in votes.items()}
-        self._residuals = residuals
-        self._all_partners = partners_of(residuals)
+        self._residuals = residuals_of(matched)
+        self._all_partners = partners_of(matched)
         self._tracks = context.sparse_tracks  # found once, and not by every worker at a time
 
     def job(self, item: str) -> Job[ConfirmTask]:

@@ -25,10 +25,10 @@ from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair
+from colmap_sph.stereo.poses.ties import Ties, find_corners, find_ties, row_residual, tolerable_sampling
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
-from colmap_sph.stereo.ties import Ties, find_corners, find_ties, row_residual, tolerable_sampling
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context

@@ -16,8 +16,8 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.state.array_file import ArrayType, Head, read_arrays, read_head, write_arrays
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.poses.ties import MAX_TIES, Ties, row_residual
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Surface
-from colmap_sph.stereo.ties import MAX_TIES, Ties, row_residual
 
 _PAIR = "pair"
 _ESTIMATE = "estimate"

@@ -15,7 +15,7 @@ from colmap_sph.pipeline.stages.pair_files import (
     read_pair,
     write_estimate,
 )
-from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of, residuals_of
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View
@@ -79,11 +79,11 @@ class VoteStage(Stage[str, VoteTask]):
     name = "vote on depth"
     make = staticmethod(make_photometric_maps)
 
-    def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], residuals: Mapping[Pair, float]) -> None:
+    def __init__(self, context: "Context", matched: Mapping[Pair, Result]) -> None:
         super().__init__(context, [view.name for view in context.scene.views])
-        self._pair_keys = pair_keys
-        self._residuals = residuals
-        self._partners = partners_of(pair_keys)
+        self._pair_keys = keys_of(matched)
+        self._residuals = residuals_of(matched)
+        self._partners = partners_of(matched)
 
     def job(self, item: str) -> Job[VoteTask]:
         """See `Stage.job`."""
