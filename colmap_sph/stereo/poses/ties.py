@@ -226,12 +226,12 @@ def _on_surfaces(places: Float, disparity: NDArray[np.float32]) -> tuple[Float, 
 
 
 def _around(places: Float, radius: int, slopes: Float | None = None) -> tuple[Float, Float]:
-    """(n, h, w) columns and rows of the windows around places, with sloping columns where these are given."""
+    """(n, h, w) columns and (n, h, 1) rows of windows around places, with sloping columns if these are given."""
     offsets = np.arange(-radius, radius + 1, dtype=float)
     i, j = offsets[None, None, :], offsets[None, :, None]
-    along = i if slopes is None else slopes[:, 0, None, None] * i + slopes[:, 1, None, None] * j
+    along = i + 0 * j if slopes is None else slopes[:, 0, None, None] * i + slopes[:, 1, None, None] * j
     columns = places[:, 0, None, None] + along
-    return np.broadcast_arrays(columns, places[:, 1, None, None] + j)  # type: ignore[return-value]
+    return columns, places[:, 1, None, None] + j
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,21 +309,22 @@ def _windows(
     side: Side,
     places: tuple[Float, Float],
 ) -> NDArray[np.float32]:
-    """Grey values at (n, h, w) rectified columns and rows, straight from the image; its border is repeated."""
+    """Grey values at (n, h, w) columns and (n, h, 1) rows, straight from the image, whose border is repeated."""
     view, image = photo
     columns, rows = places
     along = ((columns + geometry.column_origin(side)) / geometry.columns_per_radian).astype(np.float32)
     across = ((rows + geometry.row_origin) / geometry.rows_per_radian).astype(np.float32)
+    # Rows are the same all along a window: most of a ray is known by them, see `resampling`.
     if geometry.surface == "spherical":
-        cosine = np.cos(along)
-        ray = np.stack(np.broadcast_arrays(np.sin(along), cosine * np.sin(across), cosine * np.cos(across)))
+        sine, cosine, row_ray = np.sin(along), np.cos(along), (np.sin(across), np.cos(across))
     else:
-        ray = np.stack(np.broadcast_arrays(along, across, np.float32(1)))
-    x, y, z = np.tensordot(pixel_from_rectified_ray(view, geometry).astype(np.float32), ray, 1)
+        sine, cosine, row_ray = along, np.ones_like(along), (across, np.ones_like(across))
+    camera = pixel_from_rectified_ray(view, geometry).astype(np.float32)
+    x, y, z = (a * sine + (b * row_ray[0] + c * row_ray[1]) * cosine for a, b, c in camera)
     with np.errstate(divide="ignore", invalid="ignore"):
         # COLMAP counts from the pixel's corner, cv2.remap from its centre.
         maps = [np.where(z > 0, part / z, -1) - np.float32(0.5) for part in (x, y)]
-    columns_there, rows_there = (part.reshape(-1, part.shape[-1]).astype(np.float32) for part in maps)
+    columns_there, rows_there = (part.reshape(-1, part.shape[-1]) for part in maps)
     values = cv2.remap(image, columns_there, rows_there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float32).reshape(maps[0].shape)
 
