@@ -58,8 +58,9 @@ class ConfirmOptions:
             raise OptionError(f"min_surface must lie in 0..1, not {self.min_surface}.", "min_surface")
 
 
-# Points may project back farther away by so many row residuals.
+# Points may project back farther away by so many row residuals, of so many pixels at most: what is more is wrong.
 _RESIDUALS = 2.0
+_MOST_RESIDUAL = 1.5
 # Slope of the steepest surface that is looked for around a pixel, as depth over width.
 _STEEPEST = 4.0
 
@@ -152,7 +153,7 @@ def _compare(
         partner_estimate.support,
         pixel_transfer(view, partner),
         pixel_transfer(partner, view),
-        options.max_reprojection_error + _RESIDUALS * residual * float(view.K[0, 0]),
+        options.max_reprojection_error + _RESIDUALS * min(residual * float(view.K[0, 0]), _MOST_RESIDUAL),
         options.tolerance,
         options.min_contradicting_support,
         *sums,

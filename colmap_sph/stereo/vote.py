@@ -19,6 +19,8 @@ from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, rectified_ray_from_pixel
 
+# A pair whose rows disagree by more rectified pixels is wrong rather than imprecise, and agrees with nothing more.
+_MOST_RESIDUAL = 1.0
 # Candidates of all pairs are voted on in bands of rows of about this size.
 _BAND_BYTES = 8 << 20
 
@@ -98,7 +100,7 @@ def depth_candidates(
         (geometry.column_origin(side), geometry.row_origin),
         geometry.disparity_origin,
         geometry.baseline,
-        math.hypot(options.disparity_sigma, residual * geometry.columns_per_radian),
+        math.hypot(options.disparity_sigma, min(residual * geometry.columns_per_radian, _MOST_RESIDUAL)),
         options.max_disparity_step,
         geometry.surface == "spherical",
         side == "left",
