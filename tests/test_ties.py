@@ -99,6 +99,7 @@ def test_no_texture_no_ties(matched):
     (left, right), images, geometry, disparity, _ = matched
     flat = np.full_like(images[0], 128)
     assert len(find_ties((left, flat), (right, flat), geometry, disparity, find_corners(flat))) == 0
+    assert len(find_ties((left, images[0]), (right, images[1]), geometry, disparity, np.empty((0, 2)))) == 0
     nothing = np.full_like(disparity, np.nan)
     assert len(find_ties((left, images[0]), (right, images[1]), geometry, nothing, find_corners(images[0]))) == 0
 
