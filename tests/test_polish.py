@@ -5,10 +5,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
-from projects import FOUR_NAMES, render_four_images
+from projects import FOUR_NAMES, read_picture, render_four_images
 
 import colmap_sph
 from colmap_sph.errors import OptionError
@@ -155,6 +156,21 @@ def test_a_run_that_was_ended_while_the_model_was_exchanged_goes_on(project: Pat
     (workspace.sparse_dir / "points3D.bin").unlink()
     assert "The poses were polished" in run(project).polishing
     assert models(project) == before
+
+
+def test_a_changed_image_polishes_the_given_model_again(project: Path) -> None:
+    """Not the polished one, in whose place the new one comes."""
+    given = (project / "dense/colmap_sph/given/images.bin").read_bytes()
+    path = project / "images" / FOUR_NAMES[0]
+    darker = cv2.convertScaleAbs(read_picture(path), alpha=0.9)
+    path.write_bytes(cv2.imencode(".jpg", darker, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+    plan = make_plan(Project(project / "sparse/0"), ON)
+    report = run(project)
+    assert "The poses were polished" in report.polishing
+    assert made(report) == {"undistort": 1} | {stage.name: stage.total for stage in plan.stages[3:]}
+    assert misses(project / "dense/sparse", project / "true") < 0.12
+    assert (project / "dense/colmap_sph/given/images.bin").read_bytes() == given
+    assert made(run(project)) == {}
 
 
 def test_a_model_that_the_user_changed_is_used_as_it_is(project: Path) -> None:
