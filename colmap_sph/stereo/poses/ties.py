@@ -210,7 +210,7 @@ def _on_surfaces(places: Float, disparity: NDArray[np.float32]) -> tuple[Float, 
     steps = np.arange(-_SURFACE_RADIUS, _SURFACE_RADIUS + 1)
     window = disparity[middle[:, 1, None, None] + steps[:, None], middle[:, 0, None, None] + steps].astype(float)
     column, row = (part.ravel() for part in np.meshgrid(steps, steps))
-    window = window.reshape(len(window), -1)
+    window = window.reshape(-1, len(column))  # there may be no window
     there = np.isfinite(window)
     found = there.mean(axis=1) >= _LEAST_FOUND
     places, middle, window, there = (part[found] for part in (places, middle, window, there))
