@@ -246,6 +246,16 @@ def test_poses_are_kept_with_a_reason(
     assert models(project)[0] == models(plain)[0]
 
 
+def test_poses_without_tracks_are_polished_on_request(project: Path) -> None:
+    change_model(project, no_tracks)
+    report = run(project, replace(OFF, polish=PolishOptions("always")))
+    assert "The poses were polished" in report.polishing
+    assert "sparse points" not in report.polishing
+    assert sorted(report.pose_movement) == FOUR_NAMES
+    assert all(0.2 < pixels < 3 for pixels in report.pose_movement.values())
+    assert misses(project / "dense/sparse", project / "true") < 0.12
+
+
 def test_wrong_cameras_are_no_matter_of_poses(project: Path) -> None:
     change_model(project, long_focus)
     polishing = run(project).polishing

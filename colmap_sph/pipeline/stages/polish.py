@@ -102,7 +102,7 @@ def polish_poses(task: PolishTask) -> Facts:
     reason = judgement.refusal(task.options.least_gain)
     if reason:
         return _kept(task, reason, advice)
-    moved = movements(scene, after)
+    moved = movements(scene, after, tracks)
     polish = Polish(_success(judgement, moved), is_polished=True, movement=moved, advice=advice)
     with scratch_folder(workspace.polishing_scratch_dir):
         made = workspace.polishing_scratch_dir / "polished"
