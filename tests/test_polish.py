@@ -178,6 +178,8 @@ def test_a_model_that_the_user_changed_is_used_as_it_is(project: Path) -> None:
     before = models(project)
     assert "was changed since this program made it" in run(project).polishing
     assert models(project) == before
+    plans = [make_plan(Project(project / "sparse/0"), ON, overwrite=overwrite) for overwrite in (False, True)]
+    assert ["polish poses" in {stage.name for stage in plan.stages} for plan in plans] == [False, True]
 
 
 def test_a_lost_given_model_is_made_again(project: Path) -> None:
@@ -303,6 +305,14 @@ def test_cameras_are_refined_into_a_model_of_their_own(project: Path) -> None:
         assert abs(k1 + k2 * corner) < 0.1
         assert camera.params[:4].tolist() == [camera.params[0], camera.params[0], 80, 60]
     assert (project / "sparse/0/cameras.bin").read_bytes() == given
+
+
+def test_cameras_without_tracks_are_kept_with_the_poses(project: Path) -> None:
+    change_model(project, no_tracks)
+    report = run(project, replace(OFF, polish=PolishOptions("on", cameras=True)))
+    assert "no tracks" in report.polishing
+    assert report.polishing.endswith("So are the cameras.")
+    assert not (project / "dense/colmap_sph/refined").exists()
 
 
 def test_right_cameras_are_kept(project: Path) -> None:

@@ -118,6 +118,7 @@ class Keys:
         names = sorted({name for pair in pairs for name in pair})
         return self._key(
             "polish",
+            self._programs["known images"],  # their detail
             self._programs["pair"],
             [(name, self._image(name), self._mask(name)) for name in names],
             pairs,
