@@ -83,6 +83,8 @@ def test_a_pair_that_would_be_tried_first_is_another(dense: Path) -> None:
         jobs.append(MatchStage(replace(context, scene=replace(context.scene, views=views)), [pair]).job(pair))
     assert [job.task.trial < 1 for job in jobs] == [False, False, True]
     assert jobs[0].key == jobs[1].key != jobs[2].key
+    share_of_pixels = jobs[2].task.trial ** 2
+    assert jobs[2].cost.seconds == pytest.approx((1 + share_of_pixels) * jobs[0].cost.seconds)
 
 
 def test_the_detail_of_an_image_is_measured_once(dense: Path, monkeypatch: pytest.MonkeyPatch) -> None:
