@@ -227,6 +227,8 @@ def written(
         {"numbers": numbers_with({2: 0.0})},
         {"numbers": numbers_with({2: 1.5})},
         {"numbers": numbers_with({3: np.nan})},
+        {"numbers": numbers_with({3: -0.5})},
+        {"numbers": numbers_with({3: 1e9})},
         {"numbers": numbers_with({13: np.inf})},
         {"numbers": numbers_with({19: HEIGHT + 1.0})},
         {"numbers": numbers_with({20: 1e300})},

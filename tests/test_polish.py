@@ -5,10 +5,11 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
-from projects import FOUR_NAMES, render_four_images
+from projects import FOUR_NAMES, read_picture, render_four_images
 
 import colmap_sph
 from colmap_sph.errors import OptionError
@@ -157,11 +158,28 @@ def test_a_run_that_was_ended_while_the_model_was_exchanged_goes_on(project: Pat
     assert models(project) == before
 
 
+def test_a_changed_image_polishes_the_given_model_again(project: Path) -> None:
+    """Not the polished one, in whose place the new one comes."""
+    given = (project / "dense/colmap_sph/given/images.bin").read_bytes()
+    path = project / "images" / FOUR_NAMES[0]
+    darker = cv2.convertScaleAbs(read_picture(path), alpha=0.9)
+    path.write_bytes(cv2.imencode(".jpg", darker, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+    plan = make_plan(Project(project / "sparse/0"), ON)
+    report = run(project)
+    assert "The poses were polished" in report.polishing
+    assert made(report) == {"undistort": 1} | {stage.name: stage.total for stage in plan.stages[3:]}
+    assert misses(project / "dense/sparse", project / "true") < 0.12
+    assert (project / "dense/colmap_sph/given/images.bin").read_bytes() == given
+    assert made(run(project)) == {}
+
+
 def test_a_model_that_the_user_changed_is_used_as_it_is(project: Path) -> None:
     disturbed(project / "dense/sparse", 0.1)
     before = models(project)
     assert "was changed since this program made it" in run(project).polishing
     assert models(project) == before
+    plans = [make_plan(Project(project / "sparse/0"), ON, overwrite=overwrite) for overwrite in (False, True)]
+    assert ["polish poses" in {stage.name for stage in plan.stages} for plan in plans] == [False, True]
 
 
 def test_a_lost_given_model_is_made_again(project: Path) -> None:
@@ -230,6 +248,16 @@ def test_poses_are_kept_with_a_reason(
     assert models(project)[0] == models(plain)[0]
 
 
+def test_poses_without_tracks_are_polished_on_request(project: Path) -> None:
+    change_model(project, no_tracks)
+    report = run(project, replace(OFF, polish=PolishOptions("always")))
+    assert "The poses were polished" in report.polishing
+    assert "sparse points" not in report.polishing
+    assert sorted(report.pose_movement) == FOUR_NAMES
+    assert all(0.2 < pixels < 3 for pixels in report.pose_movement.values())
+    assert misses(project / "dense/sparse", project / "true") < 0.12
+
+
 def test_wrong_cameras_are_no_matter_of_poses(project: Path) -> None:
     change_model(project, long_focus)
     polishing = run(project).polishing
@@ -277,6 +305,14 @@ def test_cameras_are_refined_into_a_model_of_their_own(project: Path) -> None:
         assert abs(k1 + k2 * corner) < 0.1
         assert camera.params[:4].tolist() == [camera.params[0], camera.params[0], 80, 60]
     assert (project / "sparse/0/cameras.bin").read_bytes() == given
+
+
+def test_cameras_without_tracks_are_kept_with_the_poses(project: Path) -> None:
+    change_model(project, no_tracks)
+    report = run(project, replace(OFF, polish=PolishOptions("on", cameras=True)))
+    assert "no tracks" in report.polishing
+    assert report.polishing.endswith("So are the cameras.")
+    assert not (project / "dense/colmap_sph/refined").exists()
 
 
 def test_right_cameras_are_kept(project: Path) -> None:

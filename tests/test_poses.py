@@ -229,9 +229,15 @@ def test_what_polishing_leaves_wrong_is_told() -> None:
 def test_movement_is_that_of_the_points_in_the_image() -> None:
     """A turn about the axis of view moves nothing in the middle; one across it moves everything by f times it."""
     before = make_scene()
-    moved = movements(before, make_scene(turns=np.tile([0.002, 0, 0], (NUM_VIEWS, 1))))
-    assert list(moved) == [view.name for view in before.views]
-    assert np.allclose(list(moved.values()), 0.002 * FOCAL, rtol=0.05)
+    after = make_scene(turns=np.tile([0.002, 0, 0], (NUM_VIEWS, 1)))
+    nothing = np.empty(0, np.int64)
+    without_points = replace(before, views=tuple(replace(view, point_indices=nothing) for view in before.views))
+    no_tracks = Tracks(nothing, nothing, np.empty((0, 2)))
+    for scene, tracks in ((before, no_tracks), (without_points, make_tracks(before))):
+        moved = movements(scene, after, tracks)
+        assert list(moved) == [view.name for view in before.views]
+        assert np.allclose(list(moved.values()), 0.002 * FOCAL, rtol=0.05)
+    assert movements(without_points, after, no_tracks) == {}
 
 
 @pytest.mark.parametrize("is_common", [True, False])

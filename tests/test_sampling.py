@@ -73,6 +73,20 @@ def test_blurred_images_are_sampled_coarsely(dense: Path) -> None:
     assert MatchStage(soft, [pair]).job(pair).key != MatchStage(sharp, [pair]).job(pair).key
 
 
+def test_a_pair_that_would_be_tried_first_is_another(dense: Path) -> None:
+    """Whether it is depends on how well sparse points fit, which the geometry does not know."""
+    context = with_good_images(context_of(dense), execute)
+    pair = pair_of(context.scene)
+    jobs = []
+    for error in (0.1, 0.2, 1.0):
+        views = tuple(replace(view, reprojection_error=error) for view in context.scene.views)
+        jobs.append(MatchStage(replace(context, scene=replace(context.scene, views=views)), [pair]).job(pair))
+    assert [job.task.trial < 1 for job in jobs] == [False, False, True]
+    assert jobs[0].key == jobs[1].key != jobs[2].key
+    share_of_pixels = jobs[2].task.trial ** 2
+    assert jobs[2].cost.seconds == pytest.approx((1 + share_of_pixels) * jobs[0].cost.seconds)
+
+
 def test_the_detail_of_an_image_is_measured_once(dense: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = with_good_images(context_of(dense), execute)
     monkeypatch.setattr(check_images, "image_detail", lambda _: pytest.fail("measured again"))

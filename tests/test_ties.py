@@ -104,6 +104,15 @@ def test_no_texture_no_ties(matched):
     assert len(find_ties((left, images[0]), (right, images[1]), geometry, nothing, find_corners(images[0]))) == 0
 
 
+def test_no_window_no_ties(matched):
+    """A strip of a few rows holds none, and neither does an image without a corner."""
+    (left, right), images, geometry, disparity, _ = matched
+    corners = find_corners(images[0])
+    strip = replace(geometry, height=5)
+    assert len(find_ties((left, images[0]), (right, images[1]), strip, disparity[:5], corners)) == 0
+    assert len(find_ties((left, images[0]), (right, images[1]), geometry, disparity, corners[:0])) == 0
+
+
 def test_corners_are_where_squares_have_them():
     image = np.full((200, 300), 60, np.uint8)
     image[50:120, 80:200] = 190

@@ -97,7 +97,7 @@ class Keys:
         mask_digest = None if mask is None or self.fresh else file_digest(mask)
         return self._key("undistorted", image, camera, values, mask_digest, self._options.undistortion)
 
-    def pair(self, left: View, right: View, geometry: RectifiedPair) -> str:
+    def pair(self, left: View, right: View, geometry: RectifiedPair, trial: float) -> str:
         """Of a disparity map.
 
         Parameters
@@ -105,17 +105,20 @@ class Keys:
         left, right : View
         geometry : RectifiedPair
             In which the sparse points and the options of rectification are, too.
+        trial : float
+            Share of its rows and columns that the pair is matched at first, see `MatchTask`; 1 without.
         """
         images = [self._image(view.name) for view in (left, right)]
         masks = [self._mask(view.name) for view in (left, right)]
         cameras = [_camera(view) for view in (left, right)]
-        return self._key("pair", images, masks, cameras, geometry, self._options.matching)
+        return self._key("pair", images, masks, cameras, geometry, trial, self._options.matching)
 
     def polish(self, pairs: Sequence[tuple[str, str]], model_dir: Path) -> str:
         """Of the polished model, from the pairs to match and the folder of the given model."""
         names = sorted({name for pair in pairs for name in pair})
         return self._key(
             "polish",
+            self._programs["known images"],  # their detail
             self._programs["pair"],
             [(name, self._image(name), self._mask(name)) for name in names],
             pairs,

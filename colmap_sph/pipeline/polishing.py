@@ -13,7 +13,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.stages.facts import Polish
 from colmap_sph.pipeline.stages.match import MatchStage
-from colmap_sph.pipeline.stages.polish import GivenModel, PolishStage
+from colmap_sph.pipeline.stages.polish import GivenModel, PolishStage, kept_as_given
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
@@ -50,7 +50,7 @@ def with_polished_poses(
     Context
     """
     if given.reason_to_keep:
-        return _told(context, Polish(f"The poses are kept as given: {given.reason_to_keep}."))
+        return _told(context, kept_as_given(given.reason_to_keep, context.options.polish))
     polish = _outcome(context, pairs, executor, given)
     if polish is None:
         return replace(context, keys=Keys(context.workspace, context.options, fresh=True))

@@ -202,7 +202,8 @@ class Preparation:
         return GivenModel(originals.model_dir, originals.image_dir, self._reason_to_keep_poses())
 
     def _reason_to_keep_poses(self) -> str:
-        if self._found is not None and is_users_model(self.workspace):
+        is_replaced = self._found is None or self._overwrite
+        if not is_replaced and is_users_model(self.workspace):
             return f"{self.workspace.sparse_dir} was changed since this program made it"
         return reason_to_keep(self._originals.model, self._options.polish.poses)
 

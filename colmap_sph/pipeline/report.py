@@ -54,7 +54,7 @@ class RunReport:
     polishing : str
         Where polished poses were asked for: what was done, or why not.
     pose_movement : dict
-        Image name → how far polishing moved it, pixels (median over its sparse points); empty without.
+        Image name → how far polishing moved it, pixels (median over its points); empty without.
     row_residual : float or None
         How far the rows of rectified pairs disagree, pixels: the median of all pairs; None where no pair
         has enough ties to tell.

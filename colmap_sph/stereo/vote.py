@@ -29,7 +29,7 @@ _BAND_BYTES = 8 << 20
 class VoteOptions:
     """How the pairs of a view vote on its depth."""
 
-    disparity_sigma: float = 0.2
+    disparity_sigma: float = 0.35
     """Standard deviation, pixels, of a disparity on a smooth surface of a pair with perfect poses and lenses. It
     is larger where disparities are rough, and where the rows of a pair disagree. It is the scale of all
     tolerances, those of the confirmation among them."""

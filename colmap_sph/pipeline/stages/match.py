@@ -107,8 +107,8 @@ def make_disparity_map(task: MatchTask) -> Facts:
         _thread.scratch = Scratch(task.scratch_bytes)
     share = 1.0
     if task.trial < 1:
-        _, ties = _match(task, task.geometry.resampled(task.trial))
-        share = tolerable_sampling(row_residual(ties) or 0.0, task.trial)
+        residual = row_residual(_match(task, task.geometry.resampled(task.trial))[1])
+        share = tolerable_sampling(residual or 0.0, task.trial)
     geometry = task.geometry.resampled(share)
     disparity, ties = _match(task, geometry)
     pair = PairDisparity(task.left.view.name, task.right.view.name, geometry, disparity)
@@ -173,12 +173,14 @@ class MatchStage(Stage[Pair, MatchTask]):
         context = self.context
         left, right = (context.scene.view(name) for name in item)
         geometry = self._geometry(left, right)
-        key = context.keys.pair(left, right, geometry)
+        trial = self._trial(left, right, geometry)
+        key = context.keys.pair(left, right, geometry, trial)
         target = context.pair_path(*item)
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)
+        both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
-            seconds=_SECONDS * (left_pixels + geometry.height * geometry.right_width) / 1e6,
+            seconds=_SECONDS * both_pixels / 1e6 * (1 + trial**2 * (trial < 1)),
             memory=max(_MATCH_BYTES * left_pixels, _READ_BYTES * pixels + _RECTIFIED_BYTES * left_pixels),
             disk=_FILE_BYTES * left_pixels,
             scratch=scratch_bytes(left_pixels, context.options.matching),
@@ -187,7 +189,7 @@ class MatchStage(Stage[Pair, MatchTask]):
             self._photo(left),
             self._photo(right),
             geometry,
-            self._trial(left, right, geometry),
+            trial,
             context.options.matching,
             self._scratch_bytes,
             target,

@@ -16,7 +16,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.state.array_file import ArrayType, Head, read_arrays, read_head, write_arrays
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
-from colmap_sph.stereo.poses.ties import MAX_TIES, Ties, row_residual
+from colmap_sph.stereo.poses.ties import MAX_MOVE, MAX_TIES, Ties, row_residual
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Surface
 
 _PAIR = "pair"
@@ -174,7 +174,10 @@ def _array_types(head: Head, geometry: RectifiedPair) -> list[ArrayType]:
 def _has_scale(head: Head) -> bool:
     """Whether there are a least disparity, a step above 0, a share of rows and columns, and a row residual."""
     own = head.numbers[:_OWN_NUMBERS]
-    return len(own) == _OWN_NUMBERS and bool(np.isfinite(own).all()) and own[1] > 0 and 0 < own[2] <= 1
+    if len(own) != _OWN_NUMBERS or not np.isfinite(own).all():
+        return False
+    _, step, share, residual = own
+    return step > 0 and 0 < share <= 1 and (residual == _UNKNOWN or 0 <= residual <= MAX_MOVE)
 
 
 def _texts_of(left: str, right: str, geometry: RectifiedPair) -> tuple[str, ...]:

@@ -102,7 +102,7 @@ def polish_poses(task: PolishTask) -> Facts:
     reason = judgement.refusal(task.options.least_gain)
     if reason:
         return _kept(task, reason, advice)
-    moved = movements(scene, after)
+    moved = movements(scene, after, tracks)
     polish = Polish(_success(judgement, moved), is_polished=True, movement=moved, advice=advice)
     with scratch_folder(workspace.polishing_scratch_dir):
         made = workspace.polishing_scratch_dir / "polished"
@@ -137,8 +137,15 @@ def _observations(tracks: Tracks, scene: Scene) -> Observations:
     return Observations(names, tracks.track, tracks.view, tracks.pixels, points)
 
 
+def kept_as_given(reason: str, options: PolishOptions, advice: str = "") -> Polish:
+    """What to say of poses that are not polished; of cameras, too, where these were asked for."""
+    if options.cameras and not advice:
+        advice = "So are the cameras."
+    return Polish(f"The poses are kept as given: {reason}.", advice=advice)
+
+
 def _kept(task: PolishTask, reason: str, advice: str = "") -> Facts:
-    polish = Polish(f"The poses are kept as given: {reason}.", advice=advice)
+    polish = kept_as_given(reason, task.options, advice)
     keep_given(task.workspace, task.key, asdict(polish))
     return Facts(polish=polish)
 

@@ -86,14 +86,14 @@ def adjusted_model(
     model = submodel(given, set(image_names(given)))
     own_points = sorted(model.points3D)
     with_ties = _with_observations(model, observations)
-    adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-        _options(refine_distortion=refine_distortion),
-        pycolmap.PosePriorBundleAdjustmentOptions(),
-        _config(with_ties, refine_distortion=refine_distortion),
-        _priors(model, with_ties),
-        with_ties,
-    )
-    with quiet_colmap():
+    with quiet_colmap(int(pycolmap.logging.ERROR)):  # it warns of centres in a row, and does without their priors
+        adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+            _options(refine_distortion=refine_distortion),
+            pycolmap.PosePriorBundleAdjustmentOptions(),
+            _config(with_ties, refine_distortion=refine_distortion),
+            _priors(model, with_ties),
+            with_ties,
+        )
         summary = adjuster.solve()
     if not summary.is_solution_usable():
         return None

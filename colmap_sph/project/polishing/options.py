@@ -34,7 +34,7 @@ class PolishOptions:
         if not 0 <= self.least_gain < 1:
             raise OptionError(f"least_gain must lie in 0..1, not {self.least_gain}.", "least_gain")
         if self.cameras and self.poses == "off":
-            raise OptionError("cameras are polished with the poses; give poses, too.", "cameras")
+            raise OptionError("cameras needs polished poses; give --polish-poses, too.", "cameras")
 
     @property
     def is_wanted(self) -> bool:

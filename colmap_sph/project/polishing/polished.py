@@ -61,11 +61,12 @@ def publish_polished(workspace: Workspace, made: Path, key: str, outcome: dict[s
     outcome : dict
         What to say of it later: plain values.
     """
-    restore_given(workspace)
     marker = _finished_marker(workspace)
-    _copy(workspace.sparse_dir, workspace.given_model_dir, marker)
-    polish = {"key": key, "outcome": outcome}
-    publish_model(workspace, replace(marker, given=marker.files, polish=polish), made, marker.images)
+    if not marker.given:  # else it lies there, and what is to be replaced was polished, too
+        _copy(workspace.sparse_dir, workspace.given_model_dir, marker)
+    given = marker.given or marker.files
+    marker = replace(marker, given=given, polish={"key": key, "outcome": outcome})
+    publish_model(workspace, marker, made, marker.images)
 
 
 def keep_given(workspace: Workspace, key: str, outcome: dict[str, Any]) -> None:

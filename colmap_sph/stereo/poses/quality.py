@@ -114,7 +114,7 @@ class Judgement:
     sureness : float
         Standard deviations by which more of these fit better than worse.
     sparse_before, sparse_after : float
-        Reprojection error of the model's own tracks.
+        Reprojection error of the model's own tracks; 0 where it has none.
     movement : float
         Median over the images.
     thickness : float
@@ -132,10 +132,10 @@ class Judgement:
     @property
     def words(self) -> str:
         """What changed, as a sentence."""
-        return (
-            f"Ties that had no part in it fit to {self.after:.2f} px, before {self.before:.2f} px; the sparse "
-            f"points to {self.sparse_after:.2f} px, before {self.sparse_before:.2f} px."
-        )
+        words = f"Ties that had no part in it fit to {self.after:.2f} px, before {self.before:.2f} px"
+        if not self.sparse_before:
+            return f"{words}."
+        return f"{words}; the sparse points to {self.sparse_after:.2f} px, before {self.sparse_before:.2f} px."
 
     def refusal(self, least_gain: float) -> str:
         """Why the polished poses are not used, as the end of a sentence; empty where they are."""
@@ -177,7 +177,7 @@ def judged(held_out: Tracks, before: Scene, after: Scene) -> Judgement:
     # As often better as worse by chance: binomial.
     sureness = (2 * better - len(held_out)) / np.sqrt(max(len(held_out), 1))
     sparse = [_sparse_error(scene) for scene in (before, after)]
-    moved = movements(before, after)
+    moved = movements(before, after, held_out)
     return Judgement(
         before=float(np.nanmedian(errors[0])),
         after=float(np.nanmedian(errors[1])),
@@ -260,11 +260,18 @@ def _field(cells: NDArray[np.int64], residuals: Float) -> Float:
     return np.where(number[:, None] >= _BENT_PER_CELL, np.stack(sums, axis=1) / np.maximum(number, 1)[:, None], 0)
 
 
-def movements(before: Scene, after: Scene) -> dict[str, float]:
-    """How far points move in each image that observes any, pixels (median), by its pose alone."""
+def movements(before: Scene, after: Scene, tracks: Tracks) -> dict[str, float]:
+    """How far points move in each image, pixels (median), by its pose alone.
+
+    Sparse points that the image observes, or those of tracks where it observes none; an image with neither is left
+    out.
+    """
+    corners = triangulated(tracks, before.views)[tracks.track]
     moved = {}
-    for view, other in zip(before.views, after.views, strict=True):
+    for index, (view, other) in enumerate(zip(before.views, after.views, strict=True)):
         points = before.points[view.point_indices]
+        if not len(points):
+            points = corners[tracks.view == index]
         if len(points):
             distance = np.linalg.norm(other.project(points)[0] - view.project(points)[0], axis=1)
             moved[view.name] = float(np.nanmedian(distance))

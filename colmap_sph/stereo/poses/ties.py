@@ -28,6 +28,9 @@ MAX_TIES = 300
 MIN_TIES = 30
 """Fewer ties tell too little of a pair."""
 
+MAX_MOVE = 6.0
+"""A window that moves by more pixels, along or across the rows, is lost: no row residual is larger."""
+
 MAX_RESIDUAL = 0.45
 """Rows that disagree by more rectified pixels, root mean square, show windows that are too different to match."""
 # A pair keeps so much of its rows and columns, however imprecise its poses are.
@@ -42,9 +45,8 @@ _SURFACE_RADIUS = 4
 # Of the disparities there so many must exist, and be within so many pixels of their plane.
 _LEAST_FOUND = 0.8
 _MAX_ROUGHNESS = 1.0
-# Steps of the least squares: they converge fast where they do; a window that moves farther is lost.
+# Steps of the least squares: they converge fast where they do.
 _STEPS = 5
-_MAX_MOVE = 6.0
 _CONVERGED = 0.02
 _LEAST_CORRELATION = 0.8
 # A tie must know both its places by so much, pixels of standard deviation: not on an edge alone.
@@ -192,7 +194,7 @@ def find_ties(
         slopes -= slopes[:, :1] * move[:, 2:]
     start = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
     good = (correlation > _LEAST_CORRELATION) & (sigma < _MAX_SIGMA).all(axis=1)
-    good &= (np.abs(move[:, :2]) < _CONVERGED).all(axis=1) & (np.abs(found - start) < _MAX_MOVE).all(axis=1)
+    good &= (np.abs(move[:, :2]) < _CONVERGED).all(axis=1) & (np.abs(found - start) < MAX_MOVE).all(axis=1)
     measured = (part[good].astype(np.float32) for part in (places, found, sigma[:, 1]))
     return Ties(*measured)
 
@@ -210,7 +212,7 @@ def _on_surfaces(places: Float, disparity: NDArray[np.float32]) -> tuple[Float, 
     steps = np.arange(-_SURFACE_RADIUS, _SURFACE_RADIUS + 1)
     window = disparity[middle[:, 1, None, None] + steps[:, None], middle[:, 0, None, None] + steps].astype(float)
     column, row = (part.ravel() for part in np.meshgrid(steps, steps))
-    window = window.reshape(len(window), len(column))
+    window = window.reshape(-1, len(column))  # there may be no window
     there = np.isfinite(window)
     found = there.mean(axis=1) >= _LEAST_FOUND
     places, middle, window, there = (part[found] for part in (places, middle, window, there))
