@@ -35,10 +35,10 @@ from colmap_sph.stereo.poses.quality import (
     Judgement,
     common_bends,
     judged,
-    median_error,
     movements,
     refusal,
     sound_tracks,
+    usual_error,
 )
 from colmap_sph.stereo.poses.tracks import (
     Tracks,
@@ -123,7 +123,7 @@ HELD_OUT = 5
 def _observations(tracks: Tracks, scene: Scene) -> Observations:
     points = triangulated(tracks, scene.views) + scene.origin
     names = [view.name for view in scene.views]
-    return Observations(names, tracks.track, tracks.view, tracks.pixels, points, median_error(tracks, scene))
+    return Observations(names, tracks.track, tracks.view, tracks.pixels, points, usual_error(tracks, scene))
 
 
 def _kept(task: PolishTask, reason: str, advice: str = "") -> Facts:

@@ -97,7 +97,7 @@ def refusal(tracks: Tracks, scene: Scene, least_residual: float) -> str:
             f"its sparse points lie {sparse:.1f} px from where images observe them, so that not only poses are "
             "wrong; check cameras and images of the model"
         )
-    error = median_error(tracks, scene)
+    error = _median_error(tracks, scene)
     if error < least_residual:
         return f"they are good already: the rays of ties miss each other by {error:.2f} px"
     return ""
@@ -275,8 +275,12 @@ def _errors(tracks: Tracks, scene: Scene) -> Float:
     return track_errors(tracks, triangulated(tracks, scene.views), scene.views)
 
 
-def median_error(tracks: Tracks, scene: Scene) -> float:
-    """Median error of tracks, pixels."""
+def usual_error(tracks: Tracks, scene: Scene) -> float:
+    """What tracks, or the model's own where they are less precise, miss by, pixels."""
+    return max(_median_error(tracks, scene), _sparse_error(scene))
+
+
+def _median_error(tracks: Tracks, scene: Scene) -> float:
     return float(np.median(_errors(tracks, scene)))
 
 
