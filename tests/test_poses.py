@@ -7,7 +7,7 @@ import pytest
 from rendered import SIDES, array_coordinates, pixel_rays
 
 from colmap_sph.scene import Scene, View
-from colmap_sph.stereo.poses.quality import common_bends, judged, movements, refusal, sound_tracks
+from colmap_sph.stereo.poses.quality import common_bends, judged, movements, refusal, sound_tracks, usual_error
 from colmap_sph.stereo.poses.tracks import (
     ImageTies,
     Tracks,
@@ -205,6 +205,14 @@ def test_sparse_points_far_from_their_observations_are_told() -> None:
     scene = make_scene(turns=small_turns(1.0))
     broken = replace(scene, views=tuple(replace(view, reprojection_error=5.0) for view in scene.views))
     assert "5.0 px" in refusal(make_tracks(make_scene()), broken, 0.15)
+
+
+def test_the_usual_error_is_that_of_the_less_precise_tracks() -> None:
+    """Ties of exact poses miss by their noise; sparse points by what the views say, half a pixel."""
+    scene = make_scene()
+    assert usual_error(make_tracks(scene), scene) == pytest.approx(0.5)
+    # The median of few degrees of freedom lies below their deviation.
+    assert 1.3 < usual_error(make_tracks(scene, noise=2.0), scene) < 2.1
 
 
 def test_better_poses_are_accepted_and_worse_ones_refused() -> None:

@@ -17,6 +17,7 @@ from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.poses.ties import MAX_TIES, Ties, filled_residuals, find_corners, find_ties, row_residual
+from colmap_sph.stereo.poses.tracks import image_coordinates
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
@@ -66,6 +67,34 @@ def test_ties_of_exact_poses_lie_where_the_surface_is(matched):
     errors = ties.left[:, 0] - ties.right[:, 0] - exact
     assert np.median(np.abs(errors)) < 0.1
     assert np.mean(np.abs(errors) < 0.4) > 0.95
+
+
+def exact_right_places(matched, geometry, left_places):
+    """Where the points that places in the left image show are in the right one: by the surfaces, (n, 2)."""
+    (left, right), _, _, _, pair = matched
+    pixel = image_coordinates(left, geometry, "left", left_places)
+    distance = syn.trace_points(pair.surfaces, pair.left, pixel).distance
+    points = left.center + distance[:, None] * pixel_rays(left, *pixel.T)
+    return right.project(points)[0]
+
+
+def test_what_was_matched_coarsely_is_measured_finely(matched):
+    """A third of the rows and columns: fine windows know places in the images at least twice as well as coarse."""
+    (left, right), images, fine, disparity, _ = matched
+    coarse = fine.resampled(1 / 3)
+    few = (disparity[::3, ::3] / 3)[: coarse.height, : coarse.left_width]
+    errors = []
+    for finer in (1.0, 3.0):
+        photos = (left, images[0]), (right, images[1])
+        ties = find_ties(*photos, coarse, few, find_corners(images[0]), finer)
+        assert len(ties) > 20
+        # Rectified pixels are those of the coarse geometry: corners lie where they are, rows agree.
+        assert np.abs(ties.row_shifts).max() < 0.5
+        there = image_coordinates(right, coarse, "right", ties.right)
+        errors.append(there - exact_right_places(matched, coarse, ties.left))
+    coarsely, finely = (np.median(np.linalg.norm(error, axis=1)) for error in errors)
+    assert finely < 0.1
+    assert finely < coarsely / 2
 
 
 @pytest.mark.parametrize("pixels", [0.5, -1.25])

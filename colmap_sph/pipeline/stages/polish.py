@@ -4,7 +4,6 @@ What is accepted is decided by ties that had no part in the adjustment, and by t
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,9 +11,8 @@ from typing import TYPE_CHECKING
 import msgspec
 import numpy as np
 
-from colmap_sph.errors import InputError
 from colmap_sph.pipeline.stages.facts import Facts, Polish
-from colmap_sph.pipeline.stages.pair_files import read_pair, read_ties
+from colmap_sph.pipeline.stages.fine_ties import CACHE_BYTES, fine_ties
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
 from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
@@ -33,11 +31,17 @@ from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.poses.quality import Judgement, common_bends, judged, movements, refusal, sound_tracks
+from colmap_sph.stereo.poses.quality import (
+    Judgement,
+    common_bends,
+    judged,
+    movements,
+    refusal,
+    sound_tracks,
+    usual_error,
+)
 from colmap_sph.stereo.poses.tracks import (
-    ImageTies,
     Tracks,
-    image_coordinates,
     track_errors,
     tracks_of_ties,
     triangulated,
@@ -85,7 +89,7 @@ def polish_poses(task: PolishTask) -> Facts:
     folder = starting_model(workspace)
     given = load_model(folder)
     scene = scene_of_model(given, folder)
-    tracks = tracks_of_ties(_ties(task.pairs, scene), scene.index_of)
+    tracks = tracks_of_ties(fine_ties(workspace, task.pairs, scene), scene.index_of)
     tracks = sound_tracks(tracks, scene)
     reason = refusal(tracks, scene, task.options.least_residual)
     if reason:
@@ -116,25 +120,10 @@ HELD_OUT = 5
 """Of so many tracks one has no part in the adjustment."""
 
 
-def _ties(pairs: Mapping[Pair, Path], scene: Scene) -> dict[Pair, ImageTies]:
-    """Ties of all pairs, in image coordinates; a pair whose file cannot be read has none."""
-    ties = {}
-    for pair, path in pairs.items():
-        with suppress(InputError):
-            geometry = read_pair(path).geometry
-            found = read_ties(path)
-            left, right = (scene.view(name) for name in pair)
-            ties[pair] = ImageTies(
-                image_coordinates(left, geometry, "left", found.left),
-                image_coordinates(right, geometry, "right", found.right),
-            )
-    return ties
-
-
 def _observations(tracks: Tracks, scene: Scene) -> Observations:
     points = triangulated(tracks, scene.views) + scene.origin
     names = [view.name for view in scene.views]
-    return Observations(names, tracks.track, tracks.view, tracks.pixels, points)
+    return Observations(names, tracks.track, tracks.view, tracks.pixels, points, usual_error(tracks, scene))
 
 
 def kept_as_given(reason: str, options: PolishOptions, advice: str = "") -> Polish:
@@ -234,7 +223,7 @@ class PolishStage(Stage[str, PolishTask]):
             context.workspace, self._given, paths, context.options.polish, context.options.undistortion, key
         )
         number = len(context.scene.views)
-        cost = Cost(_SECONDS * number, _BYTES * number, 0.0)
+        cost = Cost(_SECONDS * number, _BYTES * number + CACHE_BYTES, 0.0)
         return Job(key, self._known(key), cost, task)
 
     def _known(self, key: str) -> Facts | None:

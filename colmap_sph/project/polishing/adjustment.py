@@ -18,8 +18,10 @@ from colmap_sph.project.sparse_model import image_names, submodel
 
 _FEWEST_IMAGES = 3
 _INSIST = "; --polish-poses always polishes them, too"
-# Beyond so many pixels a residual counts linearly: mismatches, and what moves.
-_LOSS_PIXELS = 1.0
+# Beyond what is usual a residual counts linearly: mismatches, and what moves. What is usual is measured, between
+# these bounds, pixels.
+_LEAST_USUAL = 0.1
+_MOST_USUAL = 1.0
 # Standard deviation of a given centre, in what a pixel covers at the median depth of the image's points.
 _CENTER_PIXELS = 5.0
 _MAX_ITERATIONS = 100
@@ -40,6 +42,8 @@ class Observations:
         Image coordinates, of the model's images.
     points : (n, 3) float64 ndarray
         Where each track is about, in the model's frame.
+    error : float
+        What they usually miss these by, pixels.
     """
 
     names: Sequence[str]
@@ -47,6 +51,7 @@ class Observations:
     image: NDArray[np.int64]
     pixels: NDArray[np.float64]
     points: NDArray[np.float64]
+    error: float
 
 
 def reason_to_keep(model: pycolmap.Reconstruction, polishing: Polishing) -> str:
@@ -88,7 +93,7 @@ def adjusted_model(
     with_ties = _with_observations(model, observations)
     with quiet_colmap(int(pycolmap.logging.ERROR)):  # it warns of centres in a row, and does without their priors
         adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            _options(refine_distortion=refine_distortion),
+            _options(observations.error, refine_distortion=refine_distortion),
             pycolmap.PosePriorBundleAdjustmentOptions(),
             _config(with_ties, refine_distortion=refine_distortion),
             _priors(model, with_ties),
@@ -126,7 +131,7 @@ def _with_observations(model: pycolmap.Reconstruction, observations: Observation
     return larger
 
 
-def _options(*, refine_distortion: bool) -> pycolmap.BundleAdjustmentOptions:
+def _options(usual_error: float, *, refine_distortion: bool) -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = False
@@ -134,7 +139,7 @@ def _options(*, refine_distortion: bool) -> pycolmap.BundleAdjustmentOptions:
     options.refine_extra_params = refine_distortion
     options.refine_sensor_from_rig = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
-    options.ceres.loss_function_scale = _LOSS_PIXELS
+    options.ceres.loss_function_scale = float(np.clip(usual_error, _LEAST_USUAL, _MOST_USUAL))
     solver = options.ceres.solver_options
     solver.max_num_iterations = _MAX_ITERATIONS
     solver.function_tolerance = _CONVERGED

@@ -5,6 +5,7 @@ each other.
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -54,8 +55,8 @@ def refined_cameras(
     seen = np.isfinite(pixels).all(axis=1)
     for camera in model.cameras.values():
         _as_opencv(camera)
-    original = Observations(
-        observations.names, observations.track[seen], observations.image[seen], pixels[seen], observations.points
+    original = replace(
+        observations, track=observations.track[seen], image=observations.image[seen], pixels=pixels[seen]
     )
     return adjusted_model(model, original, refine_distortion=True)
 

@@ -282,6 +282,11 @@ def _errors(tracks: Tracks, scene: Scene) -> Float:
     return track_errors(tracks, triangulated(tracks, scene.views), scene.views)
 
 
+def usual_error(tracks: Tracks, scene: Scene) -> float:
+    """What tracks, or the model's own where they are less precise, miss by, pixels."""
+    return max(_median_error(tracks, scene), _sparse_error(scene))
+
+
 def _median_error(tracks: Tracks, scene: Scene) -> float:
     return float(np.median(_errors(tracks, scene)))
 

@@ -161,6 +161,7 @@ def find_ties(
     geometry: RectifiedPair,
     disparity: NDArray[np.float32],
     corners: Float,
+    finer: float = 1.0,
 ) -> Ties:
     """Measure corners of the left image in the right one.
 
@@ -173,29 +174,33 @@ def find_ties(
         Of the left image's pixels; NaN = none. Where to look, and that it is one surface.
     corners : (n, 2) float64 ndarray
         Image coordinates in the left image, the best first.
+    finer : float
+        The windows have so many pixels per rectified pixel: what is matched coarsely can be measured finely.
 
     Returns
     -------
     Ties
-        At most `MAX_TIES`.
+        At most `MAX_TIES`, in pixels of `geometry`.
     """
     places = _rectified_places(left[0], geometry, "left", corners)
     places, planes = _on_surfaces(places, disparity)
     if not len(places):
         return Ties.none()
-    template = _Template.of(_windows(left, geometry, "left", _around(places, _RADIUS + 1)))
+    fine = geometry.resampled(finer)
+    places, planes = places * finer, planes * [finer, 1, 1]
+    template = _Template.of(_windows(left, fine, "left", _around(places, _RADIUS + 1)))
     found = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
     # The right column of the window's pixel (i, j) is that of its middle, plus slopes · (i, j).
     slopes = np.column_stack([1 - planes[:, 1], -planes[:, 2]])
     for _ in range(_STEPS):
-        window = _windows(right, geometry, "right", _around(found, _RADIUS, slopes))
+        window = _windows(right, fine, "right", _around(found, _RADIUS, slopes))
         move, correlation, sigma = template.step(window)
         found -= np.column_stack([(slopes * move[:, :2]).sum(axis=1), move[:, 1]])
         slopes -= slopes[:, :1] * move[:, 2:]
     start = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
     good = (correlation > _LEAST_CORRELATION) & (sigma < _MAX_SIGMA).all(axis=1)
     good &= (np.abs(move[:, :2]) < _CONVERGED).all(axis=1) & (np.abs(found - start) < MAX_MOVE).all(axis=1)
-    measured = (part[good].astype(np.float32) for part in (places, found, sigma[:, 1]))
+    measured = ((part[good] / finer).astype(np.float32) for part in (places, found, sigma[:, 1]))
     return Ties(*measured)
 
 
