@@ -26,7 +26,7 @@ _MAX_SIDE = 32766
 # Rectified pixels per sample that an image's detail asks for, as bilinear resampling takes some of it away and
 # windows are of whole pixels; and as many per pixel at most.
 _OVERSAMPLING = 1.45
-_MOST_SAMPLING = 1.4
+_MOST_SAMPLING = 1.3
 # Fewer rows or columns than this are not worth matching.
 _MIN_SIDE = 16
 
@@ -38,7 +38,7 @@ class RectificationOptions:
     surface: Surface = "spherical"
     """Surface the images are resampled to: a sphere around the baseline, or a plane (the classic "frame")."""
     sampling: float = 1.0
-    """Rectified pixels, as a factor on what the images' detail asks for: 1.4 per pixel where they are sharp, 0.5
+    """Rectified pixels, as a factor on what the images' detail asks for: 1.3 per pixel where they are sharp, 0.5
     where they are soft."""
     min_cosine: float = 0.1
     """Rays whose angle with the baseline has a smaller sine than this are left out: at 0.1, within 5.7° of the

@@ -19,6 +19,8 @@ from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, rectified_ray_from_pixel
 
+# Pairs are sampled coarsely where images are soft: what is matched there is less sure, by up to this factor.
+_MOST_SOFTNESS = 2.0
 # A pair whose rows disagree by more rectified pixels is wrong rather than imprecise, and agrees with nothing more.
 _MOST_RESIDUAL = 1.0
 # Candidates of all pairs are voted on in bands of rows of about this size.
@@ -29,10 +31,11 @@ _BAND_BYTES = 8 << 20
 class VoteOptions:
     """How the pairs of a view vote on its depth."""
 
-    disparity_sigma: float = 0.35
-    """Standard deviation, pixels, of a disparity on a smooth surface of a pair with perfect poses and lenses. It
-    is larger where disparities are rough, and where the rows of a pair disagree. It is the scale of all
-    tolerances, those of the confirmation among them."""
+    disparity_sigma: float = 0.25
+    """Standard deviation, rectified pixels, of a disparity on a smooth surface of a pair with sharp images and
+    perfect poses and lenses. It is larger where disparities are rough, where the rows of a pair disagree, and
+    where a pair is sampled more coarsely than its images. It is the scale of all tolerances, those of the
+    confirmation among them."""
     max_disparity_step: float = 2.0
     """Neighbouring disparities that differ by more than this (pixels) belong to different surfaces."""
     tolerance: float = 3.0
@@ -100,7 +103,7 @@ def depth_candidates(
         (geometry.column_origin(side), geometry.row_origin),
         geometry.disparity_origin,
         geometry.baseline,
-        math.hypot(options.disparity_sigma, min(residual * geometry.columns_per_radian, _MOST_RESIDUAL)),
+        _disparity_sigma(view, geometry, options, residual),
         options.max_disparity_step,
         geometry.surface == "spherical",
         side == "left",
@@ -109,6 +112,13 @@ def depth_candidates(
         sigma,
     )
     return depth, sigma
+
+
+def _disparity_sigma(view: View, geometry: RectifiedPair, options: VoteOptions, residual: float) -> float:
+    """Standard deviation of a pair's disparities on smooth surfaces, rectified pixels."""
+    softness = min(max(float(view.K[0, 0]) / geometry.columns_per_radian, 1.0), _MOST_SOFTNESS)
+    shift = min(residual * geometry.columns_per_radian, _MOST_RESIDUAL)
+    return math.hypot(options.disparity_sigma * softness, shift)
 
 
 def vote_depth(
