@@ -98,7 +98,8 @@ def confirm_depth(
     sizes = Counter(stations)
     numbers = itertools.count() if stations is None else stations
     shifts = itertools.repeat(0.0) if residuals is None else residuals
-    numbered = zip(numbers, partners, shifts, strict=False)
+    are_counted = stations is not None and residuals is not None
+    numbered = zip(numbers, partners, shifts, strict=are_counted)
     for number, members in groupby(numbered, key=lambda member: member[0]):
         has_others = sizes[number] > 1
         station = _Sums.empty(estimate.depth.shape) if has_others else sums
