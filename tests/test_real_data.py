@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from clouds import read_fused
 from conftest import keep_images
@@ -139,3 +140,44 @@ def test_brighton(data_dir: Path, tmp_path: Path) -> None:
     assert result.report.points > 200_000
     image = read_picture(result.workspace.image_path(BRIGHTON[0]))
     assert max(image.shape) <= 1000
+
+
+def test_hand_held_frames(data_dir: Path, tmp_path: Path) -> None:
+    """Soft images with imprecise poses: covered share of the sensor's depth, and of that within 1 and 5 %."""
+    result = run_on(data_dir / "redkitchen_pinhole", tmp_path, None, RunOptions())
+    assert result.report.row_residual is not None and 0.2 < result.report.row_residual < 0.6
+    assert 0.3 < result.report.sampling < 0.7
+    seen = covered = near = close = 0
+    for name in result.report.coverage:
+        path = result.source / "depth" / f"{Path(name).stem}.png"
+        truth = truth_at_pixel_origin(read_picture(path, cv2.IMREAD_UNCHANGED).astype(np.float32) / 1000)
+        depth = read_depth_map(result.workspace.depth_map_path(name, "geometric"))
+        both = (depth > 0) & (truth > 0)
+        error = np.abs(depth[both] / truth[both] - 1)
+        seen += int(np.count_nonzero(truth > 0))
+        covered += int(np.count_nonzero(both))
+        near += int(np.count_nonzero(error < 0.01))
+        close += int(np.count_nonzero(error < 0.05))
+    assert covered > 0.78 * seen
+    assert near > 0.44 * covered
+    assert close > 0.9 * covered
+
+
+def test_rotations_disturbed_by_half_a_pixel(data_dir: Path, tmp_path: Path) -> None:
+    """Maps of neighbours still meet, and the run says by how much the rows of its pairs do not."""
+    root = tmp_path / "disturbed"
+    shutil.copytree(present(data_dir / "penta") / "sparse", root / "sparse")
+    scene = pycolmap.Reconstruction(root / "sparse" / "0")
+    rng = np.random.default_rng(17)
+    for image in scene.images.values():
+        pose = image.cam_from_world()
+        turn = pycolmap.Rotation3d(rng.normal(0, 0.5 / image.camera.mean_focal_length(), 3))
+        rotation = turn * pose.rotation
+        moved = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ image.projection_center()))
+        scene.frames[image.frame_id].rig_from_world = moved
+    scene.write(root / "sparse" / "0")
+    (root / "images").symlink_to(data_dir / "penta" / "images")
+    keep_images(root, PENTA)
+    report = colmap_sph.run(root / "sparse" / "0", options=RunOptions())
+    assert report.row_residual is not None and 0.25 < report.row_residual < 0.6
+    assert np.mean(list(report.coverage.values())) > 0.62
