@@ -146,7 +146,7 @@ def test_hand_held_frames(data_dir: Path, tmp_path: Path) -> None:
     """Soft images with imprecise poses: covered share of the sensor's depth, and of that within 1 and 5 %."""
     result = run_on(data_dir / "redkitchen_pinhole", tmp_path, None, RunOptions())
     assert result.report.row_residual is not None and 0.2 < result.report.row_residual < 0.6
-    assert 0.3 < result.report.sampling < 0.7
+    assert result.report.sampling is not None and 0.3 < result.report.sampling < 0.7
     seen = covered = near = close = 0
     for name in result.report.coverage:
         path = result.source / "depth" / f"{Path(name).stem}.png"
