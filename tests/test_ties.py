@@ -189,12 +189,17 @@ def test_a_votes_standard_deviation_grows_by_the_residual():
     pair = PairDisparity("a", "b", geometry, disparity)
     focal = geometry.columns_per_radian
     disparity += np.float32(focal / 10 - 10)
-    exact = vote_depth(left, [pair], VoteOptions())
-    rough = vote_depth(left, [pair], VoteOptions(), None, [0.6 / focal])
+    options = VoteOptions(disparity_sigma=0.2)
+    exact = vote_depth(left, [pair], options)
+    rough = vote_depth(left, [pair], options, None, [0.6 / focal])
     place = (24, 40)
     assert exact.depth[place] == pytest.approx(10, rel=1e-4)
     assert exact.sigma[place] == pytest.approx(10 * 0.2 / (focal / 10), rel=1e-3)
     assert rough.sigma[place] == pytest.approx(10 * np.hypot(0.2, 0.6) / (focal / 10), rel=1e-3)
+    # Half the rectified pixels per pixel, and twice the standard deviation of each: four times as much in depth.
+    coarse = replace(pair, geometry=geometry.resampled(0.5), disparity=disparity[::2, ::2] / 2)
+    soft = vote_depth(left, [coarse], options)
+    assert soft.sigma[place] == pytest.approx(4 * exact.sigma[place], rel=1e-2)
 
 
 @pytest.mark.parametrize(("residual", "confirmed"), [(0.0, False), (0.004, False), (0.012, True)])
