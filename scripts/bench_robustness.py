@@ -200,7 +200,7 @@ class Prepared:
 
 def run_ours(prepared: Prepared, method: Method, folder: Path) -> float:
     """Run the program into `folder`; its processor seconds."""
-    arguments = [sys.executable, "-m", "colmap_sph", "run", "--model", str(prepared.capture.sparse_dir)]
+    arguments = [sys.executable, "-P", "-m", "colmap_sph", "run", "--model", str(prepared.capture.sparse_dir)]
     arguments += ["--output", str(folder), "--threads", str(prepared.threads), *method.arguments]
     return _seconds(arguments, folder.parent / f"{folder.name}.log", (0, PARTIAL_EXIT_CODE))
 
