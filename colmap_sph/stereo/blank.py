@@ -14,6 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.stereo.resampling import half_size
+
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
 
@@ -82,7 +84,7 @@ def blank_pixels(image: NDArray[np.uint8] | Float) -> Mask:
         return np.zeros(image.shape, np.uint8)
     scales = [image.astype(np.float32, copy=False)]
     while len(scales) < _LEVELS:
-        scales.append(_half(scales[-1]))
+        scales.append(half_size(scales[-1]))
     noise, local = _noise(scales)
     bounds = [_MARGIN * noise * _FALL ** (level - _NOISE_LEVEL) for level in range(_LEVELS)]
     blank = _quiet(scales[-1], bounds[-1] / noise * local)
@@ -91,14 +93,6 @@ def blank_pixels(image: NDArray[np.uint8] | Float) -> Mask:
             return np.zeros(image.shape, np.uint8)
         blank = _next_finer(blank, scale.shape) & _quiet(scale, bound)
     return _with_edges(scales[0], blank, noise)
-
-
-def _half(image: Float) -> Float:
-    """Half the size; odd rows and columns are doubled."""
-    height, width = image.shape
-    even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
-    half = (even.shape[1] // 2, even.shape[0] // 2)
-    return np.asarray(cv2.resize(even, half, interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
 def _next_finer(blank: Mask, shape: tuple[int, ...]) -> Mask:

@@ -19,6 +19,7 @@ from colmap_sph import _native
 from colmap_sph.errors import OptionError
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
+from colmap_sph.stereo.resampling import half_size
 from colmap_sph.stereo.search_ranges import MAX_DEPTH, STEP, num_levels, propagate, range_depth, whole_range
 
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
@@ -262,21 +263,13 @@ def _pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
     """Full resolution first. Odd rows and columns are doubled, so that pixel x of a level covers 2x, 2x + 1."""
     pyramid = [image]
     for _ in range(levels):
-        pixels = pyramid[-1].image
+        pixels = half_size(pyramid[-1].image)
         valid = pyramid[-1].valid
-        height, width = pixels.shape
-        border = (0, height % 2, 0, width % 2)
+        height, width = valid.shape
         if height % 2 or width % 2:
-            pixels = _with_border(pixels, border, cv2.BORDER_REPLICATE)
-            valid = _with_border(valid, border, cv2.BORDER_CONSTANT)
-        half = ((width + 1) // 2, (height + 1) // 2)
-        coarse_valid = cv2.resize(valid, half, interpolation=cv2.INTER_AREA)
-        pyramid.append(
-            RectifiedImage(
-                np.asarray(cv2.resize(pixels, half, interpolation=cv2.INTER_AREA), dtype=np.float32),
-                np.where(coarse_valid >= _HALF_CONTENT, _CONTENT, np.uint8(0)),
-            )
-        )
+            valid = _with_border(valid, (0, height % 2, 0, width % 2), cv2.BORDER_CONSTANT)
+        coarse_valid = cv2.resize(valid, pixels.shape[::-1], interpolation=cv2.INTER_AREA)
+        pyramid.append(RectifiedImage(pixels, np.where(coarse_valid >= _HALF_CONTENT, _CONTENT, np.uint8(0))))
     return pyramid
 
 
