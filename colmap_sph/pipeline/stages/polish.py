@@ -50,6 +50,10 @@ from colmap_sph.stereo.poses.tracks import (
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
+# Of so many tracks one has no part in the adjustment.
+_HELD_OUT = 5
+# Images are bent alike where what they have in common is more than this share of their residuals.
+_BENT_SHARE = 0.05
 # Processor seconds, and bytes in use, per image of the model.
 _SECONDS = 0.4
 _BYTES = 4e6
@@ -94,13 +98,11 @@ def polish_poses(task: PolishTask) -> Facts:
     reason = refusal(tracks, scene, task.options.least_residual)
     if reason:
         return _kept(task, reason)
-    is_held_out = np.arange(len(tracks)) % HELD_OUT == 0
-    used = tracks.only(~is_held_out)
+    used, held_out = _divided(tracks)
     adjusted = adjusted_model(given, _observations(used, scene))
     if adjusted is None:
         return _kept(task, "their adjustment does not converge")
     after = scene_of_model(adjusted, folder)
-    held_out = tracks.only(is_held_out)
     judgement = judged(held_out, scene, after)
     advice = _advice(task, tracks, scene, judgement)
     reason = judgement.refusal(task.options.least_gain)
@@ -115,9 +117,10 @@ def polish_poses(task: PolishTask) -> Facts:
     return Facts(polish=polish)
 
 
-_BENT_SHARE = 0.05
-HELD_OUT = 5
-"""Of so many tracks one has no part in the adjustment."""
+def _divided(tracks: Tracks) -> tuple[Tracks, Tracks]:
+    """Tracks to adjust by, and those to judge by."""
+    is_held_out = np.arange(len(tracks)) % _HELD_OUT == 0
+    return tracks.only(~is_held_out), tracks.only(is_held_out)
 
 
 def _observations(tracks: Tracks, scene: Scene) -> Observations:
@@ -141,9 +144,9 @@ def _kept(task: PolishTask, reason: str, advice: str = "") -> Facts:
 
 def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
     """What to do about images that are bent alike; where it was asked for, that it was done."""
-    bent = [bend for bend in common_bends(tracks, scene) if bend.share > _BENT_SHARE]
     if task.options.cameras:
         return _with_refined_cameras(task, tracks, scene, judgement)
+    bent = [bend for bend in common_bends(tracks, scene) if bend.share > _BENT_SHARE]
     return " ".join(
         f"The {len(bend.views)} images with the camera of {scene.views[bend.views[0]].name} are bent alike, by "
         f"{bend.pixels:.2f} px beyond what poses can take up: its lens model is imprecise; try --polish-cameras."
@@ -153,14 +156,12 @@ def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement
 
 def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
     """Refine the cameras of the original model, and leave it in the workspace where it is better."""
-    is_held_out = np.arange(len(tracks)) % HELD_OUT == 0
+    used, held_out = _divided(tracks)
     given = load_model(task.given.model_dir)
-    observations = _observations(tracks.only(~is_held_out), scene)
-    refined = refined_cameras(given, observations, task.undistortion.for_colmap())
+    options = task.undistortion.for_colmap()
+    refined = refined_cameras(given, _observations(used, scene), options)
     error = np.inf
     if refined is not None:
-        held_out = tracks.only(is_held_out)
-        options = task.undistortion.for_colmap()
         calibrations = [view.K for view in scene.views]
         poses, pixels = straightened(given, refined, _observations(held_out, scene), calibrations, options)
         views = [replace(view, R=pose[:, :3], t=pose[:, 3]) for view, pose in zip(scene.views, poses, strict=True)]
