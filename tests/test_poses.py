@@ -11,7 +11,6 @@ from colmap_sph.stereo.poses.quality import common_bends, judged, movements, ref
 from colmap_sph.stereo.poses.tracks import (
     ImageTies,
     Tracks,
-    image_coordinates,
     parallax_angles,
     thickness,
     track_errors,
@@ -20,7 +19,7 @@ from colmap_sph.stereo.poses.tracks import (
     views_together,
 )
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
-from colmap_sph.stereo.rectified_pair import Float, Surface
+from colmap_sph.stereo.rectified_pair import Float, Surface, image_coordinates
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 500.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -71,6 +71,7 @@ def digests() -> dict[str, str]:
         ("stereo/confirm.py", {"confirm"}),
         ("stereo/refinement.py", {"confirm"}),
         ("stereo/fusion.py", {"fuse"}),
+        ("stereo/poses/ties.py", {"match", "vote", "confirm"}),
         ("project/masks.py", {"undistort", "match", "vote", "confirm", "fuse"}),
         ("scene.py", {"undistort", "match", "vote", "confirm", "fuse"}),
     ],

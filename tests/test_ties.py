@@ -12,14 +12,13 @@ from rendered import SIDES, disparities, exact_disparity, grey, pixel_rays, scen
 from colmap_sph import synthetic as syn
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.self_check import judge_rows
-from colmap_sph.pipeline.stages.pair_files import facts_of_pair, read_pair, read_ties, write_pair
+from colmap_sph.pipeline.stages.pair_files import facts_of_pair, read_pair, read_pair_with_ties, write_pair
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.poses.ties import MAX_TIES, Ties, filled_residuals, find_corners, find_ties, row_residual
-from colmap_sph.stereo.poses.tracks import image_coordinates
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
-from colmap_sph.stereo.rectified_pair import PairDisparity
+from colmap_sph.stereo.rectified_pair import PairDisparity, image_coordinates
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
 
@@ -161,11 +160,11 @@ def test_ties_are_kept_with_the_pair(tmp_path: Path, matched):
     told = write_pair(tmp_path / "pair.sph", pair, "key", ties)
     assert facts_of_pair(tmp_path / "pair.sph", "key", "a", "b", geometry) == told
     assert told.row_residual == row_residual(ties) / geometry.columns_per_radian
-    read = read_ties(tmp_path / "pair.sph")
+    _, read = read_pair_with_ties(tmp_path / "pair.sph")
     for name in ("left", "right", "sigma"):
         assert np.array_equal(getattr(read, name), getattr(ties, name))
     assert write_pair(tmp_path / "pair.sph", pair, "key").row_residual is None
-    assert len(read_ties(tmp_path / "pair.sph")) == 0
+    assert len(read_pair_with_ties(tmp_path / "pair.sph")[1]) == 0
     assert read_pair(tmp_path / "pair.sph").disparity.shape == disparity.shape
 
 
@@ -197,7 +196,7 @@ def test_a_votes_standard_deviation_grows_by_the_residual():
     assert exact.sigma[place] == pytest.approx(10 * 0.2 / (focal / 10), rel=1e-3)
     assert rough.sigma[place] == pytest.approx(10 * np.hypot(0.2, 0.6) / (focal / 10), rel=1e-3)
     # Half the rectified pixels per pixel, and twice the standard deviation of each: four times as much in depth.
-    coarse = replace(pair, geometry=geometry.resampled(0.5), disparity=disparity[::2, ::2] / 2)
+    coarse = replace(pair, geometry=geometry.resampled(0.5), disparity=disparity[::2, ::2] / np.float32(2))
     soft = vote_depth(left, [coarse], options)
     assert soft.sigma[place] == pytest.approx(4 * exact.sigma[place], rel=1e-2)
 

@@ -108,6 +108,33 @@ def rectified_ray_from_pixel(view: View, pair: RectifiedPair) -> Float:
     return np.asarray(pair.rectified_from_world @ view.R.T @ np.linalg.inv(view.K))
 
 
+def rectified_coordinates(view: View, pair: RectifiedPair, side: Side, pixels: Float) -> Float:
+    """(n, 2) columns and rows, rectified array coordinates, of (n, 2) image coordinates."""
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ rectified_ray_from_pixel(view, pair).T
+    if pair.surface == "spherical":
+        across, along = ray_angles(rays)
+    else:
+        along, across = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
+    return np.column_stack(
+        [
+            along * pair.columns_per_radian - pair.column_origin(side),
+            across * pair.rows_per_radian - pair.row_origin,
+        ]
+    )
+
+
+def image_coordinates(view: View, pair: RectifiedPair, side: Side, places: NDArray[np.floating]) -> Float:
+    """(n, 2) image coordinates of (n, 2) columns and rows, rectified array coordinates."""
+    along = (places[:, 0].astype(float) + pair.column_origin(side)) / pair.columns_per_radian
+    across = (places[:, 1].astype(float) + pair.row_origin) / pair.rows_per_radian
+    if pair.surface == "spherical":
+        rays = np.stack([np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)])
+    else:
+        rays = np.stack([along, across, np.ones_like(along)])
+    pixels = pixel_from_rectified_ray(view, pair) @ rays
+    return np.asarray((pixels[:2] / pixels[2]).T)
+
+
 @dataclass(frozen=True, eq=False)
 class PairDisparity:
     """What matching found for a rectified pair.

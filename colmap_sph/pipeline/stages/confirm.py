@@ -13,8 +13,8 @@ from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
-from colmap_sph.pipeline.stages.pair_files import read_estimate
-from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of, residuals_of
+from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import read_whole_grey
 from colmap_sph.project.masks import read_mask

@@ -15,9 +15,10 @@ from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
+from colmap_sph.pipeline.stages.photo import Grey, Photo
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.images.reading import grey_bytes, read_grey
+from colmap_sph.project.images.reading import grey_bytes
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX
 from colmap_sph.project.state.ownership import remove_array_files
@@ -25,7 +26,7 @@ from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.poses.ties import Ties, find_corners, find_ties, row_residual, tolerable_sampling
+from colmap_sph.stereo.poses.ties import Ties, find_ties, row_residual, tolerable_sampling
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
@@ -56,21 +57,7 @@ _RECTIFIED_SHARE = 1.4
 _SCRATCH_BYTES = 256 << 20
 _CACHE_BYTES = 512 << 20
 
-
-@dataclass(frozen=True, eq=False)
-class _Photo:
-    """A grey image, and its corners."""
-
-    image: NDArray[np.uint8] | NDArray[np.float32]
-    corners: NDArray[np.float64]
-
-    @classmethod
-    def read(cls, path: Path) -> "_Photo":
-        image = read_grey(path)
-        return cls(image, find_corners(image))
-
-
-_photos: LoadCache[_Photo] = LoadCache(lambda photo: photo.image.nbytes + photo.corners.nbytes)
+_photos: LoadCache[Photo] = LoadCache(lambda photo: photo.nbytes)
 _masks: LoadCache[NDArray[np.uint8] | None] = LoadCache(lambda mask: 0 if mask is None else mask.nbytes)
 _thread = threading.local()
 
@@ -130,8 +117,8 @@ def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32
     return disparity, find_ties(*photos, geometry, disparity, left.corners)
 
 
-def _photo(file: PhotoFile) -> _Photo:
-    return _photos.get(file_stamp(file.image), lambda: _Photo.read(file.image))
+def _photo(file: PhotoFile) -> Photo:
+    return _photos.get(file_stamp(file.image), lambda: Photo.read(file.image))
 
 
 def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> RectifiedImage:
@@ -144,9 +131,7 @@ def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> Rectifie
     return RectifiedImage(*resample(image, view, geometry, side, mask=mask))
 
 
-def _mask(
-    photo: PhotoFile, image: NDArray[np.uint8] | NDArray[np.float32], keep_blank: bool
-) -> NDArray[np.uint8] | None:
+def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
     """255 where an image takes part in matching, else 0; None where all of it does."""
     mask = read_mask(photo.mask, photo.view.width, photo.view.height)
     blank = None if keep_blank else blank_pixels(image)

@@ -4,7 +4,7 @@ A pair's disparity map comes with the geometry that gives it meaning, and with i
 in 16 bits, 1/64 pixel apart or as fine as the pair's range allows; 0 = none.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args
@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.state.array_file import ArrayType, Head, read_arrays, read_head, write_arrays
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
-from colmap_sph.stereo.poses.ties import MAX_MOVE, MAX_TIES, Ties, row_residual
+from colmap_sph.stereo.partners.pairing import Pair
+from colmap_sph.stereo.poses.ties import MAX_MOVE, MAX_TIES, Ties, filled_residuals, row_residual
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Surface
 
 _PAIR = "pair"
@@ -70,24 +72,18 @@ def write_pair(
 
 def read_pair(path: Path) -> PairDisparity:
     """Read a pair's disparity map; `InputError` where the file is missing or damaged."""
-    head, (codes, *_) = _read(path)
+    return read_pair_with_ties(path)[0]
+
+
+def read_pair_with_ties(path: Path) -> tuple[PairDisparity, Ties]:
+    """Read a pair's disparity map and its ties; `InputError` where the file is missing or damaged."""
+    head, (codes, *tables) = read_arrays(path, _PAIR, lambda head: _array_types(head, _geometry_of(head)))
     least, step = head.numbers[:2]
     disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
     disparity[codes == 0] = np.nan
-    return PairDisparity(head.texts[0], head.texts[1], _geometry_of(head), disparity)
-
-
-def read_ties(path: Path) -> Ties:
-    """Read a pair's ties; `InputError` where the file is missing or damaged."""
-    _, (_, *tables) = _read(path)
-    if not tables:
-        return Ties.none()
-    (table,) = tables
-    return Ties(table[:, :2], table[:, 2:4], table[:, 4])
-
-
-def _read(path: Path) -> tuple[Head, Sequence[NDArray[Any]]]:
-    return read_arrays(path, _PAIR, lambda head: _array_types(head, _geometry_of(head)))
+    table = tables[0] if tables else np.empty((0, _TIE_COLUMNS), np.float32)
+    ties = Ties(table[:, :2], table[:, 2:4], table[:, 4])
+    return PairDisparity(head.texts[0], head.texts[1], _geometry_of(head), disparity), ties
 
 
 def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: RectifiedPair) -> Facts | None:
@@ -115,6 +111,12 @@ def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: Rectifi
 
 def _facts(residual: float | None, geometry: RectifiedPair) -> Facts:
     return Facts(row_residual=None if residual is None else residual / geometry.columns_per_radian)
+
+
+def residuals_of(matched: Mapping[Pair, Result]) -> dict[Pair, float]:
+    """Row residual of each pair, radians; those with too few ties have the median of all."""
+    measured = filled_residuals([result.facts.row_residual for result in matched.values()])
+    return dict(zip(matched, measured, strict=True))
 
 
 def disparity_bytes(path: Path) -> int:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
 
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.stereo.poses.ties import filled_residuals
 
 if TYPE_CHECKING:  # what the code of a stage's results depends on is in its key, see `program`; these have no part
     from colmap_sph.pipeline.context import Context
@@ -161,12 +160,6 @@ class Kept:
     def total(self, threads: int) -> int:
         """Bytes to keep free for all of it."""
         return threads * self.scratch + self.caches * self.cache
-
-
-def residuals_of(matched: Mapping[Item, Result]) -> dict[Item, float]:
-    """Row residual of each pair, radians; those with too few ties have the median of all."""
-    measured = filled_residuals([result.facts.row_residual for result in matched.values()])
-    return dict(zip(matched, measured, strict=True))
 
 
 def keys_of(results: Mapping[Item, Result]) -> dict[Item, str]:

@@ -13,9 +13,10 @@ from colmap_sph.pipeline.stages.pair_files import (
     is_estimate_there,
     read_estimate,
     read_pair,
+    residuals_of,
     write_estimate,
 )
-from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of, residuals_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.masks import read_mask
 from colmap_sph.scene import View

@@ -19,8 +19,7 @@ from colmap_sph.stereo.rectified_pair import (
     RectifiedPair,
     Side,
     pixel_from_rectified_ray,
-    ray_angles,
-    rectified_ray_from_pixel,
+    rectified_coordinates,
 )
 
 MAX_TIES = 300
@@ -182,7 +181,7 @@ def find_ties(
     Ties
         At most `MAX_TIES`, in pixels of `geometry`.
     """
-    places = _rectified_places(left[0], geometry, "left", corners)
+    places = rectified_coordinates(left[0], geometry, "left", corners)
     places, planes = _on_surfaces(places, disparity)
     if not len(places):
         return Ties.none()
@@ -293,21 +292,6 @@ def _normalised(windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDAr
     flat = flat - flat.mean(axis=1, keepdims=True)
     scale = np.sqrt((flat**2).mean(axis=1, keepdims=True)) + _LEAST_CONTRAST
     return flat / scale, scale
-
-
-def _rectified_places(view: View, geometry: RectifiedPair, side: Side, pixels: Float) -> Float:
-    """(n, 2) column and row of image coordinates, rectified array coordinates."""
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ rectified_ray_from_pixel(view, geometry).T
-    if geometry.surface == "spherical":
-        across, along = ray_angles(rays)
-    else:
-        along, across = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
-    return np.column_stack(
-        [
-            along * geometry.columns_per_radian - geometry.column_origin(side),
-            across * geometry.rows_per_radian - geometry.row_origin,
-        ]
-    )
 
 
 def _windows(

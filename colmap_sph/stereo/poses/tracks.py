@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from colmap_sph.scene import View
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, pixel_from_rectified_ray
+from colmap_sph.stereo.rectified_pair import Float
 
 Indices = NDArray[np.int64]
 
@@ -59,18 +59,6 @@ class ImageTies:
 
     left: Float
     right: Float
-
-
-def image_coordinates(view: View, geometry: RectifiedPair, side: Side, places: NDArray[np.floating]) -> Float:
-    """(n, 2) image coordinates of (n, 2) columns and rows, rectified array coordinates."""
-    along = (places[:, 0].astype(float) + geometry.column_origin(side)) / geometry.columns_per_radian
-    across = (places[:, 1].astype(float) + geometry.row_origin) / geometry.rows_per_radian
-    if geometry.surface == "spherical":
-        rays = np.stack([np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)])
-    else:
-        rays = np.stack([along, across, np.ones_like(along)])
-    pixels = pixel_from_rectified_ray(view, geometry) @ rays
-    return np.asarray((pixels[:2] / pixels[2]).T)
 
 
 def tracks_of_ties(ties: Mapping[Pair, ImageTies], index_of: Mapping[str, int]) -> Tracks:
