@@ -12,7 +12,8 @@ from scipy import ndimage
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
-from colmap_sph.stereo import matching, offsets
+from colmap_sph.stereo import matching
+from colmap_sph.stereo.search import offsets
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import (
     SINGLE_PAIR,

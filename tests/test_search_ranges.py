@@ -5,7 +5,7 @@ import pytest
 
 from colmap_sph.errors import RectificationError
 from colmap_sph.stereo.disparity_range import columns_with_counterparts, few_digits, parallax_range
-from colmap_sph.stereo.offsets import INVALID, SUBPIXEL
+from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
 from colmap_sph.stereo.search_ranges import MAX_DEPTH, STEP, num_levels, propagate, range_depth, whole_range
 
 

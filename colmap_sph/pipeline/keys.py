@@ -3,6 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.options import RunOptions
@@ -97,21 +100,25 @@ class Keys:
         mask_digest = None if mask is None or self.fresh else file_digest(mask)
         return self._key("undistorted", image, camera, values, mask_digest, self._options.undistortion)
 
-    def pair(self, left: View, right: View, geometry: RectifiedPair, trial: float) -> str:
+    def pair(
+        self, left: View, right: View, geometry: RectifiedPair, seeds: NDArray[np.float64], trial: float
+    ) -> str:
         """Of a disparity map.
 
         Parameters
         ----------
         left, right : View
         geometry : RectifiedPair
-            In which the sparse points and the options of rectification are, too.
+            In which the options of rectification are, too.
+        seeds : (n, 3) float64 ndarray
+            Where its sparse points are expected to match.
         trial : float
             Share of its rows and columns that the pair is matched at first, see `MatchTask`; 1 without.
         """
         images = [self._image(view.name) for view in (left, right)]
         masks = [self._mask(view.name) for view in (left, right)]
         cameras = [_camera(view) for view in (left, right)]
-        return self._key("pair", images, masks, cameras, geometry, trial, self._options.matching)
+        return self._key("pair", images, masks, cameras, geometry, seeds, trial, self._options.matching)
 
     def polish(self, pairs: Sequence[tuple[str, str]], model_dir: Path) -> str:
         """Of the polished model, from the pairs to match and the folder of the given model."""

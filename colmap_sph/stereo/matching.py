@@ -2,7 +2,7 @@
 
 Census (9 × 7) of the sharpened images, Hamming cost, aggregation along 8 paths (Hirschmüller 2008), comparison
 of the matches from left and from right, sub-pixel fit without pixel locking, and removal of small segments, on an
-image pyramid with per-pixel search ranges (Rothermel et al. 2012, "tSGM"; see `search_ranges`).
+image pyramid, each level about what the one above it predicts (Rothermel et al. 2012, "tSGM"; see `prediction`).
 
 This module is the only caller of the matching kernels. Their convention is an *offset*, target column minus
 reference column; with the left image as reference it is minus the disparity.
@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
 from colmap_sph.stereo.kernels import backend
-from colmap_sph.stereo.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
 from colmap_sph.stereo.resampling import half_size
-from colmap_sph.stereo.search_ranges import MAX_DEPTH, STEP, num_levels, propagate, range_depth, whole_range
+from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
+from colmap_sph.stereo.search.prediction import Prediction, from_coarser, from_seeds, searched_depth
+from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
 
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
 # Census compares 1/64 grey values, see CENSUS_MARGIN in `matching.h`: on weak texture, whole ones are too coarse.
@@ -166,6 +167,7 @@ def match_pair(
     scratch: Scratch | None = None,
     *,
     infinity: float | None = None,
+    seeds: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float32]:
     """Match the left image of a rectified pair in the right one.
 
@@ -182,6 +184,8 @@ def match_pair(
         Disparity of what is infinitely far away. Where the range nearly reaches it, matches are searched up to
         there, and those beyond `min_disparity` dropped: clouds would else be matched to whatever looks most like
         them in the range.
+    seeds : (n, 3) float64 ndarray, optional
+        Left column, left row and disparity, pixels, of what is known to match, see `seeds_of_points`.
 
     Returns
     -------
@@ -223,12 +227,12 @@ def match_pair(
         low, high = least >> level, -(-most >> level)
         shape = lefts[-1].image.shape
         if offset is None:
-            base, depth = whole_range(shape, low, high)
+            prediction = from_seeds(seeds, shape, level, low, high)
         else:
-            searched = options.disparities if level == 0 else options.coarse_disparities
-            depth = min(range_depth(low, high), searched)
-            base = propagate(offset, shape, depth, low, high, options.range_radius)
-        offset = _match_level(lefts.pop(), rights.pop(), base, depth, options, scratch, finest=level == 0)
+            depth = searched_depth(low, high, options.disparities if level == 0 else options.coarse_disparities)
+            prediction = from_coarser(offset, prediction, shape, depth, options.range_radius)
+        offset = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
+        offset[(offset < (low - SPARE) * SUBPIXEL) | (offset > (high + SPARE) * SUBPIXEL)] = INVALID
         if sky is not None:
             _drop_beyond(offset, farthest, sky, level)
         if level > 0 or options.median_filter:
@@ -289,8 +293,7 @@ def _census(image: RectifiedImage) -> NDArray[np.uint64]:
 def _match_level(
     left: RectifiedImage,
     right: RectifiedImage,
-    base: NDArray[np.int32],
-    depth: int,
+    prediction: Prediction,
     options: MatchingOptions,
     scratch: Scratch,
     *,
@@ -298,31 +301,59 @@ def _match_level(
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
+    margin = prediction.depth // 2
+    source_width = right.image.shape[1]
+    right, columns = _warped(right, prediction, margin)
+    right_census = _census(right)
+    del right
     left_census = _census(left)
     image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
     del left
-    right_census = _census(right)
-    del right
-    offset = np.empty(base.shape, dtype=np.int32)
+    offset = np.empty(image.shape, dtype=np.int32)
     _native.match(
         kernels,
         left_census,
         right_census,
-        base,
+        columns,
+        source_width,
+        prediction.base + np.int32(margin),
+        prediction.first,
         image,
         options.p1,
         _p2_table(options),
         options.max_slant,
         options.max_left_right_difference,
         options.max_left_right_excess if finest else options.max_coarse_left_right_excess,
-        scratch.volume(base.shape, depth),
+        scratch.volume(image.shape, prediction.depth),
         offset,
     )
-    if not finest:
-        return offset
-    fitted = np.empty_like(offset)
-    _native.fit_offsets(kernels, offset, left_census, right_census, fitted)
-    return fitted
+    if finest:
+        fitted = np.empty_like(offset)
+        _native.fit_offsets(kernels, offset, left_census, right_census, fitted)
+        offset = fitted
+    unwarped = np.empty_like(offset)
+    _native.unwarp_offsets(offset, prediction.offset, margin, unwarped)
+    return unwarped
+
+
+def _warped(
+    right: RectifiedImage, prediction: Prediction, margin: int
+) -> tuple[RectifiedImage, NDArray[np.int32]]:
+    """The right image as the left one is expected to see it, with a margin; and its columns in the right one."""
+    height, width = prediction.offset.shape
+    image = np.empty((height, width + 2 * margin), dtype=np.float32)
+    valid = np.empty(image.shape, dtype=np.uint8)
+    columns = np.empty(image.shape, dtype=np.int32)
+    _native.warp(
+        np.ascontiguousarray(right.image),
+        np.ascontiguousarray(right.valid),
+        prediction.offset,
+        margin,
+        image,
+        valid,
+        columns,
+    )
+    return RectifiedImage(image, valid), columns
 
 
 def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:

@@ -1,0 +1,183 @@
+"""Where the pixels of a level are expected to match, and what they search about that.
+
+The coarsest level starts from the pair's sparse points and searches the whole range; every other one from what the
+level above found, about which each pixel searches the same number of offsets (Rothermel et al. 2012, "tSGM", where
+each pixel has a number of its own, too: with one for all, memory stays regular). The right image is warped by what
+is predicted before the two are compared: surfaces that one image sees stretched or slanted lie flat then, and the
+windows that are compared show the same. Offsets are those of `offsets`; *residuals* are what they exceed the
+predicted ones by.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.stereo.rectified_pair import Float
+from colmap_sph.stereo.search.offsets import INVALID, MEDIAN_SIDE, SUBPIXEL
+from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, range_depth
+from colmap_sph.stereo.search.seeds import interpolated_disparity
+
+# Predictions are the mean of those within this radius that differ by no more than so many pixels: of one surface.
+_MEAN_RADIUS = 3
+_MAX_STEP = 3
+# Residuals, of the finer level, that a neighbourhood's range must leave free at either end of the pixel's, and
+# those that the predicted offset must.
+_CLEARANCE = 4
+_OWN_CLEARANCE = 6
+# Within 3 x 3 pixels of a coarser level, offsets on one surface differ by no more (in pixels of the finer one).
+_MAX_SURFACE_STEP = 4
+# Steps to which what is interpolated between sparse points is rounded, so that its last bits do not count.
+_SEED_STEPS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a level's pixels search.
+
+    Attributes
+    ----------
+    offset : (H, W) int32 ndarray
+        Predicted offset, 1/256 pixel.
+    base : (H, W) int32 ndarray
+        First residual to search, pixels.
+    depth : int
+        Number of residuals to search.
+    """
+
+    offset: NDArray[np.int32]
+    base: NDArray[np.int32]
+    depth: int
+
+    @property
+    def first(self) -> NDArray[np.int32]:
+        """(H, W) int32 first offset to search, pixels."""
+        return self.base + (self.offset + SUBPIXEL // 2) // SUBPIXEL
+
+
+def from_seeds(seeds: Float | None, shape: tuple[int, ...], level: int, low: int, high: int) -> Prediction:
+    """What the coarsest level searches: the whole range, about what sparse points tell.
+
+    Parameters
+    ----------
+    seeds : (n, 3) float64 ndarray, optional
+        As of `seeds_of_points`. Without any, the middle of the range is predicted.
+    shape : (int, int)
+        Of the level.
+    level : int
+        Its pixels are 2 to the power of `level` of full resolution.
+    low, high : int
+        Least and most offset, pixels of the level.
+
+    Returns
+    -------
+    Prediction
+    """
+    if seeds is None or not len(seeds):
+        predicted = np.full(shape, (low + high) // 2, dtype=np.float32)
+    else:
+        predicted = -interpolated_disparity(seeds, shape, 2.0**level)
+        predicted = np.clip(np.round(predicted * _SEED_STEPS) / _SEED_STEPS, low, high)
+    # To both sides as far as the farthest end of the range is from a prediction.
+    reach = int(np.ceil(max(high - float(predicted.min()), float(predicted.max()) - low))) + SPARE
+    depth = min(-(-(2 * reach + 1) // STEP) * STEP, MAX_DEPTH)
+    base = np.full(shape, -depth // 2, dtype=np.int32)
+    return Prediction(_in_steps(predicted), base, depth)
+
+
+def from_coarser(
+    offset: NDArray[np.int32], prior: Prediction, shape: tuple[int, ...], depth: int, radius: int
+) -> Prediction:
+    """What a level searches, from the offsets of the level above.
+
+    A pixel searches about its predicted offset, or with the window shifted so that all offsets of its neighbourhood
+    lie inside, where they fit. What was not found lies as far from what was predicted as the nearest that was.
+
+    Parameters
+    ----------
+    offset : (h, w) int32 ndarray
+        Of the coarser level, 1/256 of its pixels.
+    prior : Prediction
+        Of the coarser level.
+    shape : (int, int)
+        (H, W) of the finer level: 2 h and 2 w, or one less.
+    depth : int
+        Number of residuals that a pixel searches.
+    radius : int
+        Of the neighbourhood, pixels of the coarser level.
+
+    Returns
+    -------
+    Prediction
+    """
+    own = _filled(offset, prior)
+    least, most = (_repeated(2 * values, shape) for values in _neighbourhood(own, radius))
+    predicted = _upsample(2 * _mean_on_surfaces(own), shape)
+    half = depth / 2
+    above = np.maximum(most - predicted + (_CLEARANCE - half), 0)
+    below = np.maximum(predicted - least + (_CLEARANCE - half), 0)
+    # Where the neighbourhood does not fit, towards its middle.
+    shift = np.where((above > 0) & (below > 0), (above - below) / 2, above - below)
+    limit = half - _OWN_CLEARANCE
+    base = np.round(np.clip(shift, -limit, limit) - half).astype(np.int32)
+    return Prediction(_in_steps(predicted), base, depth)
+
+
+def searched_depth(low: int, high: int, most: int) -> int:
+    """Number of residuals to search in a range of offsets, of which one knows where to look: `most`, or less."""
+    return min(range_depth(low, high), most)
+
+
+def _in_steps(offset: NDArray[np.float32]) -> NDArray[np.int32]:
+    return np.round(offset * SUBPIXEL).astype(np.int32)
+
+
+def _filled(offset: NDArray[np.int32], prior: Prediction) -> NDArray[np.float32]:
+    """Offsets in pixels, without gaps or single outliers."""
+    valid = offset != INVALID
+    predicted = prior.offset.astype(np.float32) * np.float32(1 / SUBPIXEL)
+    if not valid.any():
+        return predicted
+    residual = offset.astype(np.float32) * np.float32(1 / SUBPIXEL) - predicted
+    filled = predicted + _fill_nearest(residual, valid)
+    return np.asarray(cv2.medianBlur(filled, MEDIAN_SIDE), dtype=np.float32)
+
+
+def _mean_on_surfaces(offset: NDArray[np.float32]) -> NDArray[np.float32]:
+    steps = _in_steps(offset)
+    mean = np.empty_like(steps)
+    _native.mean_offsets(steps, _MEAN_RADIUS, _MAX_STEP * SUBPIXEL, mean)
+    return mean.astype(np.float32) * np.float32(1 / SUBPIXEL)
+
+
+def _neighbourhood(values: NDArray[np.float32], radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Least and largest value within `radius` of every pixel."""
+    window = np.ones((2 * radius + 1,) * 2, dtype=np.uint8)
+    return np.asarray(cv2.erode(values, window)), np.asarray(cv2.dilate(values, window))
+
+
+def _repeated(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Twice the size, cut to `shape`."""
+    doubled = (2 * values.shape[1], 2 * values.shape[0])
+    return np.asarray(cv2.resize(values, doubled, interpolation=cv2.INTER_NEAREST)[: shape[0], : shape[1]])
+
+
+def _upsample(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Twice the size, cut to `shape`: interpolated on surfaces and repeated at steps."""
+    doubled = (2 * values.shape[1], 2 * values.shape[0])
+    least, most = _neighbourhood(values, 1)
+    flat = (most - least <= _MAX_SURFACE_STEP).astype(np.float32)
+    interpolated = cv2.resize(values, doubled, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
+    return np.where(_repeated(flat, shape) > 0, interpolated, _repeated(values, shape))
+
+
+def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Give pixels that are not valid the value of the nearest one that is."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(labels.max()) + 1, dtype=np.float32)
+    of_label[labels[valid]] = values[valid]
+    return np.asarray(of_label[labels], dtype=np.float32)
