@@ -67,9 +67,10 @@ static void add_row(const int32_t *own, const int32_t *other, ptrdiff_t width, p
                     int32_t *sum, int32_t *count) {
     const ptrdiff_t first = dx < 0 ? -dx : 0, end = dx > 0 ? width - dx : width;
     for (ptrdiff_t x = first; x < end; x++) {
-        /* Unsigned, as the difference of extremes wraps round. */
+        /* Unsigned, as the difference of extremes wraps round, to one of the other sign. */
         const int32_t difference = (int32_t)((uint32_t)other[x + dx] - (uint32_t)own[x]);
-        const int32_t kept = -(difference <= max_step && difference >= -max_step);
+        const int32_t kept = -((difference <= max_step) & (difference >= -max_step) &
+                               ((difference < 0) == (other[x + dx] < own[x])));
         sum[x] += difference & kept;
         count[x] -= kept;
     }
@@ -87,7 +88,7 @@ void mean_offsets(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int 
             }
         }
         for (ptrdiff_t x = 0; x < width; x++) {
-            mean[y * width + x] = (int32_t)((uint32_t)own[x] + (uint32_t)(sums[x] / counts[x]));
+            mean[y * width + x] = own[x] + sums[x] / counts[x];
         }
     }
 }
