@@ -5,7 +5,7 @@ STEP = 32
 MAX_DEPTH = 1024
 """And no larger."""
 SPARE = 1
-"""Offsets searched beyond either end of a range, so that a match at its end has neighbours for its sub-pixel fit."""
+"""Offsets searched beyond either end of a range, so that a match at its end has neighbours to be fitted to."""
 
 # Images of a level have no side shorter than this, and large ones have two levels above them at least: noise and
 # gaps shrink, while the whole range may be short.
