@@ -149,13 +149,11 @@ def warp(source, valid, prediction, margin, target_width):
         nearest = (place + 128) // 256
         if 0 <= nearest < source_width:
             columns[y, w] = nearest
-        if 0 <= place <= 256 * (source_width - 1):
-            before, after = place // 256, -(-place // 256)
+        if source_width:
+            before, after = (min(max(k, 0), source_width - 1) for k in (place // 256, -(-place // 256)))
             share = place % 256 / 256
             warped[y, w] = (1 - share) * float(source[y, before]) + share * float(source[y, after])
-            content[y, w] = min(valid[y, before], valid[y, after])
-        elif source_width:
-            warped[y, w] = source[y, min(max(nearest, 0), source_width - 1)]
+            content[y, w] = min(valid[y, before], valid[y, after]) if columns[y, w] >= 0 else 0
     return warped, content, columns
 
 

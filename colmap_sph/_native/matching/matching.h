@@ -91,8 +91,9 @@ typedef int fit_offsets_fn(const int32_t *offset, const uint64_t *reference, con
                            match_size size, int32_t *fitted);
 
 /* A source image as the reference is expected to see it: target pixel w shows what lies `prediction` (1/256 pixel)
- * from reference column w - margin; beyond the reference's sides the outermost predictions count. Content is what
- * is made of content alone. `columns` are the nearest ones of the source, -1 outside. */
+ * from reference column w - margin; beyond the reference's sides the outermost predictions count, and beyond those
+ * of the source its outermost pixels. `columns` are the nearest ones of the source, -1 outside. Content is what
+ * lies in one of them and is made of content alone. */
 void warp(const float *source, const uint8_t *valid, const int32_t *prediction, ptrdiff_t margin, match_size size,
           float *warped, uint8_t *warped_valid, int32_t *columns);
 

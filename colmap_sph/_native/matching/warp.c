@@ -16,19 +16,20 @@ void warp(const float *source, const uint8_t *valid, const int32_t *prediction, 
         for (ptrdiff_t w = 0; w < size.target_width; w++) {
             const int64_t place =
                 (int64_t)(w - margin) * 256 + prediction[y * size.width + within(w - margin, size.width)];
-            const int64_t column = place >> 8;
-            const int part = (int)(place & 255);
             const int64_t nearest = (place + 128) >> 8;
-            columns[out + w] = nearest < 0 ? -1 : nearest < size.source_width ? (int32_t)nearest : -1;
-            if (column < 0 || column + (part > 0) >= size.source_width) {
-                warped[out + w] = size.source_width > 0 ? row[within((ptrdiff_t)nearest, size.source_width)] : 0;
+            const int inside = nearest >= 0 && nearest < size.source_width;
+            columns[out + w] = inside ? (int32_t)nearest : -1;
+            if (size.source_width == 0) {
+                warped[out + w] = 0;
                 warped_valid[out + w] = 0;
                 continue;
             }
-            const ptrdiff_t next = (ptrdiff_t)column + (part > 0);
-            const float left = row[column], right = row[next];
-            warped[out + w] = left + (right - left) * ((float)part / 256);
-            warped_valid[out + w] = row_valid[column] < row_valid[next] ? row_valid[column] : row_valid[next];
+            const int part = (int)(place & 255);
+            const ptrdiff_t column = within((ptrdiff_t)(place >> 8), size.source_width);
+            const ptrdiff_t next = within((ptrdiff_t)(place >> 8) + (part > 0), size.source_width);
+            const uint8_t both = row_valid[column] < row_valid[next] ? row_valid[column] : row_valid[next];
+            warped[out + w] = row[column] + (row[next] - row[column]) * ((float)part / 256);
+            warped_valid[out + w] = inside ? both : 0;
         }
     }
 }
