@@ -283,8 +283,9 @@ def _with_border(image: NDArray[Any], border: tuple[int, int, int, int], kind: i
 
 
 def _census(image: RectifiedImage) -> NDArray[np.uint64]:
-    sharp = cv2.filter2D(image.image, cv2.CV_32F, _UNSHARP, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
-    padded = _with_border(sharp, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
+    # Sharpened with its border, which a warped image has inside.
+    padded = _with_border(image.image, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
+    padded = cv2.filter2D(padded, cv2.CV_32F, _UNSHARP, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
     census = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), census)
     return census
