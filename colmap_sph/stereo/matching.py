@@ -226,13 +226,14 @@ def match_pair(
     for level in range(levels, -1, -1):
         low, high = least >> level, -(-most >> level)
         shape = lefts[-1].image.shape
+        most_searched = options.disparities if level == 0 else options.coarse_disparities
+        depth = searched_depth(low, high, MAX_DEPTH if offset is None else most_searched)
         if offset is None:
             prediction = from_seeds(seeds, shape, level, low, high)
         else:
-            depth = searched_depth(low, high, options.disparities if level == 0 else options.coarse_disparities)
             prediction = from_coarser(offset, prediction, shape, depth, options.range_radius)
         offset = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
-        offset[(offset < (low - SPARE) * SUBPIXEL) | (offset > (high + SPARE) * SUBPIXEL)] = INVALID
+        _drop_outside(offset, low - SPARE, max(high + SPARE, low - SPARE + depth - 1))
         if sky is not None:
             _drop_beyond(offset, farthest, sky, level)
         if level > 0 or options.median_filter:
@@ -248,6 +249,11 @@ def _sky_offset(min_disparity: float, max_disparity: float, infinity: float | No
         return None
     beyond = min_disparity - infinity
     return -infinity if 0 < beyond <= _NEAR_RANGE * (max_disparity - min_disparity) else None
+
+
+def _drop_outside(offset: NDArray[np.int32], first: int, last: int) -> None:
+    """Invalidate, in place, what does not lie between two offsets, pixels, as windows about predictions reach."""
+    offset[(offset < first * SUBPIXEL) | (offset > last * SUBPIXEL)] = INVALID
 
 
 def _drop_beyond(offset: NDArray[np.int32], farthest: int, sky: float, level: int) -> None:
