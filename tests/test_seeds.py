@@ -9,7 +9,7 @@ from rendered import disparities, scene_of_pair
 from colmap_sph import synthetic as syn
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
-from colmap_sph.stereo.rectified_pair import RectifiedPair
+from colmap_sph.stereo.rectified_pair import RectifiedPair, Surface
 from colmap_sph.stereo.search import seeds
 from colmap_sph.stereo.search.seeds import finer_first, interpolated_disparity, seeds_of_points, shared_points
 
@@ -69,7 +69,7 @@ PAIRS = {
 }
 
 
-def rectified(name: str, surface: str) -> tuple[Scene, View, View, RectifiedPair]:
+def rectified(name: str, surface: Surface) -> tuple[Scene, View, View, RectifiedPair]:
     scene, left, right = scene_of_pair(PAIRS[name])
     return scene, left, right, rectify_pair(scene, left, right, RectificationOptions(surface=surface))
 
@@ -77,7 +77,7 @@ def rectified(name: str, surface: str) -> tuple[Scene, View, View, RectifiedPair
 @pytest.mark.parametrize(
     ("name", "surface"), [("convergent", "spherical"), ("convergent", "frame"), ("forward", "spherical")]
 )
-def test_seeds_lie_where_the_points_are_seen(name: str, surface: str) -> None:
+def test_seeds_lie_where_the_points_are_seen(name: str, surface: Surface) -> None:
     """Those that both images show, in their order, to a quarter of a pixel."""
     scene, left, right, pair = rectified(name, surface)
     points = shared_points(scene, left, right)

@@ -4,8 +4,8 @@ Census (9 × 7) of the sharpened images, Hamming cost, aggregation along 8 paths
 of the matches from left and from right, sub-pixel fit without pixel locking, and removal of small segments, on an
 image pyramid, each level about what the one above it predicts (Rothermel et al. 2012, "tSGM"; see `prediction`).
 
-This module is the only caller of the matching kernels. Their convention is an *offset*, target column minus
-reference column; with the left image as reference it is minus the disparity.
+This module and `prediction` are the only callers of the matching kernels. Their convention is an *offset*, target
+column minus reference column; with the left image as reference it is minus the disparity.
 """
 
 from dataclasses import dataclass
