@@ -90,15 +90,21 @@ def run_aggregation(backend, cost, base, image, p1, p2, max_slant=0):
     return aggregated
 
 
-def run_selection(backend, aggregated, base, reference, target, max_difference, max_excess=0, shown=None):
-    """`shown` are the target's columns in its source and the source's width; without, it is the source."""
+Shown = tuple[np.ndarray, int]  # columns of the source that a target shows, and the source's width
+
+
+def run_selection(
+    backend, aggregated, base, reference, target, max_difference, max_excess=0, shown: Shown | None = None
+):
+    """Without `shown` the target is its own source."""
     offset = np.full(base.shape, 5, dtype=np.int32)
-    shown = unwarped(target.shape) if shown is None else shown
-    _native.selection(backend, aggregated, base, reference, target, *shown, max_difference, max_excess, offset)
+    columns, width = unwarped(target.shape) if shown is None else shown
+    images = reference, target, columns
+    _native.selection(backend, aggregated, base, *images, width, max_difference, max_excess, offset)
     return offset
 
 
-def unwarped(shape):
+def unwarped(shape) -> Shown:
     """Columns of a target that is its own source, and its width."""
     return np.tile(np.arange(shape[1], dtype=np.int32), (shape[0], 1)), shape[1]
 
@@ -306,7 +312,7 @@ def test_selection_from_a_warped_target_is_the_oracles(
     base = bases(rng, size, kind)
     shown = source_columns(rng, target.shape, columns, source_width), source_width
     np.testing.assert_array_equal(
-        run_selection(backend, aggregated, base, reference, target, *limits, shown),
+        run_selection(backend, aggregated, base, reference, target, limits[0], limits[1], shown),
         oracle.selection(aggregated, base, reference, target, *shown, *limits),
     )
 
@@ -623,12 +629,14 @@ def test_means_leave_out_what_is_of_another_surface():
 # ---- the whole chain ---------------------------------------------------------------------------------------
 
 
-def run_match(backend, images, shown, bases_, image, p1, p2, max_slant, check, depth, rows):
-    """`images` are the census of reference and target, `bases_` the base and the surface."""
-    base = bases_[0]
+def run_match(backend, images, bases_, image, p1, p2, max_slant, check: tuple[int, int], depth, rows):
+    """`images` are the census of reference and target and what the target shows, `bases_` base and surface."""
+    reference, target, columns, width = images
+    base, surface = bases_
     scratch = np.full((2, rows * base.shape[1], depth), 77, dtype=np.uint8)
     offset = np.full(base.shape, 5, dtype=np.int32)
-    _native.match(backend, *images, *shown, *bases_, image, p1, p2, max_slant, *check, scratch, offset)
+    given = reference, target, columns, width, base, surface, image
+    _native.match(backend, *given, p1, p2, max_slant, *check, scratch, offset)
     return offset
 
 
@@ -657,6 +665,6 @@ def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind
     expected = oracle.selection(sums, base, reference, target, *shown, 2, 5)
     # In one piece, and in bands of rows: to the bit the same.
     for rows in {1, 2, 3, size[0], size[0] + 1}:
-        images = reference, target
-        offset = run_match(backend, images, shown, (base, surface), image, 10, p2, 2, (2, 5), depth, rows)
+        images = reference, target, *shown
+        offset = run_match(backend, images, (base, surface), image, 10, p2, 2, (2, 5), depth, rows)
         np.testing.assert_array_equal(offset, expected)

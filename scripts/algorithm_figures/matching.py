@@ -48,11 +48,11 @@ class Level:
     depth: int
     offset: NDArray[np.int32]
 
-    def disparity(self, row: int, column: int, offset: NDArray[np.floating]) -> NDArray[np.float64]:
+    def disparity(self, row: int, column: int, offset: NDArray[Any]) -> NDArray[np.float64]:
         """Disparities, pixels, of a pixel's offsets in the warped image, pixels."""
         residual = offset - self.margin
         predicted = np.interp(column + residual, np.arange(self.prediction.shape[1]), self.prediction[row])
-        return -(residual + predicted / 256)
+        return np.asarray(-residual - predicted / 256)
 
 
 @contextmanager
