@@ -1,10 +1,17 @@
 """Analytic scenes with exact depth and normals, stereo pairs for tests, and the demo block.
 
 Each module imports only those before it: texture, primitives, terrain, rays, light, photographs' sky and optics,
-render, pairs, ground, village, model, photographs, capture, block, street.
+render, pairs, ground, village, model, photographs, capture, block, street, canyon.
 """
 
 from colmap_sph.synthetic.block import BlockOptions, DemoBlock, demo_cameras, make_demo_block
+from colmap_sph.synthetic.canyon import (
+    CanyonOptions,
+    build_canyon,
+    canyon_cameras,
+    canyon_gsd,
+    make_canyon_block,
+)
 from colmap_sph.synthetic.capture import Capture, CaptureOptions, read_truth, write_capture
 from colmap_sph.synthetic.light import Light, ShadowMap
 from colmap_sph.synthetic.model import (
@@ -49,6 +56,7 @@ __all__ = [
     "Bending",
     "BlockOptions",
     "Camera",
+    "CanyonOptions",
     "Capture",
     "CaptureOptions",
     "ConvexPolyhedron",
@@ -76,9 +84,12 @@ __all__ = [
     "Terrain",
     "Village",
     "box",
+    "build_canyon",
     "build_reconstruction",
     "build_street",
     "build_village",
+    "canyon_cameras",
+    "canyon_gsd",
     "convergent_pair",
     "demo_cameras",
     "epipole_inside_pair",
@@ -87,6 +98,7 @@ __all__ = [
     "forward_motion_pair",
     "gabled_house",
     "look_at",
+    "make_canyon_block",
     "make_demo_block",
     "make_street_block",
     "photograph",

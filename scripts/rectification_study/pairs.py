@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.evaluation import DepthView, truth_at_pixel_origin, truth_normals_at_pixel_origin
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.pair_files import read_pair
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectified_pair import PairDisparity, Surface
 from colmap_sph.stereo.vote import depth_candidates, right_disparity
@@ -23,6 +24,9 @@ CORRECT = 2.0
 ANGLE_EDGES = (0.0, 10.0, 25.0, 40.0, 55.0, 75.0, 180.0)
 SLOPE_EDGES = (0.0, 20.0, 45.0, 70.0, 90.0)
 """Of surfaces against the plane that frame rectification uses, degrees."""
+
+# A street far ahead changes its depth by so much of it from pixel to pixel, and is no edge.
+_STEEPEST = 0.2
 
 PairScores = dict[str, Any]
 Map = NDArray[np.float32]
@@ -37,7 +41,14 @@ class ExactMaps:
         self.normals = lru_cache(maxsize=20)(self._normals)
 
     def _depth(self, name: str) -> Map | None:
-        return truth_at_pixel_origin(self.views[name].read_depth()) if name in self.views else None
+        if name not in self.views:
+            return None
+        return truth_at_pixel_origin(self.views[name].read_depth(), largest_step=_STEEPEST)
+
+    def known(self, view: View) -> Map:
+        """Exact depth of every pixel, 0 = unknown."""
+        depth = self.depth(view.name)
+        return np.zeros((view.height, view.width), np.float32) if depth is None else depth
 
     def _normals(self, name: str) -> Map | None:
         view = self.views.get(name)
@@ -65,8 +76,13 @@ class ExactMaps:
 @cache
 def pair_files(run: Run) -> dict[tuple[str, str], Path]:
     """File of every pair that a run matched, by the names of its images."""
+    return pair_files_of(run.workspace)
+
+
+def pair_files_of(workspace: Workspace) -> dict[tuple[str, str], Path]:
+    """File of every pair that was matched in a workspace, by the names of its images."""
     found = {}
-    for file in sorted((run.workspace.state_dir / "pairs").glob("*.sph")):
+    for file in sorted((workspace.state_dir / "pairs").glob("*.sph")):
         pair = read_pair(file)
         found[pair.left, pair.right] = file
     return found
