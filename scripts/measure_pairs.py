@@ -3,8 +3,8 @@
     python scripts/measure_pairs.py --scene walk --output /tmp/pairs
     python scripts/measure_pairs.py --scene drive --width 960 --output /tmp/pairs --rectification.sampling 1.4
 
-Renders the scene into OUTPUT unless it is there, runs the program beside it (what has not changed is not done again)
-and prints a table. `study_rectification.py` compares sphere and frame.
+Renders the scene into OUTPUT unless it is there, runs the program beside it (what has not changed is not done
+again) and prints a table. `study_rectification.py` compares sphere and frame.
 """
 
 import sys
@@ -23,6 +23,7 @@ from colmap_sph.app.evaluate_command import exact_depth_views
 from colmap_sph.errors import ColmapSphError
 from colmap_sph.evaluation import DepthView
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.stages.pair_files import read_pair
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -76,7 +77,7 @@ def _score_pair(
     options: RunOptions,
 ) -> dict[str, Any]:
     left, right = (scene.view(name) for name in pair)
-    disparity = pairs.read_pair(files[pair]) if pair in files else None
+    disparity = read_pair(files[pair]) if pair in files else None
     depths = None if disparity is None else pairs.pair_depths(left, right, disparity, options)
     counts = found.count_pair((left, right), depths, (maps.known(left), maps.known(right)))
     cosine = float(np.clip(left.viewing_direction @ right.viewing_direction, -1, 1))

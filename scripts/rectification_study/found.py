@@ -1,4 +1,4 @@
-"""What a pair finds of the surface that both of its images see, and how much of it is right: pixels of the originals.
+"""What a pair finds of the surface that both of its images see, and how much of it is right, in their pixels.
 
 Nothing here depends on how the pair was rectified, so that surfaces, samplings and programs compare.
 """
