@@ -1,7 +1,7 @@
 """Analytic scenes with exact depth and normals, stereo pairs for tests, and the demo block.
 
 Each module imports only those before it: texture, primitives, terrain, rays, light, photographs' sky and optics,
-render, pairs, ground, village, model, photographs, capture, block, street, canyon.
+render, pairs, ground, village, model, photographs, capture, block, street, canyon, town.
 """
 
 from colmap_sph.synthetic.block import BlockOptions, DemoBlock, demo_cameras, make_demo_block
@@ -49,6 +49,7 @@ from colmap_sph.synthetic.street import (
 )
 from colmap_sph.synthetic.terrain import Terrain
 from colmap_sph.synthetic.texture import Facade, Material, Mottled, Noise, Painting, RoofTiles
+from colmap_sph.synthetic.town import TownOptions, make_town_block, town_cameras
 from colmap_sph.synthetic.village import Village, build_village
 
 __all__ = [
@@ -82,6 +83,7 @@ __all__ = [
     "Surface",
     "SyntheticPair",
     "Terrain",
+    "TownOptions",
     "Village",
     "box",
     "build_canyon",
@@ -101,6 +103,7 @@ __all__ = [
     "make_canyon_block",
     "make_demo_block",
     "make_street_block",
+    "make_town_block",
     "photograph",
     "pinhole",
     "read_truth",
@@ -111,6 +114,7 @@ __all__ = [
     "sphere",
     "street_cameras",
     "street_gsd",
+    "town_cameras",
     "trace_points",
     "visible",
     "write_capture",
