@@ -44,7 +44,7 @@ def test_pairs_are_summed_by_angle():
     pairs = importlib.import_module("rectification_study.pairs")
     scored = [
         made_up_pair(5.0, (100, 80, 1000), (110, 90, 900)),
-        made_up_pair(8.0, (50, 40, 500), (40, 40, 400)),
+        made_up_pair(7.0, (50, 40, 500), (40, 40, 400)),
         made_up_pair(90.0, None, (30, 20, 300)),
     ]
     near, wide, every = pairs.by_angle(scored)
@@ -52,7 +52,7 @@ def test_pairs_are_summed_by_angle():
     assert (wide["frame"]["skipped"], wide["frame"]["warped"], wide["spherical"]["matched"]) == (1, 0, 30)
     assert (every["pairs"], every["frame"]["warped"], every["spherical"]["warped"]) == (3, 1500, 1600)
     assert wide["frame"]["median_error_gsd"] is None
-    assert [pair["right"] for pair in pairs.telling_pairs(scored, 3)] == ["b5.0.jpg", "b8.0.jpg"]
+    assert [pair["right"] for pair in pairs.telling_pairs(scored, 3)] == ["b5.0.jpg", "b7.0.jpg"]
 
 
 def test_errors_are_in_pixels_on_the_ground_and_slopes_against_a_plane():

@@ -1,4 +1,4 @@
-"""A convergent oblique block over a made-up town of tall buildings: pictures, COLMAP model and exact depth on disk."""
+"""A convergent oblique block over a made-up town of tall buildings: pictures, model and exact depth on disk."""
 
 from __future__ import annotations
 

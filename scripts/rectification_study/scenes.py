@@ -11,8 +11,8 @@ import numpy as np
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
 
-SceneName = Literal["penta", "walk", "drive"]
-"""The shared block; a street passed with a picture every metre, and one every three."""
+SceneName = Literal["penta", "walk", "drive", "town"]
+"""The shared block; a street passed with a picture every metre, and every three; a convergent oblique block."""
 
 
 @dataclass(frozen=True)
@@ -82,4 +82,16 @@ def _canyon(step: float) -> Callable[[Path, int, int], syn.Capture]:
     return make
 
 
-_RENDERED: dict[str, Callable[[Path, int, int], syn.Capture]] = {"walk": _canyon(1.0), "drive": _canyon(3.0)}
+def _town(folder: Path, width: int, threads: int) -> syn.Capture:
+    # The same ground whatever the width.
+    options = syn.TownOptions(
+        width=width, height=width * 2 // 3, nadir_gsd=96 / width, oblique_gsd=110 / width, points=8000
+    )
+    return syn.make_town_block(folder, options, threads=threads)
+
+
+_RENDERED: dict[str, Callable[[Path, int, int], syn.Capture]] = {
+    "walk": _canyon(1.0),
+    "drive": _canyon(3.0),
+    "town": _town,
+}
