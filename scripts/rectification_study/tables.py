@@ -133,8 +133,8 @@ def _exact(clouds: Mapping[str, Any], depth_maps: Mapping[str, Any]) -> str:
     for key, label in (("median_error_gsd", "median error [GSD]"), ("median_normal_angle_deg", "normals [deg]")):
         frame, spherical = of_maps(key)
         if frame is not None and spherical is not None:
-            values = [f"{frame:.4f}", f"{spherical:.4f}", change(frame, spherical)]
-            rows.append([f"geometric depth maps: {label}", *values])
+            cells = [f"{frame:.4f}", f"{spherical:.4f}", change(frame, spherical)]
+            rows.append([f"geometric depth maps: {label}", *cells])
     return table(["", "frame", "spherical", "difference"], rows)
 
 
