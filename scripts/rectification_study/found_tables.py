@@ -21,7 +21,7 @@ def sections(content: Mapping[str, Any]) -> str:
         _table("angle [deg]", angles, "found"),
         _table("baseline / distance", bases, "found"),
     ]
-    if angles[-1]["common_pairs"]:
+    if 0 < angles[-1]["common_pairs"] < angles[-1]["pairs"]:
         parts += [
             "Only the pairs that both surfaces can rectify:",
             _table("angle [deg]", angles, "found_common"),
