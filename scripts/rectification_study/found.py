@@ -28,7 +28,7 @@ def seen_by_both(view: View, other: View, truth: Map, other_truth: Map) -> NDArr
     ----------
     view, other : View
     truth, other_truth : (H, W) float32 ndarray
-        Exact z-depth at COLMAP's pixel origin; 0 = unknown.
+        Exact z-depth at COLMAP's pixel origin; 0 = unknown, as it is at edges where it is made of that at centres.
 
     Returns
     -------
