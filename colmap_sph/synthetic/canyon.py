@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +29,7 @@ _AHEAD = 75.0
 _DISTANCE = 10.0
 _FOCAL = 0.75
 # The way weaves: metres to both sides, metres of a period; and whoever holds the camera looks about, radians.
-_WEAVE = (0.25, 9.0)
+_WEAVE = (0.25, 9.7)
 _GLANCE = np.radians(3.0)
 
 _PLASTER: tuple[Colour, ...] = (
@@ -97,7 +97,7 @@ def build_canyon(gsd: float, way: float, seed: int) -> tuple[Surface, ...]:
         The carriageway first.
     """
     rng = np.random.default_rng((seed, 47))
-    noise = Noise(gsd, seed)
+    noise = Noise(gsd, seed, tile=2048)
     start, end = -_BEHIND, way + _AHEAD
     surfaces: list[Surface] = [_carriageway(noise, start, end, rng), *_patches(noise, start, end, rng)]
     for side in (-1.0, 1.0):
@@ -135,7 +135,8 @@ def _carriageway(noise: Noise, start: float, end: float, rng: np.random.Generato
     middle = np.arange(start - 20.0, end + 20.0, 0.5)
     road = Road(np.column_stack([np.zeros_like(middle), middle]), _CARRIAGEWAY)
     asphalt = paint_ground((-16.0, start - 20.0, 16.0, end + 20.0), noise, [], [road], rng)
-    return Plane((0, 0, 0), (0, 0, 1), asphalt, (60.0, end + 40.0))
+    # Who goes straight on must not meet the same noise again.
+    return Plane((0, 0, 0), (0, 0, 1), replace(asphalt, turn=0.6), (60.0, end + 40.0))
 
 
 def _patches(noise: Noise, start: float, end: float, rng: np.random.Generator) -> list[Surface]:

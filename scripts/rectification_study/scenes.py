@@ -12,7 +12,7 @@ from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
 
 SceneName = Literal["penta", "walk", "drive", "town"]
-"""The shared block; a street passed with a picture every metre, and every three; a convergent oblique block."""
+"""The shared block; a street passed with a picture every metre, and every 2.8; a convergent oblique block."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,6 @@ def _town(folder: Path, width: int, threads: int) -> syn.Capture:
 
 _RENDERED: dict[str, Callable[[Path, int, int], syn.Capture]] = {
     "walk": _canyon(1.0),
-    "drive": _canyon(3.0),
+    "drive": _canyon(2.8),
     "town": _town,
 }
