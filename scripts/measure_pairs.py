@@ -116,18 +116,20 @@ def _label(value: float, by: str) -> str:
 
 
 def map_table(workspace: Workspace, exact: list[DepthView], scene: Scene, coverage: float) -> str:
-    """Coverage of all pixels and of those of known depth, and how many of these are right, of all maps."""
+    """Coverage of all pixels, of those of known depth, how many of these are right, and of the sky."""
     maps = pairs.ExactMaps(exact)
+    empty = {view.name: view.read_depth() == 0 for view in exact}
     rows = []
     for kind in ("photometric", "geometric"):
-        known = covered = percent = gsd = 0
-        for view in scene.views:
-            counts = _count_map(view, read_depth_map(workspace.depth_map_path(view.name, kind)), maps.known(view))
-            known, covered = known + counts[0], covered + counts[1]
-            percent, gsd = percent + counts[2], gsd + counts[3]
+        depths = {view.name: read_depth_map(workspace.depth_map_path(view.name, kind)) for view in scene.views}
+        counts = [_count_map(view, depths[view.name], maps.known(view)) for view in scene.views]
+        known, covered, percent, gsd = np.sum(counts, axis=0)
         cells = [covered / max(known, 1), percent / max(covered, 1), gsd / max(covered, 1)]
+        sky = [(depths[name] > 0)[nothing] for name, nothing in empty.items()]
+        cells.append(np.concatenate(sky).mean() if any(map(len, sky)) else 0.0)
         rows.append([kind, f"{coverage:.3f}" if kind == "geometric" else "-", *(f"{cell:.3f}" for cell in cells)])
-    return table(["maps", "coverage", "found of truth", "of found: < 1 %", "< 1 GSD"], rows)
+    header = ["maps", "coverage", "found of truth", "of found: < 1 %", "< 1 GSD", "found where nothing is"]
+    return table(header, rows)
 
 
 def _count_map(view: View, depth: found.Map, truth: found.Map) -> tuple[int, int, int, int]:

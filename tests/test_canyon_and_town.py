@@ -226,13 +226,13 @@ def test_a_walk_down_the_street_is_reconstructed(street: syn.Capture, capsys: py
     pairs, not_rectified, found, _, _, within_1_pixel, _ = rows["1"]
     assert (pairs, not_rectified) == (5, 0)
     assert found > 0.75 and within_1_pixel > 0.93
-    _, found, within_1_percent, _ = rows["geometric"]
+    _, found, within_1_percent, _, of_sky = rows["geometric"]
     # A percent of the depth of what is far ahead is a twentieth of a pixel in pictures as small.
     assert found > 0.65 and within_1_percent > 0.45
 
     # The same from the maps themselves and the exact depth at their pixels, away from edges.
     workspace = Workspace(street.root.parent / f"walk-{STREET.width}-spherical")
-    known = covered = right = 0
+    known = covered = right = sky = in_sky = 0
     for name in street.names:
         truth, _ = street.truth(name)
         depth = read_depth_map(workspace.depth_map_path(name, "geometric"))
@@ -240,6 +240,8 @@ def test_a_walk_down_the_street_is_reconstructed(street: syn.Capture, capsys: py
         smooth = (truth > 0) & np.all(np.abs(around - truth) < 0.05 * truth, axis=0)
         both = smooth & (depth > 0)
         known, covered = known + smooth.sum(), covered + both.sum()
+        sky, in_sky = sky + (truth == 0).sum(), in_sky + (depth[truth == 0] > 0).sum()
         right += (np.abs(depth[both] / truth[both] - 1) <= 0.01).sum()
     assert covered / known == pytest.approx(found, abs=0.05)
+    assert in_sky / sky == pytest.approx(of_sky, abs=0.05)
     assert right / covered == pytest.approx(within_1_percent, abs=0.05)
