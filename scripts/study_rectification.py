@@ -134,7 +134,7 @@ def measured(
         "points": {surface: run.points() for surface, run in results.items()},
         "pairs": scored,
         "by_angle": pairs.by_angle(scored),
-        "by_base": pairs.by_base(scored),
+        "by_parallax": pairs.by_parallax(scored),
     }
     done = {surface: run for surface, run in results.items() if not run.failure}
     if study.lidar is not None and len(done) == len(results):

@@ -1,4 +1,4 @@
-"""What pairs find of what both images see, frame against sphere, by angle and by baseline."""
+"""What pairs find of what both images see, frame against sphere, by angle and by parallax."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,18 +14,18 @@ _WORDS = ("found", "within 1 % of depth", "within 1 GSD", "within 1 px")
 
 def sections(content: Mapping[str, Any]) -> str:
     """All of it, as Markdown."""
-    angles, bases = content["by_angle"], content["by_base"]
+    angles, parallaxes = content["by_angle"], content["by_parallax"]
     parts = [
         lost(angles[-1]),
         "All pairs, in which a surface that cannot rectify a pair finds nothing:",
-        _table("angle [deg]", angles, "found"),
-        _table("baseline / distance", bases, "found"),
+        _table("angle between views [deg]", angles, "found"),
+        _table("parallax [deg]", parallaxes, "found"),
     ]
     if 0 < angles[-1]["common_pairs"] < angles[-1]["pairs"]:
         parts += [
             "Only the pairs that both surfaces can rectify:",
-            _table("angle [deg]", angles, "found_common"),
-            _table("baseline / distance", bases, "found_common"),
+            _table("angle between views [deg]", angles, "found_common"),
+            _table("parallax [deg]", parallaxes, "found_common"),
         ]
     parts.append(
         "Shares of the pixels of the original images whose exact surface both images of a pair see. Found: with a "

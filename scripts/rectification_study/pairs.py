@@ -23,8 +23,8 @@ from rectification_study.runs import SURFACES, Run
 CORRECT = 2.0
 """A depth is correct up to this error, in GSD of its pixel."""
 ANGLE_EDGES = (0.0, 8.0, 15.0, 25.0, 40.0, 50.0, 60.0, 75.0, 180.0)
-BASE_EDGES = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 1000.0)
-"""Of baselines over the distance of what both images see."""
+PARALLAX_EDGES = (0.0, 2.0, 4.0, 8.0, 15.0, 25.0, 40.0, 50.0, 60.0, 75.0, 180.0)
+"""Of the angle at the sparse points that both images see between the rays to their centres, degrees."""
 SLOPE_EDGES = (0.0, 20.0, 45.0, 70.0, 90.0)
 """Of surfaces against the plane that frame rectification uses, degrees."""
 
@@ -113,8 +113,8 @@ def score_pairs(
     Returns
     -------
     list of dict
-        ``left``, ``right``, ``view_angle_deg`` between the viewing directions, ``base_to_distance`` (the baseline
-        over the median distance of the sparse points of both), and per surface either ``skipped`` (why), or:
+        ``left``, ``right``, ``view_angle_deg`` between the viewing directions, ``parallax_deg`` (the median angle
+        at the sparse points of both between the rays to their centres), and per surface ``skipped`` (why), or:
         ``matched`` pixels of the two original images that the pair gives a depth; ``warped`` pixels, those of the
         rectified images. With exact depth also ``correct`` pixels, those of every class of slopes where the pair
         was matched on both, ``median_error_gsd``, and that of the pixels matched on both,
@@ -151,9 +151,11 @@ def score_pairs(
 def _geometry_of(scene: Scene, left: View, right: View) -> dict[str, float]:
     cosine = float(np.clip(left.viewing_direction @ right.viewing_direction, -1, 1))
     both = scene.points[np.intersect1d(left.point_indices, right.point_indices)]
-    distance = np.median(np.linalg.norm(both - left.center, axis=1)) if len(both) else np.inf
-    baseline = np.linalg.norm(right.center - left.center)
-    return {"view_angle_deg": float(np.degrees(np.arccos(cosine))), "base_to_distance": float(baseline / distance)}
+    rays = [both - view.center for view in (left, right)]
+    first, second = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    angles = np.arccos(np.clip(np.sum(first * second, axis=1), -1, 1))
+    parallax = float(np.degrees(np.median(angles))) if len(both) else 0.0
+    return {"view_angle_deg": float(np.degrees(np.arccos(cosine))), "parallax_deg": parallax}
 
 
 def _exact_scores(
@@ -191,9 +193,9 @@ def by_angle(scored: Sequence[PairScores]) -> list[dict[str, Any]]:
     return _classed(scored, "view_angle_deg", ANGLE_EDGES)
 
 
-def by_base(scored: Sequence[PairScores]) -> list[dict[str, Any]]:
-    """Sums over the pairs of each class of baselines over distances, and over all."""
-    return _classed(scored, "base_to_distance", BASE_EDGES)
+def by_parallax(scored: Sequence[PairScores]) -> list[dict[str, Any]]:
+    """Sums over the pairs of each class of parallax angles, and over all."""
+    return _classed(scored, "parallax_deg", PARALLAX_EDGES)
 
 
 def _classed(scored: Sequence[PairScores], key: str, edges: Sequence[float]) -> list[dict[str, Any]]:
