@@ -290,17 +290,17 @@ def test_selection_is_the_oracles(backend, size, target_width, depth, kind, sums
 
 
 @every_backend
-@property_test
+@settings(property_test, max_examples=100)
 @given(
-    size=sizes,
-    target_width=st.integers(1, 80),
+    size=st.tuples(st.integers(1, 3), st.integers(15, 60)),
+    target_width=st.integers(20, 80),
     source_width=st.integers(0, 100),
-    depth=st.sampled_from(DEPTHS[:3]),
+    depth=st.sampled_from(DEPTHS[:2]),
     kind=st.sampled_from(["left", "smooth", "rough"]),
     columns=st.sampled_from(list(COLUMNS)),
-    sums=st.sampled_from([(0, 255), (0, 3), (250, 255), (255, 255)]),
-    invalid=st.sampled_from([0.0, 0.2]),
-    limits=st.tuples(st.sampled_from([0, 2, INT32.max]), st.sampled_from([0, 1, 40, INT32.max])),
+    sums=st.sampled_from([(0, 255), (0, 40), (240, 255)]),
+    invalid=st.sampled_from([0.0, 0.1]),
+    limits=st.tuples(st.sampled_from([0, 2, 5]), st.sampled_from([0, 1, 20])),
     seed=seeds,
 )
 def test_selection_from_a_warped_target_is_the_oracles(

@@ -1,6 +1,7 @@
 """Matching on rendered pairs against exact disparities."""
 
 import functools
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy import ndimage
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
+from colmap_sph.pipeline.stages.match import _MATCH_BYTES
 from colmap_sph.stereo import matching
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import (
@@ -449,3 +451,14 @@ def test_scratch_memory_is_what_a_plan_says(most):
     scratch = Scratch()
     match_pair(image, image, 0, most, MatchingOptions(), scratch)
     assert scratch._memory.size == pytest.approx(scratch_bytes(320 * 480, MatchingOptions()), rel=0.1)
+
+
+def test_memory_is_what_a_plan_says():
+    """Of arrays, beside the scratch memory; the rest of what a plan takes is for OpenCV's own."""
+    shape = (480, 640)
+    scratch = Scratch(max_bytes=0)
+    tracemalloc.start()
+    match_pair(random_image(shape), random_image(shape, 1), -200, 200, OPTIONS, scratch)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 0.7 * _MATCH_BYTES < peak / (shape[0] * shape[1]) < 0.9 * _MATCH_BYTES

@@ -47,7 +47,7 @@ _SECONDS = 0.1
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …
-_MATCH_BYTES = 44.0
+_MATCH_BYTES = 53.0
 # … while an image is read and rectified: per pixel of its own, and per left rectified pixel of both.
 _READ_BYTES = 11.0
 _RECTIFIED_BYTES = 10.0

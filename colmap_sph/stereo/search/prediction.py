@@ -58,7 +58,10 @@ class Prediction:
     @property
     def first(self) -> NDArray[np.int32]:
         """(H, W) int32 first offset to search, pixels."""
-        return self.base + (self.offset + SUBPIXEL // 2) // SUBPIXEL
+        first = self.offset + np.int32(SUBPIXEL // 2)
+        first //= SUBPIXEL
+        first += self.base
+        return first
 
     @property
     def margin(self) -> int:
@@ -120,15 +123,22 @@ def from_coarser(
     Prediction
     """
     own = _filled(offset, prior)
-    least, most = (_repeated(2 * values, shape) for values in _neighbourhood(own, radius))
     predicted = _upsample(2 * _mean_on_surfaces(own), shape)
+    least, most = (_repeated(2 * values, shape) for values in _neighbourhood(own, radius))
+    del own
     half = depth / 2
-    above = np.maximum(most - predicted + (_CLEARANCE - half), 0)
-    below = np.maximum(predicted - least + (_CLEARANCE - half), 0)
+    # In place: arrays of the finer level are large.
+    above = np.maximum(np.subtract(most, predicted, out=most) + (_CLEARANCE - half), 0, out=most)
+    below = np.maximum(np.subtract(predicted, least, out=least) + (_CLEARANCE - half), 0, out=least)
     # Where the neighbourhood does not fit, towards its middle.
-    shift = np.where((above > 0) & (below > 0), (above - below) / 2, above - below)
+    both = (above > 0) & (below > 0)
+    shift = np.subtract(above, below, out=above)
+    shift[both] /= 2
     limit = half - _OWN_CLEARANCE
-    base = np.round(np.clip(shift, -limit, limit) - half).astype(np.int32)
+    np.clip(shift, -limit, limit, out=shift)
+    shift -= half
+    base = np.round(shift, out=shift).astype(np.int32)
+    del most, least, above, below, both, shift
     return Prediction(_in_steps(predicted), base, depth)
 
 
