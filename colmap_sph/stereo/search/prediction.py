@@ -46,8 +46,8 @@ class Prediction:
     depth : int
         Number of residuals to search.
     exact : bool
-        Neighbours with the same residual are of one surface, whatever their `base`. Else those are of which `first`
-        differs by no more than a slope does, slot by slot: predictions may end where surfaces do.
+        Neighbours with the same residual are of one surface, whatever their `base`. Else those are of which
+        `first` differs by no more than a slope does, slot by slot: predictions may end where surfaces do.
     """
 
     offset: NDArray[np.int32]
@@ -102,8 +102,9 @@ def from_coarser(
 ) -> Prediction:
     """What a level searches, from the offsets of the level above.
 
-    A pixel searches about its predicted offset, or with the window shifted so that all offsets of its neighbourhood
-    lie inside, where they fit. What was not found lies as far from what was predicted as the nearest that was.
+    A pixel searches about its predicted offset, or with the window shifted so that all offsets of its
+    neighbourhood lie inside, where they fit. What was not found lies as far from what was predicted as the nearest
+    that was.
 
     Parameters
     ----------

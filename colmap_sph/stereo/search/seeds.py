@@ -10,8 +10,8 @@ from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordin
 
 # Seeds are rounded to so many parts of a pixel, so that the last digits of their points do not count.
 _STEPS = 4
-# A pixel is predicted from so many seeds around it, by a plane. Those nearer than this share of the image's shorter
-# side, or so many pixels of the level, count alike.
+# A pixel is predicted from so many seeds around it, by a plane. Those nearer than this share of the image's
+# shorter side, or so many pixels of the level, count alike.
 _NEIGHBOURS = 12
 _ALIKE_SHARE = 0.04
 _LEAST_ALIKE = 2.0
