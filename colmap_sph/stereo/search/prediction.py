@@ -92,9 +92,8 @@ def from_seeds(seeds: Float | None, shape: tuple[int, ...], level: int, low: int
     else:
         predicted = -interpolated_disparity(seeds, shape, 2.0**level)
         predicted = np.clip(np.round(predicted * _SEED_STEPS) / _SEED_STEPS, low, high)
-    depth = range_depth(low, high)
-    base = np.round(low - SPARE - predicted).astype(np.int32)
-    return Prediction(_in_steps(predicted), base, depth, exact=True)
+    offset = _in_steps(predicted)
+    return Prediction(offset, low - SPARE - _nearest_pixel(offset), range_depth(low, high), exact=True)
 
 
 def from_coarser(
@@ -146,6 +145,10 @@ def from_coarser(
 def searched_depth(low: int, high: int, most: int) -> int:
     """Number of residuals to search in a range of offsets, of which one knows where to look: `most`, or less."""
     return min(range_depth(low, high), most)
+
+
+def _nearest_pixel(offset: NDArray[np.int32]) -> NDArray[np.int32]:
+    return (offset + SUBPIXEL // 2) // SUBPIXEL
 
 
 def _in_steps(offset: NDArray[np.float32]) -> NDArray[np.int32]:
