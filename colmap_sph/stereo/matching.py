@@ -308,7 +308,7 @@ def _match_level(
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
-    margin = prediction.depth // 2
+    margin = prediction.margin
     source_width = right.image.shape[1]
     right, columns = _warped(right, prediction, margin)
     right_census = _census(right)
@@ -324,11 +324,11 @@ def _match_level(
         columns,
         source_width,
         prediction.base + np.int32(margin),
-        prediction.first,
+        prediction.base if prediction.exact else prediction.first,
         image,
         options.p1,
         _p2_table(options),
-        options.max_slant,
+        0 if prediction.exact else options.max_slant,
         options.max_left_right_difference,
         options.max_left_right_excess if finest else options.max_coarse_left_right_excess,
         scratch.volume(image.shape, prediction.depth),

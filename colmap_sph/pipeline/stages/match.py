@@ -76,8 +76,8 @@ class PhotoFile:
 class MatchTask:
     """A pair to match, with the bytes of scratch memory a thread may keep, and where its disparity map goes.
 
-    `seeds` are those of its sparse points, see `seeds_of_points`. Where poses may be imprecise, the pair is matched
-    at the share `trial` of its rows and columns first.
+    `seeds` are those of its sparse points, see `seeds_of_points`. Where poses may be imprecise, the pair is
+    matched at the share `trial` of its rows and columns first.
     """
 
     left: PhotoFile

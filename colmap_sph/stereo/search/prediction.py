@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.stereo.rectified_pair import Float
 from colmap_sph.stereo.search.offsets import INVALID, MEDIAN_SIDE, SUBPIXEL
-from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, range_depth
+from colmap_sph.stereo.search.ranges import SPARE, range_depth
 from colmap_sph.stereo.search.seeds import interpolated_disparity
 
 # Predictions are the mean of those within this radius that differ by no more than so many pixels: of one surface.
-_MEAN_RADIUS = 3
+_MEAN_RADIUS = 4
 _MAX_STEP = 3
 # Residuals, of the finer level, that a neighbourhood's range must leave free at either end of the pixel's, and
 # those that the predicted offset must.
@@ -45,11 +45,15 @@ class Prediction:
         First residual to search, pixels.
     depth : int
         Number of residuals to search.
+    exact : bool
+        Neighbours with the same residual are of one surface, whatever their `base`. Else those are of which
+        `first` differs by no more than a slope does, slot by slot: predictions may end where surfaces do.
     """
 
     offset: NDArray[np.int32]
     base: NDArray[np.int32]
     depth: int
+    exact: bool = False
 
     @property
     def first(self) -> NDArray[np.int32]:
@@ -58,6 +62,11 @@ class Prediction:
         first //= SUBPIXEL
         first += self.base
         return first
+
+    @property
+    def margin(self) -> int:
+        """Columns of a warped image beyond the sides of the reference that are searched from inside of it."""
+        return self.depth if self.exact else self.depth // 2
 
 
 def from_seeds(seeds: Float | None, shape: tuple[int, ...], level: int, low: int, high: int) -> Prediction:
@@ -83,11 +92,9 @@ def from_seeds(seeds: Float | None, shape: tuple[int, ...], level: int, low: int
     else:
         predicted = -interpolated_disparity(seeds, shape, 2.0**level)
         predicted = np.clip(np.round(predicted * _SEED_STEPS) / _SEED_STEPS, low, high)
-    # To both sides as far as the farthest end of the range is from a prediction.
-    reach = int(np.ceil(max(high - float(predicted.min()), float(predicted.max()) - low))) + SPARE
-    depth = min(-(-(2 * reach + 1) // STEP) * STEP, MAX_DEPTH)
-    base = np.full(shape, -depth // 2, dtype=np.int32)
-    return Prediction(_in_steps(predicted), base, depth)
+    depth = range_depth(low, high)
+    base = np.round(low - SPARE - predicted).astype(np.int32)
+    return Prediction(_in_steps(predicted), base, depth, exact=True)
 
 
 def from_coarser(
@@ -95,8 +102,9 @@ def from_coarser(
 ) -> Prediction:
     """What a level searches, from the offsets of the level above.
 
-    A pixel searches about its predicted offset, or with the window shifted so that all offsets of its neighbourhood
-    lie inside, where they fit. What was not found lies as far from what was predicted as the nearest that was.
+    A pixel searches about its predicted offset, or with the window shifted so that all offsets of its
+    neighbourhood lie inside, where they fit. What was not found lies as far from what was predicted as the nearest
+    that was.
 
     Parameters
     ----------

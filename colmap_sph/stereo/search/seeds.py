@@ -1,5 +1,6 @@
 """Sparse points of a pair → which image is the left one, and where its coarsest level is expected to match."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -9,12 +10,15 @@ from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordin
 
 # Seeds are rounded to so many parts of a pixel, so that the last digits of their points do not count.
 _STEPS = 4
-# A pixel is predicted from so many seeds around it, by a plane. Those nearer than so many pixels of the level count
-# alike; and slopes are held back by so much of the weight of all, as if there were seeds this far (pixels) away on
-# either side that tell of none.
+# A pixel is predicted from so many seeds around it, by a plane. Those nearer than this share of the image's
+# shorter side, or so many pixels of the level, count alike.
 _NEIGHBOURS = 12
-_ALIKE = 2.0
-_STIFFNESS = 0.5
+_ALIKE_SHARE = 0.04
+_LEAST_ALIKE = 2.0
+# Slopes are held back as if so many times as many seeds, at that distance and at the distance of the nearest one,
+# told of none: beyond the outermost seeds little is known.
+_STIFFNESS = 0.125
+_UNKNOWN_STIFFNESS = 0.1
 
 # Images that see their points equally fine, but for this share, stay in the order of their names.
 _EQUALLY_FINE = 1.02
@@ -93,15 +97,21 @@ def interpolated_disparity(seeds: Float, shape: tuple[int, ...], scale: float) -
         Pixels of the level.
     """
     columns, rows = ((seeds[:, axis] + 0.5) / scale - 0.5 for axis in (0, 1))
-    pixels = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).reshape(-1, 2)
+    alike = max(_ALIKE_SHARE * min(shape), _LEAST_ALIKE)
+    # Smooth at that distance: planes at the centres of cells half as wide, linear between these.
+    cell = max(int(alike / 2), 1)
+    height, width = (-(-side // cell) for side in shape)
+    across, down = np.meshgrid((np.arange(width) + 0.5) * cell - 0.5, (np.arange(height) + 0.5) * cell - 0.5)
+    places = np.column_stack([across.ravel(), down.ravel()])
     tree = cKDTree(np.column_stack([columns, rows]))
-    distance, near = tree.query(pixels, k=np.arange(1, min(_NEIGHBOURS, len(seeds)) + 1))
-    weight = 1 / (distance**2 + _ALIKE**2)
-    terms = np.stack([np.ones_like(distance), columns[near] - pixels[:, :1], rows[near] - pixels[:, 1:]])
+    distance, near = tree.query(places, k=np.arange(1, min(_NEIGHBOURS, len(seeds)) + 1))
+    weight = 1 / (distance**2 + alike**2)
+    terms = np.stack([np.ones_like(distance), columns[near] - places[:, :1], rows[near] - places[:, 1:]])
     equations = np.einsum("ipk,pk,jpk->pij", terms, weight, terms)
-    total = weight.sum(axis=1)
-    equations[:, 1, 1] += _STIFFNESS * total
-    equations[:, 2, 2] += _STIFFNESS * total
+    ridge = weight.sum(axis=1) * (_STIFFNESS * alike**2 + _UNKNOWN_STIFFNESS * distance[:, 0] ** 2)
+    equations[:, 1, 1] += ridge
+    equations[:, 2, 2] += ridge
     right_sides = np.einsum("ipk,pk,pk->pi", terms, weight, seeds[near, 2] / scale)
-    solution = np.linalg.solve(equations, right_sides[..., None])[:, 0, 0]
-    return solution.reshape(shape).astype(np.float32)
+    planes = np.linalg.solve(equations, right_sides[..., None])[:, 0, 0].astype(np.float32)
+    fine = cv2.resize(planes.reshape(height, width), (width * cell, height * cell))
+    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
