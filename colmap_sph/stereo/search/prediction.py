@@ -92,8 +92,9 @@ def from_seeds(seeds: Float | None, shape: tuple[int, ...], level: int, low: int
     else:
         predicted = -interpolated_disparity(seeds, shape, 2.0**level)
         predicted = np.clip(np.round(predicted * _SEED_STEPS) / _SEED_STEPS, low, high)
-    depth = range_depth(low, high)
-    base = np.round(low - SPARE - predicted).astype(np.int32)
+    # Windows about predictions between whole pixels begin up to one earlier.
+    depth = range_depth(low, high + 1)
+    base = np.floor(low - SPARE - predicted).astype(np.int32)
     return Prediction(_in_steps(predicted), base, depth, exact=True)
 
 
