@@ -10,7 +10,6 @@ from colmap_sph import synthetic as syn
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import RectifiedPair, Surface
-from colmap_sph.stereo.search import seeds
 from colmap_sph.stereo.search.seeds import finer_first, interpolated_disparity, seeds_of_points, shared_points
 
 # ---- between seeds -----------------------------------------------------------------------------------------
@@ -30,35 +29,56 @@ def test_equal_seeds_say_the_same_everywhere(count: int, scale: float) -> None:
     np.testing.assert_allclose(disparity, np.full((20, 31), -12.5 / scale), rtol=1e-5)
 
 
+def full_of_seeds(plane: tuple[float, float, float]) -> np.ndarray:
+    """Seeds at random over and beyond an image of 120 x 90 pixels, on a plane of disparities."""
+    places = np.random.default_rng(0).uniform(-40, 160, (1500, 2))
+    return np.column_stack([places, plane[0] + places @ plane[1:]])
+
+
 @pytest.mark.parametrize("scale", [1.0, 4.0])
-def test_a_plane_is_continued_by_as_much_as_slopes_are_free(scale: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exactly where nothing holds them back. Pixel 0 of a level of scale 4 has its centre at 1.5."""
-    given = random_seeds(200)
-    given[:, 2] = 7 + 0.25 * given[:, 0] - 0.125 * given[:, 1]
-    columns, rows = ((np.arange(size) + 0.5) * scale - 0.5 for size in (31, 23))
-    exact = (7 + 0.25 * columns - 0.125 * rows[:, None]) / scale
-    error = np.abs(interpolated_disparity(given, (23, 31), scale) - exact) * scale
-    assert np.median(error) < 0.15
-    monkeypatch.setattr(seeds, "_STIFFNESS", 0.0)
-    np.testing.assert_allclose(interpolated_disparity(given, (23, 31), scale), exact, atol=1e-3)
+def test_a_plane_full_of_seeds_is_found(scale: float) -> None:
+    """In pixels of the level, of which that of column 0 has its centre at column 1.5 where the scale is 4."""
+    plane = 7.0, 0.25, -0.125
+    shape = int(90 / scale), int(120 / scale)
+    columns, rows = ((np.arange(size) + 0.5) * scale - 0.5 for size in shape[::-1])
+    exact = (plane[0] + plane[1] * columns + plane[2] * rows[:, None]) / scale
+    error = interpolated_disparity(full_of_seeds(plane), shape, scale) - exact
+    assert np.abs(error).max() < 1.0 / scale
+    assert abs(error.mean()) < 0.02
 
 
-@pytest.mark.parametrize("count", [1, 2, 5, 60])
-def test_planes_between_seeds_are_those_of_weighted_least_squares(count: int) -> None:
-    """Pixel by pixel: the nearest seeds, weighed by distance, and one more row for each slope, which is none."""
-    given = random_seeds(count, seed=3)
-    scale = 4.0
-    disparity = interpolated_disparity(given, (9, 13), scale)
-    places = (given[:, :2] + 0.5) / scale - 0.5
-    for row, column in np.ndindex(9, 13):
-        step = places - (column, row)
-        near = np.argsort(np.hypot(*step.T), kind="stable")[: seeds._NEIGHBOURS]
-        weight = 1 / ((step[near] ** 2).sum(axis=1) + seeds._ALIKE**2)
-        root = np.sqrt(weight)[:, None]
-        held = np.sqrt(seeds._STIFFNESS * weight.sum())
-        rows = np.vstack([root * np.column_stack([np.ones(len(near)), step[near]]), [0, held, 0], [0, 0, held]])
-        values = np.concatenate([root[:, 0] * given[near, 2] / scale, [0, 0]])
-        assert disparity[row, column] == pytest.approx(np.linalg.lstsq(rows, values)[0][0], abs=1e-4)
+def test_a_level_is_an_image_of_its_own() -> None:
+    """Seeds of full resolution in pixels of four times the size are those of a smaller image."""
+    seeds = random_seeds(60)
+    smaller = np.column_stack([(seeds[:, :2] + 0.5) / 4 - 0.5, seeds[:, 2] / 4])
+    np.testing.assert_allclose(
+        interpolated_disparity(seeds, (23, 31), 4.0), interpolated_disparity(smaller, (23, 31), 1.0), rtol=1e-4
+    )
+
+
+def test_rows_and_columns_are_alike_and_order_is_nothing() -> None:
+    seeds = random_seeds(60)
+    disparity = interpolated_disparity(seeds, (23, 31), 4.0)
+    turned = interpolated_disparity(seeds[::-1][:, [1, 0, 2]], (31, 23), 4.0)
+    np.testing.assert_allclose(turned.T, disparity, atol=1e-4)
+
+
+def test_disparities_add_up() -> None:
+    seeds, others = random_seeds(60), random_seeds(60)
+    others[:, 2] = 5 + np.arange(60)
+    both = seeds + others * (0, 0, 1)
+    parts = [interpolated_disparity(given, (23, 31), 4.0) for given in (seeds, others)]
+    np.testing.assert_allclose(interpolated_disparity(both, (23, 31), 4.0), sum(parts), atol=1e-4)
+
+
+def test_near_seeds_count_more_than_far_ones() -> None:
+    """Two groups, far from each other: each side of the image has its own group's disparity, the middle none's."""
+    rng = np.random.default_rng(0)
+    places = np.concatenate([rng.uniform((0, 0), (10, 90), (40, 2)), rng.uniform((110, 0), (120, 90), (40, 2))])
+    seeds = np.column_stack([places, np.repeat([-20.0, 60.0], 40)])
+    disparity = interpolated_disparity(seeds, (90, 120), 1.0)
+    assert np.abs(disparity[10:-10, :10] + 20).max() < 2
+    assert np.abs(disparity[10:-10, -10:] - 60).max() < 2
 
 
 # ---- seeds of points ---------------------------------------------------------------------------------------

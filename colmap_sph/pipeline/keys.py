@@ -3,9 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.options import RunOptions
@@ -15,6 +12,7 @@ from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.agreement import SparseSights
 from colmap_sph.stereo.rectified_pair import RectifiedPair
+from colmap_sph.stereo.search.seeds import Seeds
 
 # The modules whose code makes each kind of result.
 _MAKERS = {
@@ -100,9 +98,7 @@ class Keys:
         mask_digest = None if mask is None or self.fresh else file_digest(mask)
         return self._key("undistorted", image, camera, values, mask_digest, self._options.undistortion)
 
-    def pair(
-        self, left: View, right: View, geometry: RectifiedPair, seeds: NDArray[np.float64], trial: float
-    ) -> str:
+    def pair(self, left: View, right: View, geometry: RectifiedPair, seeds: Seeds, trial: float) -> str:
         """Of a disparity map.
 
         Parameters
@@ -110,7 +106,7 @@ class Keys:
         left, right : View
         geometry : RectifiedPair
             In which the options of rectification are, too.
-        seeds : (n, 3) float64 ndarray
+        seeds : (n, 3) float32 ndarray
             Where its sparse points are expected to match.
         trial : float
             Share of its rows and columns that the pair is matched at first, see `MatchTask`; 1 without.

@@ -22,6 +22,7 @@ from colmap_sph.stereo.resampling import half_size
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
 from colmap_sph.stereo.search.prediction import Prediction, from_coarser, from_seeds, searched_depth
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
+from colmap_sph.stereo.search.seeds import Seeds
 
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
 # Census compares 1/64 grey values, see CENSUS_MARGIN in `matching.h`: on weak texture, whole ones are too coarse.
@@ -167,7 +168,7 @@ def match_pair(
     scratch: Scratch | None = None,
     *,
     infinity: float | None = None,
-    seeds: NDArray[np.float64] | None = None,
+    seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
     """Match the left image of a rectified pair in the right one.
 
@@ -184,7 +185,7 @@ def match_pair(
         Disparity of what is infinitely far away. Where the range nearly reaches it, matches are searched up to
         there, and those beyond `min_disparity` dropped: clouds would else be matched to whatever looks most like
         them in the range.
-    seeds : (n, 3) float64 ndarray, optional
+    seeds : (n, 3) float32 ndarray, optional
         Left column, left row and disparity, pixels, of what is known to match, see `seeds_of_points`.
 
     Returns

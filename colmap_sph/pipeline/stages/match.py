@@ -30,7 +30,7 @@ from colmap_sph.stereo.poses.ties import Ties, find_ties, row_residual, tolerabl
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
-from colmap_sph.stereo.search.seeds import finer_first, seeds_of_points, shared_points
+from colmap_sph.stereo.search.seeds import Seeds, finer_first, seeds_of_points, shared_points
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -83,7 +83,7 @@ class MatchTask:
     left: PhotoFile
     right: PhotoFile
     geometry: RectifiedPair
-    seeds: NDArray[np.float64]
+    seeds: Seeds
     trial: float
     options: MatchingOptions
     scratch_bytes: int

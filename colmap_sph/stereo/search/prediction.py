@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
-from colmap_sph.stereo.rectified_pair import Float
 from colmap_sph.stereo.search.offsets import INVALID, MEDIAN_SIDE, SUBPIXEL
 from colmap_sph.stereo.search.ranges import SPARE, range_depth
-from colmap_sph.stereo.search.seeds import interpolated_disparity
+from colmap_sph.stereo.search.seeds import Seeds, interpolated_disparity
 
 # Predictions are the mean of those within this radius that differ by no more than so many pixels: of one surface.
 _MEAN_RADIUS = 4
@@ -69,12 +68,12 @@ class Prediction:
         return self.depth if self.exact else self.depth // 2
 
 
-def from_seeds(seeds: Float | None, shape: tuple[int, ...], level: int, low: int, high: int) -> Prediction:
+def from_seeds(seeds: Seeds | None, shape: tuple[int, ...], level: int, low: int, high: int) -> Prediction:
     """What the coarsest level searches: the whole range, about what sparse points tell.
 
     Parameters
     ----------
-    seeds : (n, 3) float64 ndarray, optional
+    seeds : (n, 3) float32 ndarray, optional
         As of `seeds_of_points`. Without any, the middle of the range is predicted.
     shape : (int, int)
         Of the level.

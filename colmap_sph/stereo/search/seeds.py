@@ -8,8 +8,13 @@ from scipy.spatial import cKDTree
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordinates_of_rays
 
+Seeds = NDArray[np.float32]
+"""(n, 3) left columns, left rows and disparities, pixels, of sparse points in a rectified pair."""
+
 # Seeds are rounded to so many parts of a pixel, so that the last digits of their points do not count.
 _STEPS = 4
+# So many tell what can be told, and travel well.
+_MOST = 256
 # A pixel is predicted from so many seeds around it, by a plane. Those nearer than this share of the image's
 # shorter side, or so many pixels of the level, count alike.
 _NEIGHBOURS = 12
@@ -43,7 +48,7 @@ def finer_first(scene: Scene, first: View, second: View) -> tuple[View, View]:
     return (second, first) if coarser else (first, second)
 
 
-def seeds_of_points(left: View, right: View, pair: RectifiedPair, points: Float) -> Float:
+def seeds_of_points(left: View, right: View, pair: RectifiedPair, points: Float) -> Seeds:
     """Where a rectified pair shows points.
 
     Parameters
@@ -55,9 +60,9 @@ def seeds_of_points(left: View, right: View, pair: RectifiedPair, points: Float)
 
     Returns
     -------
-    (m, 3) float64 ndarray
+    (m, 3) float32 ndarray
         Column and row in the left rectified image, and disparity, of the points inside of both images, rounded to
-        quarters of a pixel.
+        quarters of a pixel; at most 256, from all over the points' order.
     """
     left_places = _places(left, pair, "left", points)
     right_places = _places(right, pair, "right", points)
@@ -65,7 +70,9 @@ def seeds_of_points(left: View, right: View, pair: RectifiedPair, points: Float)
     with np.errstate(invalid="ignore"):
         inside = (np.abs(left_places - _middle(pair, "left")) <= _middle(pair, "left")).all(axis=1)
         inside &= (np.abs(right_places - _middle(pair, "right")) <= _middle(pair, "right")).all(axis=1)
-    return np.asarray(np.round(seeds[inside] * _STEPS) / _STEPS)
+    seeds = seeds[inside]
+    kept = np.linspace(0, len(seeds) - 1, min(len(seeds), _MOST)).astype(int)
+    return np.asarray(np.round(seeds[kept] * _STEPS) / _STEPS, dtype=np.float32)
 
 
 def _places(view: View, pair: RectifiedPair, side: Side, points: Float) -> Float:
@@ -79,12 +86,12 @@ def _middle(pair: RectifiedPair, side: Side) -> Float:
     return np.array([pair.width(side) - 1, pair.height - 1]) / 2
 
 
-def interpolated_disparity(seeds: Float, shape: tuple[int, ...], scale: float) -> NDArray[np.float32]:
+def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -> NDArray[np.float32]:
     """Disparity between seeds: of every pixel the plane through those around it, the near ones first.
 
     Parameters
     ----------
-    seeds : (n, 3) float64 ndarray
+    seeds : (n, 3) float32 ndarray
         As of `seeds_of_points`; at least one.
     shape : (int, int)
         Rows and columns of the level.
@@ -96,6 +103,7 @@ def interpolated_disparity(seeds: Float, shape: tuple[int, ...], scale: float) -
     (H, W) float32 ndarray
         Pixels of the level.
     """
+    seeds = seeds.astype(np.float64)
     columns, rows = ((seeds[:, axis] + 0.5) / scale - 0.5 for axis in (0, 1))
     alike = max(_ALIKE_SHARE * min(shape), _LEAST_ALIKE)
     # Smooth at that distance: planes at the centres of cells half as wide, linear between these.
