@@ -21,7 +21,7 @@ from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, select_
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, pixel_from_rectified_ray
 from colmap_sph.stereo.resampling import resample
-from colmap_sph.stereo.search.seeds import seeds_of_points, shared_points
+from colmap_sph.stereo.search.seeds import Seeds, seeds_of_points, shared_points
 from colmap_sph.synthetic import read_truth
 
 
@@ -32,7 +32,7 @@ class MatchedPair:
     left: View
     right: View
     geometry: RectifiedPair
-    seeds: NDArray[np.float64]
+    seeds: Seeds
     left_image: RectifiedImage
     right_image: RectifiedImage
 

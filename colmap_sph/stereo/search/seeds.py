@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordinates_of_rays
 
-Seeds = NDArray[np.float32]
+Seeds = NDArray[np.floating]
 """(n, 3) left columns, left rows and disparities, pixels, of sparse points in a rectified pair."""
 
 # Seeds are rounded to so many parts of a pixel, so that the last digits of their points do not count.
