@@ -57,17 +57,21 @@ class MatchingOptions:
     p2_contrast: int = 2
     """Difference of neighbours in the left image, grey values, at which P2 has fallen halfway to `p2_min`."""
     disparities: int = 32
-    """Disparities searched per pixel at full resolution; a multiple of 32."""
+    """Disparities searched per pixel, about the predicted one, at full resolution; a multiple of 32."""
     coarse_disparities: int = 64
-    """Disparities searched per pixel at the levels between the coarsest and the finest; a multiple of 32."""
+    """Disparities searched per pixel, about the predicted one, at the levels between the coarsest, which searches
+    the whole range, and the finest; a multiple of 32."""
     max_coarsest_disparities: int = 128
     """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
     range_radius: int = 4
-    """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches."""
+    """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches, too, where
+    they fit."""
     max_slant: int = 3
-    """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
+    """Below the coarsest level, neighbours whose search ranges begin at most this many pixels apart follow the
+    slope of one surface, which costs nothing."""
     max_left_right_difference: int = 2
-    """Largest difference, in pixels, between the matches found from the left and from the right image."""
+    """Largest distance, in columns of the left image, from a pixel to the best match of the right pixel at which
+    it was found."""
     max_left_right_excess: int = 4
     """A match beyond `max_left_right_difference` is kept all the same when its aggregated cost (half the sum over
     8 paths, census bits) exceeds that of the right pixel's best match by no more than this; 255 keeps all."""

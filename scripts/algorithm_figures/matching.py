@@ -27,9 +27,10 @@ class Level:
     ----------
     prediction : offset that each pixel is expected to have, 1/256 pixel of the level
     margin : columns of the warped right image before the first pixel's expected one
+    warped : grey values of the warped right image
     left, right : census words, those of the right image warped
     base : first offset that each pixel searches in the warped image, pixels
-    surface : the same in the right image
+    surface : the same as aggregation sees it
     image, p1, p2, max_slant : what aggregation takes
     depth : offsets searched per pixel
     offset : what came out, in the warped image, 1/256 pixel
@@ -37,6 +38,7 @@ class Level:
 
     prediction: NDArray[np.int32]
     margin: int
+    warped: NDArray[np.float32]
     left: NDArray[np.uint64]
     right: NDArray[np.uint64]
     base: NDArray[np.int32]
@@ -54,17 +56,23 @@ class Level:
         predicted = np.interp(column + residual, np.arange(self.prediction.shape[1]), self.prediction[row])
         return np.asarray(-residual - predicted / 256)
 
+    def searched(self, row: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest disparity, pixels, that each pixel of a row searches."""
+        ends = np.array([self.depth - 1, 0])
+        reach = [self.disparity(row, column, base + ends) for column, base in enumerate(self.base[row])]
+        return np.min(reach, axis=1), np.max(reach, axis=1)
+
 
 @contextmanager
 def recorded() -> Iterator[list[Level]]:
     """Record every level that is matched meanwhile, the coarsest first."""
     levels: list[Level] = []
-    predicted: list[tuple[NDArray[np.int32], int]] = []
+    predicted: list[tuple[NDArray[np.int32], int, NDArray[np.float32]]] = []
     match, warp = _native.match, _native.warp
 
     def warp_and_record(*arguments: Any) -> None:
         warp(*arguments)
-        predicted.append((arguments[2].copy(), arguments[3]))
+        predicted.append((arguments[2].copy(), arguments[3], arguments[4].copy()))
 
     def match_and_record(*arguments: Any) -> None:
         match(*arguments)
@@ -191,13 +199,11 @@ def search_ranges(demo: Demo, path: Path) -> None:
     colours = ("#dbe9f6", "#a5cde3", "#5ba3cf", "#2171b5", "#08306b")
     for number, level in enumerate(levels):
         step = 2 ** (len(levels) - 1 - number)
-        base = level.surface[row // step].astype(float)
-        columns = (np.arange(len(base)) + 0.5) * step
-        low, high = -(base + level.depth - 1) * step, -base * step
+        low, high = level.searched(row // step)
         axes.fill_between(
-            columns,
-            low,
-            high,
+            (np.arange(len(low)) + 0.5) * step,
+            low * step,
+            high * step,
             step="mid",
             color=colours[number * (len(colours) - 1) // max(len(levels) - 1, 1)] if number else colours[0],
             alpha=0.75,
@@ -209,9 +215,37 @@ def search_ranges(demo: Demo, path: Path) -> None:
     axes.set(xlabel="column of the left rectified image", ylabel="disparity [pixels]", xlim=(0, width))
     axes.set_ylim(-300, 700)
     step = 2 ** (len(levels) - 1)
-    first = levels[0].surface[0, 0]
-    last = first + levels[0].depth - 1
-    axes.annotate(f"level {len(levels) - 1} reaches from {-last * step} to {-first * step}", (12, 650))
+    low, high = levels[0].searched(row // step)
+    axes.annotate(
+        f"level {len(levels) - 1} reaches from {low.min() * step:.0f} to {high.max() * step:.0f}", (12, 650)
+    )
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     strip.set_xlim(0, width)
     save(figure, path)
+
+
+def warping(demo: Demo, path: Path) -> None:
+    """A part of the left image, what the right one shows of it, and that as it is warped for the finest level."""
+    pair, levels = matched(demo, WIDE)
+    finest = levels[-1]
+    rows = _around(0.73 * pair.geometry.height, 80)
+    middle = 0.46 * pair.geometry.left_width
+    columns = _around(middle, 120)
+    expected = finest.prediction[rows, columns] / 256
+    seen = _around(middle + float(expected.mean()), 120)
+    figure, axes = plt.subplots(1, 3, figsize=(9.6, 2.45), layout="constrained")
+    for panel, picture, title in (
+        (axes[0], pair.left_image.image[rows, columns], f"left: {WIDE[0]}"),
+        (axes[1], pair.right_image.image[rows, seen], f"right: {WIDE[1]}"),
+        (
+            axes[2],
+            finest.warped[rows, columns.start + finest.margin : columns.stop + finest.margin],
+            "right, warped",
+        ),
+    ):
+        show(panel, picture, title, cmap="gray", vmin=0, vmax=255)
+    save(figure, path)
+
+
+def _around(middle: float, reach: int) -> slice:
+    return slice(round(middle) - reach, round(middle) + reach)
