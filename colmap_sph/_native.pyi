@@ -81,6 +81,8 @@ def selection(
     base: NDArray[np.int32],
     reference: NDArray[np.uint64],
     target: NDArray[np.uint64],
+    columns: NDArray[np.int32],
+    source_width: int,
     max_difference: int,
     max_excess: int,
     offset: NDArray[np.int32],
@@ -93,6 +95,8 @@ def selection(
     base : (H, W) int32
     reference : (H, W) uint64
     target : (H, TARGET_W) uint64
+    columns : (H, TARGET_W) int32
+    source_width : int
     max_difference : int
     max_excess : int
     offset : (H, W) int32, written
@@ -102,7 +106,10 @@ def match(
     backend: str,
     reference: NDArray[np.uint64],
     target: NDArray[np.uint64],
+    columns: NDArray[np.int32],
+    source_width: int,
     base: NDArray[np.int32],
+    surface: NDArray[np.int32],
     image: NDArray[np.uint8],
     p1: int,
     p2: NDArray[np.uint8],
@@ -118,7 +125,10 @@ def match(
     backend : str
     reference : (H, W) uint64
     target : (H, TARGET_W) uint64
+    columns : (H, TARGET_W) int32
+    source_width : int
     base : (H, W) int32
+    surface : (H, W) int32
     image : (H, W) uint8
     p1 : int
     p2 : (256) uint8
@@ -144,6 +154,57 @@ def fit_offsets(
     reference : (H, W) uint64
     target : (H, TARGET_W) uint64
     fitted : (H, W) int32, written
+    """
+
+def warp(
+    source: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+    prediction: NDArray[np.int32],
+    margin: int,
+    warped: NDArray[np.float32],
+    warped_valid: NDArray[np.uint8],
+    columns: NDArray[np.int32],
+    /,
+) -> None:
+    """An image as another one is expected to see it, by predicted offsets in 1/256 pixel, and its columns.
+
+    source : (H, SOURCE_W) float32
+    valid : (H, SOURCE_W) uint8
+    prediction : (H, W) int32
+    margin : int
+    warped : (H, TARGET_W) float32, written
+    warped_valid : (H, TARGET_W) uint8, written
+    columns : (H, TARGET_W) int32, written
+    """
+
+def unwarp_offsets(
+    offset: NDArray[np.int32],
+    prediction: NDArray[np.int32],
+    margin: int,
+    unwarped: NDArray[np.int32],
+    /,
+) -> None:
+    """Offsets in a warped image, 1/256 pixel, to those in the image that it was warped from.
+
+    offset : (H, W) int32
+    prediction : (H, W) int32
+    margin : int
+    unwarped : (H, W) int32, written
+    """
+
+def mean_offsets(
+    offset: NDArray[np.int32],
+    radius: int,
+    max_step: int,
+    mean: NDArray[np.int32],
+    /,
+) -> None:
+    """Of every offset the mean of those near it that differ from it by no more than `max_step`.
+
+    offset : (H, W) int32
+    radius : int
+    max_step : int
+    mean : (H, W) int32, written
     """
 
 def transfer_disparity(

@@ -187,6 +187,8 @@ def census_pair(scene: Scene) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
 def matching_kernels(scene: Scene) -> list[Kernel]:
     """The kernels whose work grows with the number of disparities; the last is `match`."""
     left, right = census_pair(scene)
+    columns = np.tile(np.arange(scene.shape[1], dtype=np.int32), (scene.shape[0], 1))
+    shown = columns, scene.shape[1]
     volume = (*scene.shape, scene.depth)
     cost, sums = np.empty(volume, np.uint8), np.empty(volume, np.uint8)
     scratch = np.empty((2, scene.base.size, scene.depth), np.uint8)
@@ -205,10 +207,11 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
         _native.aggregation(backend, cost, base, image, p1, P2, slant, detours, sums)
 
     def selection(backend: str) -> None:
-        _native.selection(backend, sums, base, left, right, *limits, selected)
+        _native.selection(backend, sums, base, left, right, *shown, *limits, selected)
 
     def match(backend: str) -> None:
-        _native.match(backend, left, right, base, image, p1, P2, slant, *limits, scratch, matched)
+        images = left, right, *shown, base, base, image
+        _native.match(backend, *images, p1, P2, slant, *limits, scratch, matched)
 
     steps: list[tuple[Callable[[str], None], NDArray[Any]]] = [
         (matching_cost, cost),
@@ -251,8 +254,24 @@ def image_kernels(scene: Scene) -> list[Kernel]:
         gates = (window.radius, window.tolerance, window.max_shift, 2.0, 0.0, 0)
         _native.fit_planes(backend, inverse, inverse_sigma, support, K, *gates, normals, fitted)
 
+    source = scene.right.astype(np.float32)
+    warped, warped_valid, columns = (np.empty(scene.shape, kind) for kind in (np.float32, np.uint8, np.int32))
+    unwarped, mean = np.empty(scene.shape, np.int32), np.empty(scene.shape, np.int32)
+
+    def warp(_: str) -> None:
+        _native.warp(source, valid, offset, 0, warped, warped_valid, columns)
+
+    def unwarp_offsets(_: str) -> None:
+        _native.unwarp_offsets(offset, offset, 0, unwarped)
+
+    def mean_offsets(_: str) -> None:
+        _native.mean_offsets(offset, 3, 768, mean)
+
     pixels = width * height
     return [
+        Kernel("warp", warp, [warped, warped_valid, columns], pixels),
+        Kernel("unwarp_offsets", unwarp_offsets, [unwarped], pixels),
+        Kernel("mean_offsets", mean_offsets, [mean], pixels),
         Kernel("census", lambda backend: _native.census(backend, padded, valid, census), [census], pixels),
         Kernel(
             "fit_offsets",

@@ -88,7 +88,24 @@ def selection(rng: Random) -> Arguments:
     sums = filled(rng, (h, w, depth), np.uint8)
     base = filled(rng, (h, w), np.int32)
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
-    return [backend(rng), sums, base, *words, *rng.integers(0, (5, 99)).tolist(), np.zeros((h, w), np.int32)]
+    limits = rng.integers(0, (5, 99)).tolist()
+    return [
+        backend(rng),
+        sums,
+        base,
+        *words,
+        *source_columns(rng, (h, target)),
+        *limits,
+        np.zeros((h, w), np.int32),
+    ]
+
+
+def source_columns(rng: Random, shape: tuple[int, int]) -> Arguments:
+    """Columns of the source that target pixels show, and its width."""
+    columns = filled(rng, shape, np.int32)
+    if rng.random() < 0.7:  # as a warp gives them
+        columns = rng.integers(-1, 6, shape).cumsum(axis=1).astype(np.int32) - 5
+    return [columns, int(rng.integers(0, 150))]
 
 
 def match(rng: Random) -> Arguments:
@@ -96,13 +113,14 @@ def match(rng: Random) -> Arguments:
     target = int(rng.integers(0, 70))
     depth = 32 * int(rng.integers(1, 4))
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
-    base = filled(rng, (h, w), np.int32)
+    bases = [filled(rng, (h, w), np.int32) for _ in range(2)]
     image = filled(rng, (h, w), np.uint8)
     p1 = int(rng.integers(0, 64))
     p2 = rng.integers(p1, 128, 256).astype(np.uint8)
     limits = rng.integers(0, (5, 5, 99)).tolist()
     scratch = np.zeros((2, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
-    return [backend(rng), *words, base, image, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
+    inputs = [*words, *source_columns(rng, (h, target)), *bases, image]
+    return [backend(rng), *inputs, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
 
 
 def fit_offsets(rng: Random) -> Arguments:
@@ -112,6 +130,24 @@ def fit_offsets(rng: Random) -> Arguments:
         offset = (256 * rng.integers(-20, 20) + rng.integers(-300, 300, (h, w))).astype(np.int32)
     words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
     return [backend(rng), offset, *words, np.zeros((h, w), np.int32)]
+
+
+def warp(rng: Random) -> Arguments:
+    (h, w), source, target = size(rng), int(rng.integers(0, 70)), int(rng.integers(0, 99))
+    inputs = [filled(rng, (h, source), np.float32), filled(rng, (h, source), np.uint8)]
+    outputs = [np.zeros((h, target), kind) for kind in (np.float32, np.uint8, np.int32)]
+    return [*inputs, filled(rng, (h, w), np.int32), margin(rng), *outputs]
+
+
+def unwarp_offsets(rng: Random) -> Arguments:
+    shape = size(rng)
+    return [*(filled(rng, shape, np.int32) for _ in range(2)), margin(rng), np.zeros(shape, np.int32)]
+
+
+def mean_offsets(rng: Random) -> Arguments:
+    shape = size(rng)
+    limits = [int(rng.integers(0, 11)), int(rng.choice([0, 1, 768, 1 << 20]))]
+    return [filled(rng, shape, np.int32), *limits, np.zeros(shape, np.int32)]
 
 
 def transfer_disparity(rng: Random) -> Arguments:
@@ -249,6 +285,11 @@ def backend(rng: Random) -> str:
     return str(rng.choice(_native.backends()))
 
 
+def margin(rng: Random) -> int:
+    """Of a warped image, columns."""
+    return int(rng.integers(0, 40)) if rng.random() < 0.8 else 65535
+
+
 def number(rng: Random) -> float:
     """A likely number, or an odd one."""
     return float(rng.uniform(0, 10)) if rng.random() < 0.7 else float(rng.choice(FLOATS))
@@ -263,6 +304,9 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         selection,
         match,
         fit_offsets,
+        warp,
+        unwarp_offsets,
+        mean_offsets,
         transfer_disparity,
         depth_candidates,
         vote_depth,

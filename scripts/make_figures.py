@@ -20,6 +20,7 @@ FIGURES: dict[str, Callable[[Demo, Path], None]] = {
     "plane": views.plane,
     "matching": matching.matching,
     "search_ranges": matching.search_ranges,
+    "warping": matching.warping,
     "vote": depth.vote,
     "confirmation": depth.confirmation,
     "normals": surface.normals,

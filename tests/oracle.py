@@ -79,30 +79,115 @@ def subpixel_offset(before, best, after):
     return 0 if rise <= 0 or best == 0 else int(np.trunc((before - after) * 128 / rise))
 
 
-def selection(aggregated, base, reference, target, max_difference, max_excess):
+def _source_columns_shown(columns, source_width):
+    """Of every target pixel of a row the columns of the source that it stands for.
+
+    Its own, and the one to three that follow where its neighbour on the right shows the next but so many; none
+    outside of the source.
+    """
+    shown = []
+    for w, column in enumerate(map(int, columns)):
+        step = int(columns[w + 1]) - column if w + 1 < len(columns) else 1
+        stretch = range(column, column + (step if 1 < step <= 4 else 1)) if column >= 0 else []
+        shown.append([c for c in stretch if c < source_width])
+    return shown
+
+
+def _rivals(least, columns, source_width):
+    """Of every target pixel the one that its winners are checked against.
+
+    `least` are the least sums that point at target pixels, by their number. It is the first one with the least sum
+    of those that stand for the same column of the source; itself where it shows none.
+    """
+    standing: dict = {}  # column of the source: target pixels
+    for w, shown in enumerate(_source_columns_shown(columns, source_width)):
+        for column in shown if w in least else []:
+            standing.setdefault(column, []).append(w)
+    return [
+        min(standing.get(column, [w]), key=lambda rival: (least.get(rival), rival))
+        for w, column in enumerate(map(int, columns))
+    ]
+
+
+def selection(aggregated, base, reference, target, columns, source_width, max_difference, max_excess):
     """Offsets (H, W) int32 in 1/256 pixel, OFFSET_INVALID = none."""
     height, width, depth = aggregated.shape
     offsets = np.full((height, width), OFFSET_INVALID, dtype=np.int32)
     for y in range(height):
         content = [x for x in range(width) if int(reference[y, x]) < CENSUS_INVALID]
-        best_of_target: dict = {}  # column in the target: (sum, columns in the reference)
+        votes: dict = {}  # column in the target: sums, columns in the reference
         for x in content:
             for i in range(depth):
                 r = x + int(base[y, x]) + i
-                vote = int(aggregated[y, x, i])
                 if 0 <= r < target.shape[1]:
-                    least, columns = best_of_target.get(r, (vote, []))
-                    best_of_target[r] = (vote, [x]) if vote < least else (least, columns + [x] * (vote == least))
+                    votes.setdefault(r, []).append((int(aggregated[y, x, i]), x))
+        least = {r: min(votes[r])[0] for r in votes}
+        rivals = _rivals(least, columns[y], source_width)
         for x in content:
             sums = aggregated[y, x].astype(int)
             best = int(np.argmin(sums))
             r = x + int(base[y, x]) + best
-            if best in (0, depth - 1) or r not in best_of_target or int(target[y, r]) >= CENSUS_INVALID:
+            if best in (0, depth - 1) or r not in votes or int(target[y, r]) >= CENSUS_INVALID:
                 continue
-            least, columns = best_of_target[r]
-            if sums[best] - least <= max_excess or any(abs(column - x) <= max_difference for column in columns):
+            rival = rivals[r]
+            near = any(vote == least[rival] and abs(column - x) <= max_difference for vote, column in votes[rival])
+            if sums[best] - least[rival] <= max_excess or near:
                 offsets[y, x] = (r - x) * 256 + subpixel_offset(*(int(s) for s in sums[best - 1 : best + 2]))
     return offsets
+
+
+def warp(source, valid, prediction, margin, target_width):
+    """Warped image, its content and the nearest columns of the source, (H, target_width) each."""
+    height, source_width = source.shape
+    width = prediction.shape[1]
+    warped = np.zeros((height, target_width))
+    content = np.zeros((height, target_width), dtype=np.uint8)
+    columns = np.full((height, target_width), -1, dtype=np.int32)
+    for y, w in np.ndindex(warped.shape):
+        x = w - margin
+        place = 256 * x + int(prediction[y, min(max(x, 0), width - 1)])  # 1/256 pixel of the source
+        nearest = (place + 128) // 256
+        if 0 <= nearest < source_width:
+            columns[y, w] = nearest
+        if source_width:
+            before, after = (min(max(k, 0), source_width - 1) for k in (place // 256, -(-place // 256)))
+            share = place % 256 / 256
+            warped[y, w] = (1 - share) * float(source[y, before]) + share * float(source[y, after])
+            content[y, w] = min(valid[y, before], valid[y, after]) if columns[y, w] >= 0 else 0
+    return warped, content, columns
+
+
+def unwarp_offsets(offset, prediction, margin):
+    """Offsets (H, W) int32 to the source of a warp, 1/256 pixel, of those to what it warped."""
+    height, width = offset.shape
+    unwarped = np.full(offset.shape, OFFSET_INVALID, dtype=np.int32)
+    for y, x in np.ndindex(height, width):
+        if offset[y, x] == OFFSET_INVALID:
+            continue
+        residual = int(offset[y, x]) - 256 * margin
+        place = 256 * x + residual  # column of the reference whose prediction counts, 1/256 pixel
+        part = place % 256
+        here, beside = (int(prediction[y, min(max(place // 256 + k, 0), width - 1)]) for k in (0, 1))
+        if abs(beside - here) <= 4 * 256:
+            predicted = here + (beside - here) * part // 256
+        else:
+            predicted = here if part < 128 else beside
+        if abs(residual + predicted) < 1 << 24:
+            unwarped[y, x] = residual + predicted
+    return unwarped
+
+
+def mean_offsets(offset, radius, max_step):
+    """Mean (H, W) int32 of the offsets of a window that differ from its middle by no more than `max_step`."""
+    mean = np.empty_like(offset)
+    for y, x in np.ndindex(offset.shape):
+        rows, columns = (slice(max(k - radius, 0), k + radius + 1) for k in (y, x))
+        differences = [int(other) - int(offset[y, x]) for other in offset[rows, columns].flat]
+        near = [difference for difference in differences if abs(difference) <= max_step]
+        # Exact: towards zero, that is, towards the middle's own.
+        share = abs(sum(near)) // len(near)
+        mean[y, x] = int(offset[y, x]) + (share if sum(near) > 0 else -share)
+    return mean
 
 
 def _nearest_256(value):

@@ -90,10 +90,45 @@ def run_aggregation(backend, cost, base, image, p1, p2, max_slant=0):
     return aggregated
 
 
-def run_selection(backend, aggregated, base, reference, target, max_difference, max_excess=0):
+Shown = tuple[np.ndarray, int]  # columns of the source that a target shows, and the source's width
+
+
+def run_selection(
+    backend, aggregated, base, reference, target, max_difference, max_excess=0, shown: Shown | None = None
+):
+    """Without `shown` the target is its own source."""
     offset = np.full(base.shape, 5, dtype=np.int32)
-    _native.selection(backend, aggregated, base, reference, target, max_difference, max_excess, offset)
+    columns, width = unwarped(target.shape) if shown is None else shown
+    images = reference, target, columns
+    _native.selection(backend, aggregated, base, *images, width, max_difference, max_excess, offset)
     return offset
+
+
+def unwarped(shape) -> Shown:
+    """Columns of a target that is its own source, and its width."""
+    return np.tile(np.arange(shape[1], dtype=np.int32), (shape[0], 1)), shape[1]
+
+
+# Columns of the source that target pixels show, of a shape (height, width).
+COLUMNS = {
+    "same": lambda rng, shape: np.arange(shape[1]) + 0 * rng.integers(0, 1, shape),
+    "squeezed": lambda rng, shape: rng.integers(0, 2, shape).cumsum(axis=1),
+    "stretched": lambda rng, shape: rng.integers(0, 4, shape).cumsum(axis=1),
+    "skipping": lambda rng, shape: rng.choice([1, 2, 3, 4, 5, 6, 9], shape).cumsum(axis=1) - 20,
+    "torn": lambda rng, shape: np.arange(shape[1]) + 25 * (rng.random(shape) < 0.15).cumsum(axis=1) % 100 - 30,
+    "random": lambda rng, shape: rng.integers(-3, 20, shape),
+    "extreme": lambda rng, shape: rng.choice(
+        [INT32.min, INT32.min + 1, -1, 0, 3, INT32.max - 3, INT32.max], shape
+    ),
+}
+
+
+def source_columns(rng, shape, kind, source_width):
+    """Columns as of a warp: -1 outside, but for those that no warp gives."""
+    columns = COLUMNS[kind](rng, shape).astype(np.int32)
+    if kind not in ("random", "extreme"):
+        columns[(columns < 0) | (columns >= source_width)] = -1
+    return columns
 
 
 sizes = st.tuples(st.integers(1, 4), st.integers(1, 70))
@@ -250,7 +285,35 @@ def test_selection_is_the_oracles(backend, size, target_width, depth, kind, sums
     base = bases(rng, size, kind)
     np.testing.assert_array_equal(
         run_selection(backend, aggregated, base, reference, target, *limits),
-        oracle.selection(aggregated, base, reference, target, *limits),
+        oracle.selection(aggregated, base, reference, target, *unwarped(target.shape), *limits),
+    )
+
+
+@every_backend
+@settings(property_test, max_examples=100)
+@given(
+    size=st.tuples(st.integers(1, 3), st.integers(15, 60)),
+    target_width=st.integers(20, 80),
+    source_width=st.integers(0, 100),
+    depth=st.sampled_from(DEPTHS[:2]),
+    kind=st.sampled_from(["left", "smooth", "rough"]),
+    columns=st.sampled_from(list(COLUMNS)),
+    sums=st.sampled_from([(0, 255), (0, 40), (240, 255)]),
+    invalid=st.sampled_from([0.0, 0.1]),
+    limits=st.tuples(st.sampled_from([0, 2, 5]), st.sampled_from([0, 1, 20])),
+    seed=seeds,
+)
+def test_selection_from_a_warped_target_is_the_oracles(
+    backend, size, target_width, source_width, depth, kind, columns, sums, invalid, limits, seed
+):
+    rng = np.random.default_rng(seed)
+    aggregated = rng.integers(sums[0], sums[1] + 1, (*size, depth)).astype(np.uint8)
+    reference, target = words(rng, size, invalid), words(rng, (size[0], target_width), invalid)
+    base = bases(rng, size, kind)
+    shown = source_columns(rng, target.shape, columns, source_width), source_width
+    np.testing.assert_array_equal(
+        run_selection(backend, aggregated, base, reference, target, limits[0], limits[1], shown),
+        oracle.selection(aggregated, base, reference, target, *shown, *limits),
     )
 
 
@@ -280,6 +343,33 @@ def test_selection_keeps_a_loser_of_little_excess(backend):
         offset = run_selection(backend, aggregated, base, content, content, 2, excess)
         assert offset[0, 20] == 10 * 256
         assert (offset[0, 30] == 0) == kept
+
+
+@every_backend
+@pytest.mark.parametrize("skipped", [0, 1, 2, 3, 4, 5])
+def test_selection_compares_what_shows_the_same_column(backend, skipped):
+    """Target pixels 20 and 30, whose least sums are 10 and 16, show source columns 60 and 60 + `skipped`.
+
+    Pixel 20 stands for those that its neighbour skips, too, as long as there are no more than three.
+    """
+    aggregated = np.full((1, 40, 32), 90, dtype=np.uint8)
+    aggregated[..., 16] = 50
+    aggregated[0, 20, 16], aggregated[0, 30, 16] = 10, 16
+    base = np.full((1, 40), -16, dtype=np.int32)
+    content = np.zeros((1, 40), dtype=np.uint64)
+    columns = np.full((1, 40), -1, dtype=np.int32)
+    for step in (1, 2, 3, 4, 5, 6):
+        columns[0, 20:22] = 60, 60 + step
+        columns[0, 30] = 60 + skipped
+        # The sum of pixel 21, 50, is no rival; what is outside of the source has none.
+        rivals = skipped == 0 or (skipped < step <= 4)
+        for source_width, outside in ((60 + skipped, True), (61 + skipped, False)):
+            offset = run_selection(
+                backend, aggregated, base, content, content, 2, 5, shown=(columns, source_width)
+            )
+            assert offset[0, 20] == 0
+            assert (offset[0, 30] == 0) == (outside or not rivals)
+    assert run_selection(backend, aggregated, base, content, content, 10, 5, shown=(columns, 80))[0, 30] == 0
 
 
 @every_backend
@@ -351,21 +441,212 @@ def test_the_fit_finds_the_tip_between_whole_pixels(backend, position):
     assert np.abs(fitted[2:-2, 15] - position).max() <= 8
 
 
+# ---- warp --------------------------------------------------------------------------------------------------
+
+
+def run_warp(source, valid, prediction, margin, target_width):
+    shape = source.shape[0], target_width
+    warped = np.full(shape, 5, dtype=np.float32)
+    content = np.full(shape, 5, dtype=np.uint8)
+    columns = np.full(shape, 5, dtype=np.int32)
+    _native.warp(source, valid, prediction, margin, warped, content, columns)
+    return warped, content, columns
+
+
+def run_unwarp(offset, prediction, margin):
+    unwarped_offset = np.full(offset.shape, 5, dtype=np.int32)
+    _native.unwarp_offsets(offset, prediction, margin, unwarped_offset)
+    return unwarped_offset
+
+
+PREDICTIONS = {
+    "none": lambda rng, shape: np.zeros(shape),
+    "whole": lambda rng, shape: 256 * rng.integers(-9, 9, shape),
+    "half": lambda rng, shape: 256 * rng.integers(-9, 9, shape) + rng.integers(127, 130, shape),
+    "smooth": lambda rng, shape: rng.integers(-200, 200, shape).cumsum(axis=1) - 700,
+    "folded": lambda rng, shape: rng.integers(-600, 300, shape).cumsum(axis=1),
+    "steps": lambda rng, shape: rng.choice([-2000, -1024, -1023, 0, 1, 1025, 5000], shape),
+    "extreme": lambda rng, shape: rng.choice([INT32.min, INT32.min + 1, -1, 0, INT32.max - 1, INT32.max], shape),
+}
+margins = st.sampled_from([0, 1, 16, 33, 65535])
+
+
+@property_test
+@given(
+    size=st.tuples(st.integers(0, 3), st.integers(1, 40)),
+    widths=st.tuples(st.integers(0, 60), st.integers(0, 70)),
+    margin=margins,
+    kind=st.sampled_from(list(PREDICTIONS)),
+    invalid=shares,
+    seed=seeds,
+)
+def test_the_warp_is_the_oracles(size, widths, margin, kind, invalid, seed):
+    rng = np.random.default_rng(seed)
+    source_width, target_width = widths
+    shape = size[0], source_width
+    valid = np.where(rng.random(shape) < invalid, 0, rng.integers(1, 256, shape)).astype(np.uint8)
+    prediction = PREDICTIONS[kind](rng, size).astype(np.int32)
+    # Whole grey values are interpolated exactly in 32 bits.
+    for source, tolerance in ((rng.integers(0, 256, shape), 0.0), (rng.uniform(0, 255, shape), 1e-4)):
+        given = source.astype(np.float32), valid, prediction, margin, target_width
+        image, *others = run_warp(*given)
+        expected, *expected_others = oracle.warp(*given)
+        np.testing.assert_allclose(image, expected, rtol=0, atol=tolerance)
+        np.testing.assert_array_equal(others, expected_others)
+
+
+@pytest.mark.parametrize("slope", [-40, 0, 3, 256])
+@pytest.mark.parametrize("margin", [0, 5])
+def test_a_linear_image_is_warped_exactly(slope, margin):
+    """Grey values 3 + c / 2 of source column c, at 1/256 of 64 + (256 + slope) x for reference column x.
+
+    Beyond its sides the source goes on as its outermost pixels.
+    """
+    reference = np.arange(50)
+    source = np.tile(3 + np.arange(90) / 2, (2, 1)).astype(np.float32)
+    prediction = np.tile(64 + slope * reference, (2, 1)).astype(np.int32)
+    image, content, columns = run_warp(
+        source, np.full(source.shape, 255, np.uint8), prediction, margin, 50 + margin
+    )
+    place = np.concatenate([64 / 256 + np.arange(-margin, 0), (64 + (256 + slope) * reference) / 256])
+    inside = (place >= 0) & (place <= 89)
+    assert inside.sum() > 40
+    np.testing.assert_array_equal(image, np.tile(3 + np.clip(place, 0, 89) / 2, (2, 1)))
+    # A pixel reaches half a column to either side.
+    nearest = np.floor(place + 0.5)
+    shown = (nearest >= 0) & (nearest < 90)
+    np.testing.assert_array_equal(content, np.tile(np.where(shown, 255, 0), (2, 1)))
+    np.testing.assert_array_equal(columns, np.tile(np.where(shown, nearest, -1), (2, 1)))
+
+
+def test_nothing_is_predicted_without_reference():
+    with pytest.raises(ValueError, match="reference column"):
+        run_warp(np.zeros((2, 5), np.float32), np.zeros((2, 5), np.uint8), np.zeros((2, 0), np.int32), 3, 6)
+    run_warp(np.zeros((0, 5), np.float32), np.zeros((0, 5), np.uint8), np.zeros((0, 0), np.int32), 3, 6)
+
+
+@property_test
+@given(
+    size=st.tuples(st.integers(0, 3), st.integers(0, 40)),
+    margin=margins,
+    kind=st.sampled_from(list(PREDICTIONS)),
+    offsets=st.sampled_from(["near", "far", "extreme"]),
+    seed=seeds,
+)
+def test_offsets_are_unwarped_as_the_oracle_does(size, margin, kind, offsets, seed):
+    rng = np.random.default_rng(seed)
+    prediction = PREDICTIONS[kind](rng, size).astype(np.int32)
+    offset = {
+        "near": rng.integers(-5000, 5000, size) + 256 * margin,
+        "far": rng.integers(-(1 << 25), 1 << 25, size),
+        "extreme": rng.choice([INT32.min + 1, -(1 << 24), 1 << 24, INT32.max], size),
+    }[offsets].astype(np.int32)
+    offset[rng.random(size) < 0.2] = oracle.OFFSET_INVALID
+    np.testing.assert_array_equal(
+        run_unwarp(offset, prediction, margin), oracle.unwarp_offsets(offset, prediction, margin)
+    )
+
+
+@pytest.mark.parametrize("residual", [-700, -256, -1, 0, 100, 512])
+@pytest.mark.parametrize("slope", [-30, 0, 200])
+def test_unwarping_adds_what_is_predicted_where_the_match_lies(residual, slope):
+    """Of a linear prediction, to the last 1/256 pixel; of a residual of 0, the prediction itself."""
+    columns = np.arange(80)
+    prediction = np.tile(700 + slope * columns, (3, 1)).astype(np.int32)
+    margin = 16
+    offset = np.full_like(prediction, 256 * margin + residual)
+    exact = residual + 700 + np.floor(slope * (256 * columns + residual) / 256)
+    inner = slice(3, -3)
+    np.testing.assert_array_equal(
+        run_unwarp(offset, prediction, margin)[:, inner], np.tile(exact, (3, 1))[:, inner]
+    )
+
+
+@property_test
+@given(
+    kind=st.sampled_from(["whole", "half", "smooth", "folded", "steps"]),
+    margin=st.sampled_from([0, 16]),
+    seed=seeds,
+)
+def test_unwarping_leads_to_the_column_that_was_warped(kind, margin, seed):
+    """A match with target pixel w of the warped image is one with the source column that w shows."""
+    rng = np.random.default_rng(seed)
+    prediction = PREDICTIONS[kind](rng, (2, 60)).astype(np.int32)
+    source = np.zeros((2, 90), np.float32)
+    columns = run_warp(source, np.ones(source.shape, np.uint8), prediction, margin, 60 + 2 * margin)[2]
+    target = rng.integers(margin, 60 + margin, (2, 60))  # of every reference pixel
+    own = np.arange(60)
+    unwarped_offset = run_unwarp((256 * (target - own)).astype(np.int32), prediction, margin)
+    place = np.floor(own + unwarped_offset / 256 + 0.5)
+    shown = np.take_along_axis(columns, target, axis=1)
+    np.testing.assert_array_equal(np.where((place < 0) | (place >= 90), -1, place), shown)
+
+
+# ---- means of offsets --------------------------------------------------------------------------------------
+
+
+def run_mean(offset, radius, max_step):
+    mean = np.full(offset.shape, 5, dtype=np.int32)
+    _native.mean_offsets(offset, radius, max_step, mean)
+    return mean
+
+
+@property_test
+@given(
+    size=st.tuples(st.integers(0, 5), st.integers(0, 25)),
+    kind=st.sampled_from(list(PREDICTIONS)),
+    radius=st.sampled_from([0, 1, 3, 10]),
+    max_step=st.sampled_from([0, 1, 768, 1 << 20]),
+    seed=seeds,
+)
+def test_means_are_the_oracles(size, kind, radius, max_step, seed):
+    offset = PREDICTIONS[kind](np.random.default_rng(seed), size).astype(np.int32)
+    np.testing.assert_array_equal(
+        run_mean(offset, radius, max_step), oracle.mean_offsets(offset, radius, max_step)
+    )
+
+
+def test_the_mean_of_a_plane_is_the_plane():
+    offset = (70 * np.arange(40) - 50 * np.arange(30)[:, None] - 1000).astype(np.int32)
+    mean = run_mean(offset, 3, 360)
+    np.testing.assert_array_equal(mean[3:-3, 3:-3], offset[3:-3, 3:-3])
+    assert (mean[0] != offset[0]).any()
+
+
+def test_means_leave_out_what_is_of_another_surface():
+    """Noise of both surfaces is averaged, and nothing crosses the step between them, however large it is."""
+    rng = np.random.default_rng(0)
+    noise = rng.integers(-300, 301, (40, 40))
+    far = np.tile(np.arange(40) >= 20, (40, 1))
+    for step in (1400, -3000, INT32.max - 300):
+        offset = np.where(far, step, 0) + noise
+        mean = run_mean(offset.astype(np.int32), 3, 768)
+        assert np.abs(mean - np.where(far, step, 0)).max() < 150
+    ends = np.where(far, INT32.max, INT32.min).astype(np.int32)
+    np.testing.assert_array_equal(run_mean(ends, 3, 768), ends)
+
+
 # ---- the whole chain ---------------------------------------------------------------------------------------
 
 
-def run_match(backend, reference, target, base, image, p1, p2, max_slant, check: tuple[int, int], depth, rows):
+def run_match(backend, images, bases_, image, p1, p2, max_slant, check: tuple[int, int], depth, rows):
+    """`images` are the census of reference and target and what the target shows, `bases_` base and surface."""
+    reference, target, columns, width = images
+    base, surface = bases_
     scratch = np.full((2, rows * base.shape[1], depth), 77, dtype=np.uint8)
     offset = np.full(base.shape, 5, dtype=np.int32)
-    _native.match(backend, reference, target, base, image, p1, p2, max_slant, *check, scratch, offset)
+    given = reference, target, columns, width, base, surface, image
+    _native.match(backend, *given, p1, p2, max_slant, *check, scratch, offset)
     return offset
 
 
 @every_backend
 @pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize("depth", DEPTHS)
+@pytest.mark.parametrize(
+    ("depth", "columns"), [*((depth, "same") for depth in DEPTHS), (32, "torn"), (64, "stretched")]
+)
 @pytest.mark.parametrize("kind", ["smooth", "rough", "jumps"])
-def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, kind):
+def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind):
     rng = np.random.default_rng(depth + size[1])
     left, right = (
         rng.choice(np.array(GREYS["full"], np.int16), (size[0] + 6, width + 8)) for width in (size[1], size[1] + 5)
@@ -376,9 +657,14 @@ def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, kind):
     np.testing.assert_array_equal(run_census(backend, right, valid[1]), target)
     image = (left[3:-3, 4:-4] // 64).astype(np.uint8)
     p2 = p2_table(rng, 10, 30, 120)
-    sums = oracle.aggregation(oracle.matching_cost(reference, target, base, depth), base, image, 10, p2, 2)
-    expected = oracle.selection(sums, base, reference, target, 2, 5)
+    surface, shown = base, unwarped(target.shape)
+    if columns != "same":
+        surface = base + rng.integers(-3, 4, size).cumsum(axis=1).astype(np.int32)
+        shown = source_columns(rng, target.shape, columns, 2 * size[1]), 2 * size[1]
+    sums = oracle.aggregation(oracle.matching_cost(reference, target, base, depth), surface, image, 10, p2, 2)
+    expected = oracle.selection(sums, base, reference, target, *shown, 2, 5)
     # In one piece, and in bands of rows: to the bit the same.
     for rows in {1, 2, 3, size[0], size[0] + 1}:
-        offset = run_match(backend, reference, target, base, image, 10, p2, 2, (2, 5), depth, rows)
+        images = reference, target, *shown
+        offset = run_match(backend, images, (base, surface), image, 10, p2, 2, (2, 5), depth, rows)
         np.testing.assert_array_equal(offset, expected)

@@ -1,6 +1,7 @@
 """Matching on rendered pairs against exact disparities."""
 
 import functools
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -12,7 +13,8 @@ from scipy import ndimage
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
-from colmap_sph.stereo import matching, offsets
+from colmap_sph.pipeline.stages.match import _MATCH_BYTES
+from colmap_sph.stereo import matching
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import (
     SINGLE_PAIR,
@@ -24,6 +26,7 @@ from colmap_sph.stereo.matching import (
 )
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.resampling import resample
+from colmap_sph.stereo.search import offsets
 
 SIZE = (240, 180)
 FOCAL = 300.0
@@ -202,15 +205,23 @@ def test_no_motion_is_exactly_zero(search: tuple[float, float]):
 @pytest.mark.parametrize("shift", [-37, -8, -1, 3, 20])
 @pytest.mark.parametrize("shape", [(64, 200), (71, 151), (300, 290)])
 def test_whole_pixels_are_found(shape, shift):
-    """Disparity is left column minus right column: content moved left by `shift` has disparity `shift`."""
+    """Disparity is left column minus right column: content moved left by `shift` has disparity `shift`.
+
+    Exactly, where one level finds it; to a fraction of a pixel about what a coarser level predicts, which knows no
+    whole pixels of this one.
+    """
     scenery = random_image((shape[0], shape[1] + 80)).image
     left = whole(np.ascontiguousarray(scenery[:, 40 : 40 + shape[1]]))
     right = whole(np.ascontiguousarray(scenery[:, 40 + shift : 40 + shift + shape[1]]))
     disparity = match_pair(left, right, -40, 40, OPTIONS)
     column = np.arange(shape[1]) - shift
     inner = (column > 12) & (column < shape[1] - 12)
-    assert (np.abs(disparity[:, inner] - shift) < 0.02).mean() > 0.95
-    assert (np.abs(disparity[:, inner] - shift) <= 0.5).mean() > 0.99
+    error = np.abs(disparity[:, inner] - shift)
+    if min(shape) < 256:
+        assert (error < 0.02).mean() > 0.95
+    assert np.nanmedian(error) < 0.05
+    assert (error < 0.15).mean() > 0.95
+    assert (error <= 0.5).mean() > 0.99
     # Elsewhere the right image has nothing to match.
     outside = (column < -2) | (column > shape[1] + 1)
     assert (~np.isnan(disparity[:, outside])).sum() <= 0.2 * outside.sum() * shape[0]
@@ -347,7 +358,7 @@ def test_the_excess_is_that_of_the_level(monkeypatch):
     match = _native.match
 
     def recorded(*arguments):
-        limits.append((arguments[4].shape, arguments[8], arguments[9]))
+        limits.append((arguments[5].shape, arguments[11], arguments[12]))
         match(*arguments)
 
     monkeypatch.setattr(_native, "match", recorded)
@@ -440,3 +451,14 @@ def test_scratch_memory_is_what_a_plan_says(most):
     scratch = Scratch()
     match_pair(image, image, 0, most, MatchingOptions(), scratch)
     assert scratch._memory.size == pytest.approx(scratch_bytes(320 * 480, MatchingOptions()), rel=0.1)
+
+
+def test_memory_is_what_a_plan_says():
+    """Of arrays, beside the scratch memory; the rest of what a plan takes is for OpenCV's own."""
+    shape = (480, 640)
+    scratch = Scratch(max_bytes=0)
+    tracemalloc.start()
+    match_pair(random_image(shape), random_image(shape, 1), -200, 200, OPTIONS, scratch)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert 0.7 * _MATCH_BYTES < peak / (shape[0] * shape[1]) < 0.9 * _MATCH_BYTES

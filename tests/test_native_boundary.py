@@ -20,6 +20,7 @@ def arguments(function):
     """Valid arguments of every function, by name, outputs last."""
     f32, f64, u8 = np.float32, np.float64, np.uint8
     census_pair = {"reference": np.zeros((H, W), np.uint64), "target": np.zeros((H, TARGET), np.uint64)}
+    shown = {"columns": np.zeros((H, TARGET), np.int32), "source_width": 50}
     matrix = np.hstack([np.eye(3), np.zeros((3, 1))])
     table = {
         "census": {
@@ -50,6 +51,7 @@ def arguments(function):
             "aggregated": np.zeros((H, W, DEPTH), u8),
             "base": np.zeros((H, W), np.int32),
             **census_pair,
+            **shown,
             "max_difference": 2,
             "max_excess": 4,
             "out offset": np.zeros((H, W), np.int32),
@@ -57,7 +59,9 @@ def arguments(function):
         "match": {
             "backend": "scalar",
             **census_pair,
+            **shown,
             "base": np.zeros((H, W), np.int32),
+            "surface": np.zeros((H, W), np.int32),
             "image": np.zeros((H, W), u8),
             "p1": 10,
             "p2": np.full(256, 60, u8),
@@ -72,6 +76,27 @@ def arguments(function):
             "offset": np.zeros((H, W), np.int32),
             **census_pair,
             "out fitted": np.zeros((H, W), np.int32),
+        },
+        "warp": {
+            "source": np.zeros((H, 50), f32),
+            "valid": np.ones((H, 50), u8),
+            "prediction": np.zeros((H, W), np.int32),
+            "margin": 3,
+            "out warped": np.zeros((H, TARGET), f32),
+            "out warped_valid": np.zeros((H, TARGET), u8),
+            "out columns": np.zeros((H, TARGET), np.int32),
+        },
+        "unwarp_offsets": {
+            "offset": np.zeros((H, W), np.int32),
+            "prediction": np.zeros((H, W), np.int32),
+            "margin": 3,
+            "out unwarped": np.zeros((H, W), np.int32),
+        },
+        "mean_offsets": {
+            "offset": np.zeros((H, W), np.int32),
+            "radius": 2,
+            "max_step": 300,
+            "out mean": np.zeros((H, W), np.int32),
         },
         "transfer_disparity": {
             "left": np.zeros((H, W), f32),
@@ -248,6 +273,9 @@ FUNCTIONS = [
     "selection",
     "match",
     "fit_offsets",
+    "warp",
+    "unwarp_offsets",
+    "mean_offsets",
     "transfer_disparity",
     "depth_candidates",
     "vote_depth",
@@ -277,9 +305,8 @@ OUTPUTS = [(function, name) for function, name in ARRAYS if name.startswith("out
 # Axes whose length no other argument fixes, so that any size is right.
 FREE = {
     ("matching_cost", "target"): {1},
-    ("selection", "target"): {1},
-    ("match", "target"): {1},
     ("fit_offsets", "target"): {1},
+    ("warp", "prediction"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -550,6 +577,31 @@ def test_negative_limits_of_the_left_right_check_are_refused(function, limit):
         call(function, {**arguments(function), limit: -1})
 
 
+@pytest.mark.parametrize("function", ["selection", "match"])
+@pytest.mark.parametrize(
+    ("width", "message"), [(-1, "negative"), (-(2**31), "negative"), (65536, "65535"), (2**31 - 1, "65535")]
+)
+def test_sources_of_impossible_width_are_refused(function, width, message):
+    with pytest.raises(ValueError, match=message):
+        call(function, {**arguments(function), "source_width": width})
+
+
+@pytest.mark.parametrize("function", ["warp", "unwarp_offsets"])
+@pytest.mark.parametrize("margin", [-1, 65536, 2**31 - 1, -(2**31)])
+def test_margins_out_of_bounds_are_refused(function, margin):
+    with pytest.raises(ValueError, match="margin"):
+        call(function, {**arguments(function), "margin": margin})
+
+
+@pytest.mark.parametrize(("name", "most"), [("radius", 10), ("max_step", 1 << 20)])
+def test_bounds_of_means_are_kept(name, most):
+    for value in (0, most):
+        call("mean_offsets", {**arguments("mean_offsets"), name: value})
+    for value in (-1, most + 1, 2**31 - 1):
+        with pytest.raises(ValueError, match=name):
+            call("mean_offsets", {**arguments("mean_offsets"), name: value})
+
+
 def test_negative_slant_is_refused():
     with pytest.raises(ValueError, match="slant"):
         call("aggregation", {**arguments("aggregation"), "max_slant": -1})
@@ -671,6 +723,7 @@ def test_steps_within_the_image_are_accepted(rows, step):
 def test_rows_beyond_16_bits_are_refused():
     values = arguments("selection")
     values["target"] = np.zeros((H, 65536), np.uint64)
+    values["columns"] = np.zeros((H, 65536), np.int32)
     with pytest.raises(ValueError, match="65535"):
         call("selection", values)
     wide = {
@@ -679,7 +732,18 @@ def test_rows_beyond_16_bits_are_refused():
         if name in ("aggregated", "base", "reference", "out offset")
     }
     with pytest.raises(ValueError, match="65535"):
-        call("selection", {**arguments("selection"), **wide, "target": np.zeros((1, 8), np.uint64)})
+        narrow = {"target": np.zeros((1, 8), np.uint64), "columns": np.zeros((1, 8), np.int32)}
+        call("selection", {**arguments("selection"), **wide, **narrow})
+    values = arguments("warp")
+    for names in (["source", "valid"], ["prediction"], ["out warped", "out warped_valid", "out columns"]):
+        wide = {name: np.zeros((H, 65536), values[name].dtype) for name in names}
+        with pytest.raises(ValueError, match="65535"):
+            call("warp", {**values, **wide})
+    for function in ("unwarp_offsets", "mean_offsets"):
+        values = arguments(function)
+        wide = {name: np.zeros((1, 65536), np.int32) for name in each_array(function)}
+        with pytest.raises(ValueError, match="65535"):
+            call(function, {**values, **wide})
 
 
 @every_backend
@@ -688,11 +752,15 @@ def test_rows_beyond_16_bits_are_refused():
 def test_empty_images_are_no_work(backend, size, target_width):
     image, base, words = np.zeros(size, np.uint8), np.zeros(size, np.int32), np.zeros(size, np.uint64)
     target = np.zeros((size[0], target_width), np.uint64)
+    shown = np.zeros((size[0], target_width), np.int32), 9
     volume, sums = np.zeros((*size, 32), np.uint8), np.zeros((*size, 32), np.uint8)
     _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.int16), image, words)
     _native.matching_cost(backend, words, target, base, volume)
     _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, volume.copy(), sums)
-    _native.selection(backend, sums, base, words, target, 2, 0, np.zeros(size, np.int32))
+    offset = np.zeros(size, np.int32)
+    _native.selection(backend, sums, base, words, target, *shown, 2, 0, offset)
+    _native.unwarp_offsets(offset, base, 65535, offset.copy())
+    _native.mean_offsets(offset, 10, 1 << 20, offset.copy())
 
 
 @every_backend
@@ -702,7 +770,7 @@ def test_target_without_columns_is_never_matched(backend):
     cost, offset = np.zeros((H, W, DEPTH), np.uint8), np.zeros((H, W), np.int32)
     _native.matching_cost(backend, reference, target, base, cost)
     np.testing.assert_array_equal(cost, oracle.COST_UNSEEN)
-    _native.selection(backend, cost, base, reference, target, 2, 0, offset)
+    _native.selection(backend, cost, base, reference, target, target.astype(np.int32), 50, 2, 0, offset)
     np.testing.assert_array_equal(offset, oracle.OFFSET_INVALID)
 
 
@@ -718,7 +786,7 @@ def test_empty_images_of_absurd_width_are_refused_or_no_work(backend):
     for function, values in {
         "aggregation": (volume, base, image, 10, p2, 2, volume.copy(), volume.copy()),
         "matching_cost": (words, words, base, volume),
-        "selection": (volume, base, words, words, 2, 0, np.empty((0, width), np.int32)),
+        "selection": (volume, base, words, words, base.copy(), 9, 2, 0, np.empty((0, width), np.int32)),
     }.items():
         with pytest.raises((ValueError, MemoryError)):
             getattr(_native, function)(backend, *values)

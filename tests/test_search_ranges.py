@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+from scipy import ndimage
 
 from colmap_sph.errors import RectificationError
 from colmap_sph.stereo.disparity_range import columns_with_counterparts, few_digits, parallax_range
-from colmap_sph.stereo.offsets import INVALID, SUBPIXEL
-from colmap_sph.stereo.search_ranges import MAX_DEPTH, STEP, num_levels, propagate, range_depth, whole_range
+from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
+from colmap_sph.stereo.search.prediction import Prediction, from_coarser, from_seeds, searched_depth
+from colmap_sph.stereo.search.ranges import MAX_DEPTH, STEP, num_levels, range_depth
 
 
 def test_few_points_tell_no_range() -> None:
@@ -49,47 +51,165 @@ def test_levels_shorten_the_range_and_keep_images_large_enough() -> None:
     assert num_levels(10**6, 63, 128) == 0
 
 
-@pytest.mark.parametrize(("low", "high"), [(0, 0), (-20, 9), (-20, 10), (5, 900), (0, 5000)])
-def test_the_whole_range_is_searched_with_one_more_at_either_end(low: int, high: int) -> None:
-    base, depth = whole_range((3, 4), low, high)
-    assert base.shape == (3, 4) and (base == low - 1).all()
-    assert depth == range_depth(low, high) and depth % STEP == 0
-    assert low - 1 + depth > high + 1 or depth == MAX_DEPTH
+RANGES = [(0, 0), (-20, 9), (-20, 10), (5, 900), (0, 5000)]
+
+
+@pytest.mark.parametrize(("low", "high"), RANGES)
+def test_a_range_is_searched_with_one_more_at_either_end(low: int, high: int) -> None:
+    depth = range_depth(low, high)
+    assert depth % STEP == 0
+    assert depth >= high - low + 3 or depth == MAX_DEPTH
     assert depth - STEP < high - low + 3
+    assert searched_depth(low, high, 64) == min(depth, 64)
 
 
-def test_a_slanted_surface_is_searched_for_where_it_is() -> None:
-    columns = np.arange(60)
-    offset = np.tile(np.round(0.3 * columns * SUBPIXEL).astype(np.int32), (50, 1))
-    offset[20:25, 10:30] = INVALID
-    base = propagate(offset, (99, 119), 32, -1000, 1000, 4)
-    # Twice the size: 0.3 pixels per column as before, from half a pixel of the finer level on.
-    truth = 2 * 0.3 * ((np.arange(119) - 0.5) / 2)
-    assert base.shape == (99, 119)
-    assert np.abs(base + 16 - truth)[:, 8:-8].max() <= 2
+# ---- the coarsest level ------------------------------------------------------------------------------------
+
+
+def check_reach(prediction: Prediction, low: int, high: int) -> None:
+    """Every pixel searches the whole range and one more at either end, and less than a step in vain."""
+    depth = prediction.depth
+    assert depth % STEP == 0 and depth <= MAX_DEPTH
+    if depth < MAX_DEPTH:
+        assert (prediction.first <= low - 1).all()
+        assert (prediction.first + depth - 1 >= high + 1).all()
+    farthest = max(high - prediction.offset.min() / SUBPIXEL, prediction.offset.max() / SUBPIXEL - low)
+    assert depth - STEP <= 2 * farthest + 5
+
+
+@pytest.mark.parametrize(("low", "high"), RANGES)
+def test_without_seeds_the_middle_of_the_range_is_predicted(low: int, high: int) -> None:
+    for nothing in (None, np.zeros((0, 3))):
+        prediction = from_seeds(nothing, (3, 4), 1, low, high)
+        np.testing.assert_array_equal(prediction.offset, np.full((3, 4), (low + high) // 2 * SUBPIXEL))
+        check_reach(prediction, low, high)
+
+
+@pytest.mark.parametrize(("low", "high"), RANGES)
+@pytest.mark.parametrize("disparity", [-40, 30.25, -10000, 10000])
+def test_seeds_are_predicted_as_far_as_the_range_goes(low: int, high: int, disparity: float) -> None:
+    """At level 2, whose pixels have four times the size; to a sixteenth of a pixel."""
+    seeds = np.column_stack([np.random.default_rng(0).uniform(0, 60, (20, 2)), np.full(20, disparity)])
+    prediction = from_seeds(seeds, (15, 16), 2, low, high)
+    expected = np.clip(-disparity / 4, low, high)
+    assert np.abs(prediction.offset / SUBPIXEL - expected).max() <= 1 / 32
+    check_reach(prediction, low, high)
+
+
+def test_unlike_seeds_all_search_the_whole_range() -> None:
+    rng = np.random.default_rng(0)
+    seeds = np.column_stack([rng.uniform(0, 160, (40, 2)), rng.uniform(-30, 200, 40)])
+    prediction = from_seeds(seeds, (40, 41), 2, -50, 20)
+    assert np.ptp(prediction.offset) > 20 * SUBPIXEL
+    check_reach(prediction, -50, 20)
+
+
+# ---- the levels below --------------------------------------------------------------------------------------
+
+
+def steps(offset: np.ndarray) -> np.ndarray:
+    """Pixels in 1/256 pixel."""
+    return np.round(offset * SUBPIXEL).astype(np.int32)
+
+
+def prior_of(offset: np.ndarray) -> Prediction:
+    return Prediction(steps(offset), np.zeros(offset.shape, np.int32), STEP)
+
+
+def finer(slope: float, size: int) -> np.ndarray:
+    """Offsets of pixels of the finer level, where slope * x are those of pixel x of the coarser one.
+
+    Pixel x of the coarser level covers 2 x and 2 x + 1 of the finer one.
+    """
+    return 2 * slope * (np.arange(size) - 0.5) / 2
+
+
+@pytest.mark.parametrize("slope", [0.3, -0.7])
+def test_a_slanted_surface_is_predicted_where_it_is(slope: float) -> None:
+    offset = np.tile(slope * np.arange(60), (50, 1))
+    prediction = from_coarser(steps(offset), prior_of(0 * offset), (99, 119), 32, 4)
+    assert prediction.offset.shape == prediction.base.shape == (99, 119)
+    assert prediction.depth == 32
+    inner = np.s_[:, 14:-14]
+    assert np.abs(prediction.offset / SUBPIXEL - finer(slope, 119))[inner].max() < 0.02
+    assert (prediction.base[inner] == -16).all()
+    assert np.abs(prediction.first + 16 - finer(slope, 119))[inner].max() <= 0.52
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.4])
+def test_gaps_are_filled_along_what_was_predicted(slope: float) -> None:
+    """A surface five pixels from the predicted one, and parallel to it, with holes."""
+    prior = np.tile(slope * np.arange(60), (50, 1))
+    offset = steps(prior + 5)
+    offset[20:35, 20:40] = INVALID
+    offset[5, 7] = INVALID
+    prediction = from_coarser(offset, prior_of(prior), (100, 120), 32, 4)
+    assert np.abs(prediction.offset / SUBPIXEL - 10 - finer(slope, 120))[:, 14:-14].max() < 0.02
+
+
+def test_a_level_without_any_match_leaves_what_was_predicted() -> None:
+    prior = np.tile(0.4 * np.arange(60), (50, 1))
+    prediction = from_coarser(np.full(prior.shape, INVALID, np.int32), prior_of(prior), (100, 120), 64, 4)
+    assert np.abs(prediction.offset / SUBPIXEL - finer(0.4, 120))[:, 14:-14].max() < 0.02
+
+
+def test_one_outlier_predicts_nothing() -> None:
+    offset = np.zeros((30, 30), np.int32)
+    offset[12, 17] = 90 * SUBPIXEL
+    prediction = from_coarser(offset, prior_of(np.zeros((30, 30))), (60, 60), 32, 4)
+    assert not prediction.offset.any()
+    assert (prediction.base == -16).all()
+
+
+def test_noise_of_a_surface_is_averaged() -> None:
+    rng = np.random.default_rng(0)
+    offset = rng.normal(0, 0.3, (60, 80))
+    prediction = from_coarser(steps(offset), prior_of(np.zeros((60, 80))), (120, 160), 32, 4)
+    assert (prediction.offset / SUBPIXEL / 2).std() < 0.1
+
+
+@pytest.mark.parametrize("depth", [32, 64])
+@pytest.mark.parametrize("radius", [0, 2, 4])
+def test_the_window_holds_all_offsets_around_where_they_fit(depth: int, radius: int) -> None:
+    """Blocks of some pixels, of which some are alike and others differ by much; windows see their median.
+
+    What is predicted is a mean over pixels up to three columns away and three pixels off, which a smaller radius
+    does not look at.
+    """
+    rng = np.random.default_rng(depth + radius)
+    blocks = np.kron(rng.integers(-12, 13, (6, 8)), np.ones((9, 9), int))
+    blocks[:, :36] //= 3
+    prediction = from_coarser(steps(blocks), prior_of(0.0 * blocks), (108, 144), depth, radius)
+    first, last = prediction.first, prediction.first + depth - 1
+    own = 2 * ndimage.median_filter(blocks, 5, mode="nearest")
+    fitting = 0
+    for y, x in np.ndindex(108, 144):
+        around = own[tuple(slice(max(k // 2 - radius, 0), k // 2 + radius + 1) for k in (y, x))]
+        if np.ptp(around) <= depth - (12 if radius > 2 else 24):
+            fitting += 1
+            assert first[y, x] + 3 <= around.min() and around.max() <= last[y, x] - 2
+        assert first[y, x] < own[y // 2, x // 2] < last[y, x]
+    assert fitting > 108 * 144 // 3
 
 
 def test_a_step_is_searched_for_on_both_sides() -> None:
-    """A range that fits holds both surfaces; one that does not holds each pixel's own, with room for its fit."""
+    """A window that fits holds both surfaces; one that does not holds each pixel's own, with room for its fit."""
     for step in (5, 40):
         offset = np.zeros((40, 60), np.int32)
         offset[:, 30:] = step * SUBPIXEL
-        base = propagate(offset, (80, 120), 32, -1000, 1000, 4)
+        prediction = from_coarser(offset, prior_of(np.zeros((40, 60))), (80, 120), 32, 4)
         truth = np.where(np.arange(120) < 60, 0, 2 * step)
-        room = np.minimum(truth - base, base + 31 - truth)
+        room = np.minimum(truth - prediction.first, prediction.first + 31 - truth)
         assert room.min() >= (4 if step == 5 else 5)
-        if step == 5:
+        # Nothing is averaged or interpolated across it.
+        if step == 40:
+            np.testing.assert_array_equal(prediction.offset, np.tile(truth * SUBPIXEL, (80, 1)))
+        else:
             both = slice(56, 64)
-            assert (base[:, both] <= 0).all() and (base[:, both] + 31 >= 10).all()
+            assert (prediction.first[:, both] <= 0).all() and (prediction.first[:, both] + 31 >= 10).all()
 
 
-def test_search_ranges_stay_in_the_whole_range() -> None:
-    offset = np.full((40, 60), 10 * SUBPIXEL, np.int32)
-    assert (propagate(offset, (80, 120), 32, -5, 20, 4) == -6).all()
-    assert (propagate(offset, (80, 120), 32, 3, 60, 4) == 4).all()
-    assert (propagate(offset, (80, 120), 32, -60, 22, 4) == -8).all()
-
-
-def test_a_level_without_any_match_leaves_the_middle() -> None:
-    offset = np.full((5, 5), INVALID, np.int32)
-    assert (propagate(offset, (10, 9), 32, 10, 90, 4) == 34).all()
+def test_the_first_offset_is_the_rounded_prediction_and_the_base() -> None:
+    offset = np.array([[-385, -384, -129, -128, 127, 128, 384]], np.int32)
+    prediction = Prediction(offset, np.full((1, 7), -16, np.int32), 32)
+    np.testing.assert_array_equal(prediction.first + 16, np.floor(offset / 256 + 0.5))

@@ -44,7 +44,7 @@ def test_pairs_are_summed_by_angle():
     pairs = importlib.import_module("rectification_study.pairs")
     scored = [
         made_up_pair(5.0, (100, 80, 1000), (110, 90, 900)),
-        made_up_pair(8.0, (50, 40, 500), (40, 40, 400)),
+        made_up_pair(7.0, (50, 40, 500), (40, 40, 400)),
         made_up_pair(90.0, None, (30, 20, 300)),
     ]
     near, wide, every = pairs.by_angle(scored)
@@ -52,7 +52,7 @@ def test_pairs_are_summed_by_angle():
     assert (wide["frame"]["skipped"], wide["frame"]["warped"], wide["spherical"]["matched"]) == (1, 0, 30)
     assert (every["pairs"], every["frame"]["warped"], every["spherical"]["warped"]) == (3, 1500, 1600)
     assert wide["frame"]["median_error_gsd"] is None
-    assert [pair["right"] for pair in pairs.telling_pairs(scored, 3)] == ["b5.0.jpg", "b8.0.jpg"]
+    assert [pair["right"] for pair in pairs.telling_pairs(scored, 3)] == ["b5.0.jpg", "b7.0.jpg"]
 
 
 def test_errors_are_in_pixels_on_the_ground_and_slopes_against_a_plane():
@@ -91,6 +91,7 @@ def test_the_whole_study(block: syn.DemoBlock, project: Path):
         model=project / "sparse" / "0",
         exact_depth=project / "depth",
         shown_pairs=1,
+        same_pixels="spherical",
         run=RunOptions(threads=2),
     )
     study.main(asked)
@@ -101,10 +102,57 @@ def test_the_whole_study(block: syn.DemoBlock, project: Path):
         assert total[model]["correct"] > 0.8 * total[model]["matched"] > 0
         assert total[model]["median_error_gsd"] < 1
         assert content["cost"][model]["match pairs"]["cpu_seconds"] > 0
+    same = content["same_pixels"]
+    frame, spherical = same["by_angle"][-1]["warped_common"]
+    assert spherical == pytest.approx(frame, rel=0.02)
+    assert spherical != pytest.approx(total["warped_common"][1], rel=0.02), "they had different numbers before"
+    assert total["frame"]["warped"] == same["by_angle"][-1]["frame"]["warped"]
+    for model in ("frame", "spherical"):
+        counts = total["found"][model]
+        assert counts["seen"] == total["found_common"][model]["seen"] > counts["found"] > 0.6 * counts["seen"]
+        assert counts["within_1_pixel"] > 0.9 * counts["found"]
     report = (project / "study" / "study.md").read_text()
-    for heading in ("Points", "Exact depth", "By angle", "By slope", "Pairs that could not be rectified", "Cost"):
+    assert "frame cannot rectify 0 of 3 pairs; spherical cannot rectify 0 of 3 pairs." in report
+    assert f"# With as many rectified pixels: spherical with sampling {same['sampling']:.3f}" in report
+    for heading in (
+        "Points",
+        "Exact depth",
+        "Found of what both images see",
+        "By angle",
+        "By slope",
+        "Pairs that could not be rectified",
+        "Cost",
+    ):
         assert f"## {heading}" in report
     pictures = sorted(path.name for path in (project / "study").glob("*.png"))
     assert len(pictures) == 3 and all(name in report for name in pictures)
     with pytest.raises(InputError, match="another model or with other options"):
         study.main(replace(asked, run=RunOptions(threads=1)))
+
+
+def test_a_street_leaves_nothing_to_the_frame(tmp_path: Path):
+    pytest.importorskip("matplotlib")
+    scenes = importlib.import_module("rectification_study.scenes")
+    options = syn.CanyonOptions(width=160, height=120, images=3, points=600, supersample=1)
+    street = syn.make_canyon_block(tmp_path, options, threads=2)
+    scenes.write_exact_depth(street.names, street.cameras, street.surfaces, tmp_path / "depth")
+    study = importlib.import_module("study_rectification")
+    study.main(
+        study.Study(
+            output=tmp_path / "study",
+            model=street.sparse_dir,
+            exact_depth=tmp_path / "depth",
+            same_pixels="spherical",
+            run=RunOptions(threads=2),
+        )
+    )
+    content = json.loads((tmp_path / "study" / "study.json").read_text())
+    total = content["by_angle"][-1]
+    assert "viewing ray runs along it" in content["failures"]["frame"]
+    assert (total["pairs"], total["frame"]["skipped"], total["spherical"]["skipped"]) == (3, 3, 0)
+    assert total["found"]["frame"]["found"] == 0 < total["found"]["spherical"]["found"]
+    assert total["found"]["frame"]["seen"] == total["found"]["spherical"]["seen"]
+    assert "same_pixels" not in content, "there are no pairs on both"
+    report = (tmp_path / "study" / "study.md").read_text()
+    assert "**frame cannot rectify 3 of 3 pairs; spherical cannot rectify 0 of 3 pairs.**" in report
+    assert "**frame: no result.**" in report

@@ -179,7 +179,7 @@ def facing_view(name: str, x: float) -> View:
 
 
 def test_a_votes_standard_deviation_grows_by_the_residual():
-    """σ_Z = Z σ_d / d on the plane, with σ_d = hypot(0.2 px, s)."""
+    """σ_Z = Z σ_d / d on the plane, with σ_d = hypot(0.2 px times image pixels to a rectified one, s)."""
     left, right = facing_view("a", 0), facing_view("b", 1)
     scene_points = np.column_stack([np.zeros((101, 2)), np.linspace(9, 11, 101)])
     left, right = (replace(view, point_indices=np.arange(101)) for view in (left, right))
@@ -192,9 +192,11 @@ def test_a_votes_standard_deviation_grows_by_the_residual():
     exact = vote_depth(left, [pair], options)
     rough = vote_depth(left, [pair], options, None, [0.6 / focal])
     place = (24, 40)
+    sigma = 0.2 * left.K[0, 0] / focal
+    assert 0.16 < sigma < 0.2
     assert exact.depth[place] == pytest.approx(10, rel=1e-4)
-    assert exact.sigma[place] == pytest.approx(10 * 0.2 / (focal / 10), rel=1e-3)
-    assert rough.sigma[place] == pytest.approx(10 * np.hypot(0.2, 0.6) / (focal / 10), rel=1e-3)
+    assert exact.sigma[place] == pytest.approx(10 * sigma / (focal / 10), rel=1e-3)
+    assert rough.sigma[place] == pytest.approx(10 * np.hypot(sigma, 0.6) / (focal / 10), rel=1e-3)
     # Half the rectified pixels per pixel, and twice the standard deviation of each: four times as much in depth.
     coarse = replace(pair, geometry=geometry.resampled(0.5), disparity=disparity[::2, ::2] / np.float32(2))
     soft = vote_depth(left, [coarse], options)

@@ -18,9 +18,10 @@
         return aggregate_rows(&rows_##version, cost, base, image, size, penalties, detours, aggregated); \
     } \
     static int selection_##version(const uint8_t *aggregated, const int32_t *base, const uint64_t *reference, \
-                                   const uint64_t *target, match_size size, left_right_check check, \
-                                   int32_t *offset) { \
-        return select_rows(&rows_##version, aggregated, base, reference, target, size, check, offset); \
+                                   const uint64_t *target, const int32_t *columns, match_size size, \
+                                   left_right_check check, int32_t *offset) { \
+        return select_rows(&rows_##version, aggregated, base, reference, target, columns, size, check, \
+                           offset); \
     } \
     static int match_##version(const match_input *input, ptrdiff_t band_rows, uint8_t *scratch, \
                                int32_t *offset) { \

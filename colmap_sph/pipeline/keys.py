@@ -12,6 +12,7 @@ from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.agreement import SparseSights
 from colmap_sph.stereo.rectified_pair import RectifiedPair
+from colmap_sph.stereo.search.seeds import Seeds
 
 # The modules whose code makes each kind of result.
 _MAKERS = {
@@ -97,21 +98,23 @@ class Keys:
         mask_digest = None if mask is None or self.fresh else file_digest(mask)
         return self._key("undistorted", image, camera, values, mask_digest, self._options.undistortion)
 
-    def pair(self, left: View, right: View, geometry: RectifiedPair, trial: float) -> str:
+    def pair(self, left: View, right: View, geometry: RectifiedPair, seeds: Seeds, trial: float) -> str:
         """Of a disparity map.
 
         Parameters
         ----------
         left, right : View
         geometry : RectifiedPair
-            In which the sparse points and the options of rectification are, too.
+            In which the options of rectification are, too.
+        seeds : (n, 3) float32 ndarray
+            Where its sparse points are expected to match.
         trial : float
             Share of its rows and columns that the pair is matched at first, see `MatchTask`; 1 without.
         """
         images = [self._image(view.name) for view in (left, right)]
         masks = [self._mask(view.name) for view in (left, right)]
         cameras = [_camera(view) for view in (left, right)]
-        return self._key("pair", images, masks, cameras, geometry, trial, self._options.matching)
+        return self._key("pair", images, masks, cameras, geometry, seeds, trial, self._options.matching)
 
     def polish(self, pairs: Sequence[tuple[str, str]], model_dir: Path) -> str:
         """Of the polished model, from the pairs to match and the folder of the given model."""

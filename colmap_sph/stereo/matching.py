@@ -2,10 +2,10 @@
 
 Census (9 × 7) of the sharpened images, Hamming cost, aggregation along 8 paths (Hirschmüller 2008), comparison
 of the matches from left and from right, sub-pixel fit without pixel locking, and removal of small segments, on an
-image pyramid with per-pixel search ranges (Rothermel et al. 2012, "tSGM"; see `search_ranges`).
+image pyramid, each level about what the one above it predicts (Rothermel et al. 2012, "tSGM"; see `prediction`).
 
-This module is the only caller of the matching kernels. Their convention is an *offset*, target column minus
-reference column; with the left image as reference it is minus the disparity.
+This module and `prediction` are the only callers of the matching kernels. Their convention is an *offset*, target
+column minus reference column; with the left image as reference it is minus the disparity.
 """
 
 from dataclasses import dataclass
@@ -18,9 +18,11 @@ from numpy.typing import NDArray
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
 from colmap_sph.stereo.kernels import backend
-from colmap_sph.stereo.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
 from colmap_sph.stereo.resampling import half_size
-from colmap_sph.stereo.search_ranges import MAX_DEPTH, STEP, num_levels, propagate, range_depth, whole_range
+from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
+from colmap_sph.stereo.search.prediction import Prediction, from_coarser, from_seeds, searched_depth
+from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
+from colmap_sph.stereo.search.seeds import Seeds
 
 _CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
 # Census compares 1/64 grey values, see CENSUS_MARGIN in `matching.h`: on weak texture, whole ones are too coarse.
@@ -55,17 +57,21 @@ class MatchingOptions:
     p2_contrast: int = 2
     """Difference of neighbours in the left image, grey values, at which P2 has fallen halfway to `p2_min`."""
     disparities: int = 32
-    """Disparities searched per pixel at full resolution; a multiple of 32."""
+    """Disparities searched per pixel, about the predicted one, at full resolution; a multiple of 32."""
     coarse_disparities: int = 64
-    """Disparities searched per pixel at the levels between the coarsest and the finest; a multiple of 32."""
+    """Disparities searched per pixel, about the predicted one, at the levels between the coarsest, which searches
+    the whole range, and the finest; a multiple of 32."""
     max_coarsest_disparities: int = 128
     """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
     range_radius: int = 4
-    """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches."""
+    """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches, too, where
+    they fit."""
     max_slant: int = 3
-    """Search ranges of neighbours that are at most this many pixels apart follow the slope of one surface."""
+    """Below the coarsest level, neighbours whose search ranges begin at most this many pixels apart follow the
+    slope of one surface, which costs nothing."""
     max_left_right_difference: int = 2
-    """Largest difference, in pixels, between the matches found from the left and from the right image."""
+    """Largest distance, in columns of the left image, from a pixel to the best match of the right pixel at which
+    it was found."""
     max_left_right_excess: int = 4
     """A match beyond `max_left_right_difference` is kept all the same when its aggregated cost (half the sum over
     8 paths, census bits) exceeds that of the right pixel's best match by no more than this; 255 keeps all."""
@@ -166,6 +172,7 @@ def match_pair(
     scratch: Scratch | None = None,
     *,
     infinity: float | None = None,
+    seeds: Seeds | None = None,
 ) -> NDArray[np.float32]:
     """Match the left image of a rectified pair in the right one.
 
@@ -182,6 +189,8 @@ def match_pair(
         Disparity of what is infinitely far away. Where the range nearly reaches it, matches are searched up to
         there, and those beyond `min_disparity` dropped: clouds would else be matched to whatever looks most like
         them in the range.
+    seeds : (n, 3) float32 ndarray, optional
+        Left column, left row and disparity, pixels, of what is known to match, see `seeds_of_points`.
 
     Returns
     -------
@@ -222,13 +231,14 @@ def match_pair(
     for level in range(levels, -1, -1):
         low, high = least >> level, -(-most >> level)
         shape = lefts[-1].image.shape
+        most_searched = options.disparities if level == 0 else options.coarse_disparities
+        depth = searched_depth(low, high, MAX_DEPTH if offset is None else most_searched)
         if offset is None:
-            base, depth = whole_range(shape, low, high)
+            prediction = from_seeds(seeds, shape, level, low, high)
         else:
-            searched = options.disparities if level == 0 else options.coarse_disparities
-            depth = min(range_depth(low, high), searched)
-            base = propagate(offset, shape, depth, low, high, options.range_radius)
-        offset = _match_level(lefts.pop(), rights.pop(), base, depth, options, scratch, finest=level == 0)
+            prediction = from_coarser(offset, prediction, shape, depth, options.range_radius)
+        offset = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
+        _drop_outside(offset, low - SPARE, max(high + SPARE, low - SPARE + depth - 1))
         if sky is not None:
             _drop_beyond(offset, farthest, sky, level)
         if level > 0 or options.median_filter:
@@ -244,6 +254,11 @@ def _sky_offset(min_disparity: float, max_disparity: float, infinity: float | No
         return None
     beyond = min_disparity - infinity
     return -infinity if 0 < beyond <= _NEAR_RANGE * (max_disparity - min_disparity) else None
+
+
+def _drop_outside(offset: NDArray[np.int32], first: int, last: int) -> None:
+    """Invalidate, in place, what does not lie between two offsets, pixels, as windows about predictions reach."""
+    offset[(offset < first * SUBPIXEL) | (offset > last * SUBPIXEL)] = INVALID
 
 
 def _drop_beyond(offset: NDArray[np.int32], farthest: int, sky: float, level: int) -> None:
@@ -279,8 +294,9 @@ def _with_border(image: NDArray[Any], border: tuple[int, int, int, int], kind: i
 
 
 def _census(image: RectifiedImage) -> NDArray[np.uint64]:
-    sharp = cv2.filter2D(image.image, cv2.CV_32F, _UNSHARP, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
-    padded = _with_border(sharp, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
+    # Sharpened with its border, which a warped image has inside.
+    padded = _with_border(image.image, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
+    padded = cv2.filter2D(padded, cv2.CV_32F, _UNSHARP, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
     census = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), census)
     return census
@@ -289,8 +305,7 @@ def _census(image: RectifiedImage) -> NDArray[np.uint64]:
 def _match_level(
     left: RectifiedImage,
     right: RectifiedImage,
-    base: NDArray[np.int32],
-    depth: int,
+    prediction: Prediction,
     options: MatchingOptions,
     scratch: Scratch,
     *,
@@ -298,31 +313,59 @@ def _match_level(
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
+    margin = prediction.margin
+    source_width = right.image.shape[1]
+    right, columns = _warped(right, prediction, margin)
+    right_census = _census(right)
+    del right
     left_census = _census(left)
     image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
     del left
-    right_census = _census(right)
-    del right
-    offset = np.empty(base.shape, dtype=np.int32)
+    offset = np.empty(image.shape, dtype=np.int32)
     _native.match(
         kernels,
         left_census,
         right_census,
-        base,
+        columns,
+        source_width,
+        prediction.base + np.int32(margin),
+        prediction.base if prediction.exact else prediction.first,
         image,
         options.p1,
         _p2_table(options),
-        options.max_slant,
+        0 if prediction.exact else options.max_slant,
         options.max_left_right_difference,
         options.max_left_right_excess if finest else options.max_coarse_left_right_excess,
-        scratch.volume(base.shape, depth),
+        scratch.volume(image.shape, prediction.depth),
         offset,
     )
-    if not finest:
-        return offset
-    fitted = np.empty_like(offset)
-    _native.fit_offsets(kernels, offset, left_census, right_census, fitted)
-    return fitted
+    if finest:
+        fitted = np.empty_like(offset)
+        _native.fit_offsets(kernels, offset, left_census, right_census, fitted)
+        offset = fitted
+    unwarped = np.empty_like(offset)
+    _native.unwarp_offsets(offset, prediction.offset, margin, unwarped)
+    return unwarped
+
+
+def _warped(
+    right: RectifiedImage, prediction: Prediction, margin: int
+) -> tuple[RectifiedImage, NDArray[np.int32]]:
+    """The right image as the left one is expected to see it, with a margin; and its columns in the right one."""
+    height, width = prediction.offset.shape
+    image = np.empty((height, width + 2 * margin), dtype=np.float32)
+    valid = np.empty(image.shape, dtype=np.uint8)
+    columns = np.empty(image.shape, dtype=np.int32)
+    _native.warp(
+        np.ascontiguousarray(right.image),
+        np.ascontiguousarray(right.valid),
+        prediction.offset,
+        margin,
+        image,
+        valid,
+        columns,
+    )
+    return RectifiedImage(image, valid), columns
 
 
 def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:

@@ -108,9 +108,8 @@ def rectified_ray_from_pixel(view: View, pair: RectifiedPair) -> Float:
     return np.asarray(pair.rectified_from_world @ view.R.T @ np.linalg.inv(view.K))
 
 
-def rectified_coordinates(view: View, pair: RectifiedPair, side: Side, pixels: Float) -> Float:
-    """(n, 2) columns and rows, rectified array coordinates, of (n, 2) image coordinates."""
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ rectified_ray_from_pixel(view, pair).T
+def coordinates_of_rays(pair: RectifiedPair, side: Side, rays: Float) -> Float:
+    """(n, 2) columns and rows, rectified array coordinates, of (n, 3) rays in the rectified frame."""
     if pair.surface == "spherical":
         across, along = ray_angles(rays)
     else:
@@ -121,6 +120,12 @@ def rectified_coordinates(view: View, pair: RectifiedPair, side: Side, pixels: F
             across * pair.rows_per_radian - pair.row_origin,
         ]
     )
+
+
+def rectified_coordinates(view: View, pair: RectifiedPair, side: Side, pixels: Float) -> Float:
+    """(n, 2) columns and rows, rectified array coordinates, of (n, 2) image coordinates."""
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ rectified_ray_from_pixel(view, pair).T
+    return coordinates_of_rays(pair, side, rays)
 
 
 def image_coordinates(view: View, pair: RectifiedPair, side: Side, places: NDArray[np.floating]) -> Float:

@@ -19,7 +19,9 @@ from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, rectified_ray_from_pixel
 
-# Pairs are sampled coarsely where images are soft: what is matched there is less sure, by up to this factor.
+# Pairs are sampled coarsely where images are soft, and finely where they are sharp: what is matched there is less
+# sure, or surer, by up to these factors.
+_LEAST_SOFTNESS = 0.8
 _MOST_SOFTNESS = 2.0
 # A pair whose rows disagree by more rectified pixels is wrong rather than imprecise, and agrees with nothing more.
 _MOST_RESIDUAL = 1.0
@@ -33,8 +35,9 @@ class VoteOptions:
 
     disparity_sigma: float = 0.25
     """Standard deviation, rectified pixels, of a disparity on a smooth surface of a pair with sharp images and
-    perfect poses and lenses. It is larger where disparities are rough, where the rows of a pair disagree, and
-    where a pair is sampled more coarsely than its images. It is the scale of all tolerances, those of the
+    perfect poses and lenses, sampled as finely as these. It is larger where disparities are rough, where the rows
+    of a pair disagree, and where a pair is sampled more coarsely than its images, and smaller where it is sampled
+    more finely. It is the scale of all tolerances, those of the
     confirmation among them."""
     max_disparity_step: float = 2.0
     """Neighbouring disparities that differ by more than this (pixels) belong to different surfaces."""
@@ -116,7 +119,7 @@ def depth_candidates(
 
 def _disparity_sigma(view: View, geometry: RectifiedPair, options: VoteOptions, residual: float) -> float:
     """Standard deviation of a pair's disparities on smooth surfaces, rectified pixels."""
-    softness = min(max(float(view.K[0, 0]) / geometry.columns_per_radian, 1.0), _MOST_SOFTNESS)
+    softness = min(max(float(view.K[0, 0]) / geometry.columns_per_radian, _LEAST_SOFTNESS), _MOST_SOFTNESS)
     shift = min(residual * geometry.columns_per_radian, _MOST_RESIDUAL)
     return math.hypot(options.disparity_sigma * softness, shift)
 

@@ -1,10 +1,17 @@
 """Analytic scenes with exact depth and normals, stereo pairs for tests, and the demo block.
 
 Each module imports only those before it: texture, primitives, terrain, rays, light, photographs' sky and optics,
-render, pairs, ground, village, model, photographs, capture, block, street.
+render, pairs, ground, village, model, photographs, capture, block, street, canyon, town.
 """
 
 from colmap_sph.synthetic.block import BlockOptions, DemoBlock, demo_cameras, make_demo_block
+from colmap_sph.synthetic.canyon import (
+    CanyonOptions,
+    build_canyon,
+    canyon_cameras,
+    canyon_gsd,
+    make_canyon_block,
+)
 from colmap_sph.synthetic.capture import Capture, CaptureOptions, read_truth, write_capture
 from colmap_sph.synthetic.light import Light, ShadowMap
 from colmap_sph.synthetic.model import (
@@ -42,6 +49,7 @@ from colmap_sph.synthetic.street import (
 )
 from colmap_sph.synthetic.terrain import Terrain
 from colmap_sph.synthetic.texture import Facade, Material, Mottled, Noise, Painting, RoofTiles
+from colmap_sph.synthetic.town import TownOptions, make_town_block, town_cameras
 from colmap_sph.synthetic.village import Village, build_village
 
 __all__ = [
@@ -49,6 +57,7 @@ __all__ = [
     "Bending",
     "BlockOptions",
     "Camera",
+    "CanyonOptions",
     "Capture",
     "CaptureOptions",
     "ConvexPolyhedron",
@@ -74,11 +83,15 @@ __all__ = [
     "Surface",
     "SyntheticPair",
     "Terrain",
+    "TownOptions",
     "Village",
     "box",
+    "build_canyon",
     "build_reconstruction",
     "build_street",
     "build_village",
+    "canyon_cameras",
+    "canyon_gsd",
     "convergent_pair",
     "demo_cameras",
     "epipole_inside_pair",
@@ -87,8 +100,10 @@ __all__ = [
     "forward_motion_pair",
     "gabled_house",
     "look_at",
+    "make_canyon_block",
     "make_demo_block",
     "make_street_block",
+    "make_town_block",
     "photograph",
     "pinhole",
     "read_truth",
@@ -99,6 +114,7 @@ __all__ = [
     "sphere",
     "street_cameras",
     "street_gsd",
+    "town_cameras",
     "trace_points",
     "visible",
     "write_capture",

@@ -109,13 +109,16 @@ def demo_cameras(options: BlockOptions) -> dict[str, Camera]:
     return dict(sorted(cameras.items()))
 
 
-def _ground_corners(cameras: Mapping[str, Camera]) -> FloatArray:
-    """Corners of the ground that the pictures show, at the lowest and highest level of the scene."""
+def ground_corners(cameras: Mapping[str, Camera], relief: float) -> FloatArray:
+    """Corners (M, 3) of the ground that the pictures show, at the lowest and highest level of the scene.
+
+    It rises by `relief` metres above the mean ground, and falls by half of it below.
+    """
     corners = []
     for camera in cameras.values():
         image = np.array([[0, 0], [0, camera.height], [camera.width, 0], [camera.width, camera.height]], float)
         far = camera.back_project(image, np.ones(4)) - camera.centre
-        for level in (-_RELIEF / 2, _RELIEF):
+        for level in (-relief / 2, relief):
             reach = (level - camera.centre[2]) / np.minimum(far[:, 2], -0.05)
             corners.append(camera.centre + reach[:, None] * far)
     return np.concatenate(corners)
@@ -158,7 +161,7 @@ def make_demo_block(
     cameras = demo_cameras(options)
     village = build_village(options.nadir_gsd, options.buildings, options.trees, options.seed)
     sun = Light().sun
-    shadows = ShadowMap.cast(village.surfaces, sun, _ground_corners(cameras), options.nadir_gsd)
+    shadows = ShadowMap.cast(village.surfaces, sun, ground_corners(cameras, _RELIEF), options.nadir_gsd)
     capture = write_capture(
         output,
         cameras,

@@ -16,6 +16,7 @@ import numpy.typing as npt
 from colmap_sph.errors import OptionError, OutputError
 from colmap_sph.synthetic.light import Light
 from colmap_sph.synthetic.model import (
+    MAX_INCIDENCE,
     SparsePoints,
     build_reconstruction,
     sample_sparse_points,
@@ -48,6 +49,8 @@ class CaptureOptions:
     """Height of a picture in pixels."""
     points: int = 5000
     """Number of sparse points, each seen in three or more pictures."""
+    max_incidence: float = MAX_INCIDENCE
+    """Points are found up to this angle between ray and surface normal, degrees."""
     keypoint_noise: float = 0.3
     """Standard deviation of the keypoints about the exact projections, pixels."""
     image_noise: float = 1.5
@@ -67,6 +70,7 @@ class CaptureOptions:
             "width": (32, 8192),
             "height": (32, 8192),
             "points": (10, 1_000_000),
+            "max_incidence": (10.0, 89.0),
             "keypoint_noise": (0.0, 10.0),
             "image_noise": (0.0, 50.0),
             "supersample": (1, 8),
@@ -200,7 +204,9 @@ def write_capture(
     except OSError as error:
         raise OutputError(f"cannot write the demo block to {output}: {error}") from error
     rng = np.random.default_rng((options.seed, len(names)))
-    sparse = sample_sparse_points(surfaces, real, options.points, rng, blank=blank, moving=moving)
+    sparse = sample_sparse_points(
+        surfaces, real, options.points, rng, max_incidence=options.max_incidence, blank=blank, moving=moving
+    )
     model = build_reconstruction(
         names,
         real,

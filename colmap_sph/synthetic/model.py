@@ -14,7 +14,9 @@ from colmap_sph.errors import OutputError
 from colmap_sph.synthetic.primitives import FloatArray, Surface
 from colmap_sph.synthetic.rays import Camera, trace_points
 
-_MAX_INCIDENCE = np.radians(75.0)
+MAX_INCIDENCE = 75.0
+"""Degrees between a surface's normal and the ray up to which points are found, as a rule."""
+
 # Of the depth: far below any thickness in a scene, far above the rounding of a projection.
 _SAME_DEPTH = 1e-7
 _BORDER = 4.0
@@ -65,7 +67,12 @@ def _candidates(
 
 
 def visible(
-    surfaces: Sequence[Surface], camera: Camera, points: FloatArray, normals: FloatArray
+    surfaces: Sequence[Surface],
+    camera: Camera,
+    points: FloatArray,
+    normals: FloatArray,
+    *,
+    max_incidence: float = MAX_INCIDENCE,
 ) -> npt.NDArray[np.bool_]:
     """Whether a camera sees points of surfaces, not too grazing.
 
@@ -75,6 +82,8 @@ def visible(
     camera : Camera
     points, normals : (N, 3) float64 ndarray
         On the surfaces, and outward; world frame.
+    max_incidence : float
+        Degrees between normal and ray up to which a surface is not too grazing.
 
     Returns
     -------
@@ -84,7 +93,7 @@ def visible(
     seen: npt.NDArray[np.bool_] = (depth > 0) & _inside(camera, image)
     towards = camera.centre - points
     cosine = np.sum(towards * normals, axis=1) / np.linalg.norm(towards, axis=1)
-    seen &= cosine > np.cos(_MAX_INCIDENCE)
+    seen &= cosine > np.cos(np.radians(max_incidence))
     places = np.flatnonzero(seen)
     nearest = trace_points(surfaces, camera, image[places]).distance
     seen[places] = np.abs(nearest - depth[places]) < _SAME_DEPTH * depth[places]
@@ -108,6 +117,7 @@ def sample_sparse_points(
     rng: np.random.Generator,
     *,
     min_track_length: int = 3,
+    max_incidence: float = MAX_INCIDENCE,
     blank: Collection[int] = (),
     moving: Sequence[Sequence[Surface]] | None = None,
 ) -> SparsePoints:
@@ -121,6 +131,8 @@ def sample_sparse_points(
         Number of points wanted; fewer where cameras overlap little.
     rng : numpy.random.Generator
     min_track_length : int
+    max_incidence : float
+        See `visible`.
     blank : collection of int
         Numbers of surfaces without texture: no point can be found on them.
     moving : sequence of sequence of Surface, one per camera, optional
@@ -134,7 +146,7 @@ def sample_sparse_points(
     others = moving or [()] * len(cameras)
     seen = np.stack(
         [
-            visible((*surfaces, *before), camera, points, normals)
+            visible((*surfaces, *before), camera, points, normals, max_incidence=max_incidence)
             for camera, before in zip(cameras, others, strict=True)
         ]
     )

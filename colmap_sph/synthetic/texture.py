@@ -17,7 +17,6 @@ FloatArray = npt.NDArray[np.float64]
 Float32Array = npt.NDArray[np.float32]
 Colour = tuple[float, float, float]
 
-_TILE = 1024
 _CELLS = 256
 
 
@@ -37,25 +36,28 @@ class Noise:
         Ground sampling distance in metres: the size of a picture element on the surface.
     seed : int
         The same seed gives the same field.
+    tile : int
+        Samples of a period in each direction, half a sampling distance each; a power of two.
 
     Notes
     -----
-    White noise filtered in the frequency domain, a little more energy in every finer octave. The tile
-    spans 512 sampling distances; materials that look at it on two scales hide its period.
+    White noise filtered in the frequency domain, a little more energy in every finer octave. Materials that look
+    at the tile on two scales hide its period.
     """
 
-    def __init__(self, gsd: float, seed: int = 0) -> None:
+    def __init__(self, gsd: float, seed: int = 0, *, tile: int = 1024) -> None:
         rng = np.random.default_rng(seed)
         self.gsd = float(gsd)
         self._scale = 2.0 / self.gsd
-        frequency = np.hypot(np.fft.fftfreq(_TILE)[:, None], np.fft.rfftfreq(_TILE)[None, :])
-        spectrum = np.fft.rfft2(rng.standard_normal((_TILE, _TILE)))
+        self._size = tile
+        frequency = np.hypot(np.fft.fftfreq(tile)[:, None], np.fft.rfftfreq(tile)[None, :])
+        spectrum = np.fft.rfft2(rng.standard_normal((tile, tile)))
         lowest = 2.0 / 300.0
         highest = 0.5 / 3.0
         spectrum *= np.hypot(frequency, lowest) ** -0.75 / (1.0 + (frequency / highest) ** 8)
         spectrum[0, 0] = 0.0
-        tile = np.fft.irfft2(spectrum, s=(_TILE, _TILE))
-        self._tile: Float32Array = (tile / tile.std()).astype(np.float32).ravel()
+        field_ = np.fft.irfft2(spectrum, s=(tile, tile))
+        self._tile: Float32Array = (field_ / field_.std()).astype(np.float32).ravel()
         self._cells: Float32Array = rng.random((_CELLS, _CELLS), dtype=np.float32)
 
     def sample(self, u: FloatArray, v: FloatArray, stretch: float = 1.0) -> Float32Array:
@@ -78,10 +80,11 @@ class Noise:
         row = np.floor(y)
         fx = (x - column).astype(np.float32)
         fy = (y - row).astype(np.float32)
-        i = column.astype(np.int64) & (_TILE - 1)
-        j = (row.astype(np.int64) & (_TILE - 1)) * _TILE
-        i_next = (i + 1) & (_TILE - 1)
-        j_next = (j + _TILE) & (_TILE * _TILE - 1)
+        size = self._size
+        i = column.astype(np.int64) & (size - 1)
+        j = (row.astype(np.int64) & (size - 1)) * size
+        i_next = (i + 1) & (size - 1)
+        j_next = (j + size) & (size * size - 1)
         tile = self._tile
         top = tile[i + j]
         top += fx * (tile[i_next + j] - top)
@@ -202,12 +205,15 @@ class Painting:
         World (x, y) of the outer corner of pixel (0, 0), metres.
     texel : float
         Size of a pixel in metres.
+    turn : float
+        Angle in radians by which the axes of the noise, along which it repeats, are turned against x and y.
     """
 
     noise: Noise
     pixels: npt.NDArray[np.uint8] = field(repr=False)
     corner: tuple[float, float]
     texel: float
+    turn: float = 0.0
 
     def colour(self, coordinates: FloatArray) -> Float32Array:
         """See `Material.colour`."""
@@ -220,7 +226,9 @@ class Painting:
         low = flat[j * columns + i] * (1 - x) + flat[j * columns + i_next] * x
         high = flat[j_next * columns + i] * (1 - x) + flat[j_next * columns + i_next] * x
         value = (low + (high - low) * y) * np.float32(1.0 / 255.0)
-        detail = self.noise.sample(coordinates[0], coordinates[1])
+        east, north = coordinates
+        cosine, sine = np.cos(self.turn), np.sin(self.turn)
+        detail = self.noise.sample(cosine * east + sine * north, cosine * north - sine * east)
         painted: Float32Array = value[:, :3] * (1.0 + value[:, 3] * detail)[:, None]
         return painted
 

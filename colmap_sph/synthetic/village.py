@@ -110,7 +110,9 @@ def _terrain(rng: np.random.Generator, ground: Material) -> Terrain:
     return Terrain(0.0, np.array([2.6, 1.3, 0.5]), waves, rng.uniform(0, 2 * np.pi, 3), ground)
 
 
-def _building(plot: Plot, terrain: Terrain, noise: Noise, rng: np.random.Generator) -> list[ConvexPolyhedron]:
+def _building(
+    plot: Plot, terrain: Terrain, noise: Noise, rng: np.random.Generator, taller: int
+) -> list[ConvexPolyhedron]:
     """One building with what stands on its roof; its base lies below the lowest ground."""
     length, width = plot.size
     turn = np.array([[np.cos(plot.yaw), -np.sin(plot.yaw)], [np.sin(plot.yaw), np.cos(plot.yaw)]])
@@ -119,7 +121,7 @@ def _building(plot: Plot, terrain: Terrain, noise: Noise, rng: np.random.Generat
     base = np.array([*plot.centre, level])
     offset = (float(rng.uniform(0, 60)), float(rng.uniform(0, 60)))
     wall = _WALLS[rng.integers(len(_WALLS))]
-    storeys = int(rng.integers(2, 5)) if length > 12.5 else int(rng.integers(1, 3))
+    storeys = taller * (int(rng.integers(2, 5)) if length > 12.5 else int(rng.integers(1, 3)))
     height = 3.0 * storeys + 0.7
     gable = Facade(noise, wall, height, width, offset)
     front = Facade(noise, wall, height, length, offset)
@@ -207,7 +209,7 @@ def _cars(roads: list[Road], terrain: Terrain, noise: Noise, rng: np.random.Gene
     return parts
 
 
-def build_village(gsd: float, buildings: int, trees: int, seed: int) -> Village:
+def build_village(gsd: float, buildings: int, trees: int, seed: int, *, storeys: int = 1) -> Village:
     """Lay out the demo's scene.
 
     Parameters
@@ -218,6 +220,8 @@ def build_village(gsd: float, buildings: int, trees: int, seed: int) -> Village:
         How many; fewer where there is no room.
     seed : int
         The same seed gives the same village.
+    storeys : int
+        The buildings have so many times the storeys of a village's, which are 1 to 4.
 
     Returns
     -------
@@ -231,7 +235,7 @@ def build_village(gsd: float, buildings: int, trees: int, seed: int) -> Village:
     terrain = _terrain(rng, paint_ground(extent, noise, plots, roads, rng))
     surfaces: list[Surface] = [terrain]
     for plot in plots:
-        surfaces += _building(plot, terrain, noise, rng)
+        surfaces += _building(plot, terrain, noise, rng, storeys)
     for place in _trees(trees, plots, roads, rng):
         surfaces += _tree(place, terrain, noise, rng)
     surfaces += _cars(roads, terrain, noise, rng)

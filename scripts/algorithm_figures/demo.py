@@ -21,24 +21,27 @@ from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, select_
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, pixel_from_rectified_ray
 from colmap_sph.stereo.resampling import resample
+from colmap_sph.stereo.search.seeds import Seeds, seeds_of_points, shared_points
 from colmap_sph.synthetic import read_truth
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedPair:
-    """A pair with its rectified images and the disparity map of the left one."""
+    """A pair with its rectified images, the seeds of its sparse points and the disparity map of the left one."""
 
     left: View
     right: View
     geometry: RectifiedPair
+    seeds: Seeds
     left_image: RectifiedImage
     right_image: RectifiedImage
 
     @cached_property
     def disparity(self) -> NDArray[np.float32]:
         """(H, W_left) pixels, NaN = none."""
+        images = self.left_image, self.right_image
         least, most = self.geometry.min_disparity, self.geometry.max_disparity
-        return match_pair(self.left_image, self.right_image, least, most, MatchingOptions())
+        return match_pair(*images, least, most, MatchingOptions(), seeds=self.seeds)
 
     @property
     def as_voter(self) -> PairDisparity:
@@ -99,7 +102,8 @@ class Demo:
             resample(read_grey(self.workspace.image_path(view.name)), view, geometry, side)
             for view, side in zip(views, sides, strict=True)
         )
-        return MatchedPair(*views, geometry, *(RectifiedImage(*image) for image in images))
+        seeds = seeds_of_points(*views, geometry, shared_points(self.scene, *views))
+        return MatchedPair(*views, geometry, seeds, *(RectifiedImage(*image) for image in images))
 
     def exact_disparity(self, pair: MatchedPair) -> NDArray[np.float64]:
         """Disparity of the left rectified pixels on the sphere, from the exact depth; NaN outside the image."""

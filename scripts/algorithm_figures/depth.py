@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from algorithm_figures.demo import Demo
 from algorithm_figures.drawing import faded, masked, save, show
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
+from colmap_sph.stereo.search.seeds import finer_first
 from colmap_sph.stereo.vote import VoteOptions, depth_candidates, right_disparity
 
 NAME = "F_1.jpg"
@@ -28,11 +29,12 @@ def _candidates(demo: Demo, name: str, options: VoteOptions) -> tuple[list[str],
     for first, second in demo.selection.unique_pairs():
         if name not in (first, second):
             continue
-        pair = demo.rectified(first, second).as_voter
-        is_left = first == name
+        finer, coarser = finer_first(demo.scene, demo.scene.view(first), demo.scene.view(second))
+        pair = demo.rectified(finer.name, coarser.name).as_voter
+        is_left = finer.name == name
         disparity = pair.disparity if is_left else right_disparity(pair, options.max_disparity_step)
         depth, sigma = depth_candidates(view, disparity, pair.geometry, "left" if is_left else "right", options)
-        others.append(second if is_left else first)
+        others.append(coarser.name if is_left else finer.name)
         depths.append(depth)
         sigmas.append(sigma)
     return others, np.stack(depths), np.stack(sigmas)
@@ -65,14 +67,21 @@ def _draw_ray(axes: Any, names: list[str], depth: Float, sigma: Float, voted: fl
 def _telling_pixels(
     depths: Float, sigmas: Float, exact: Float, support: NDArray[np.uint8]
 ) -> list[tuple[int, int]]:
-    """A pixel where most candidates agree, and one where a small cluster outvotes what is wrong."""
-    outliers = ((depths > 0) & (np.abs(depths - exact) > 6 * sigmas)).sum(axis=0)
+    """A pixel where most candidates agree, and one where a cluster outvotes more that agree less."""
+    wrong = (depths > 0) & (np.abs(depths - exact) > 6 * sigmas)
+    outliers = wrong.sum(axis=0)
+    tolerance = VoteOptions().tolerance
+    agreeing = [
+        ((depths > 0) & (np.abs(depths - depth) <= tolerance * np.hypot(sigmas, sigma))).sum(axis=0)
+        for depth, sigma in zip(depths, sigmas, strict=True)
+    ]
+    rivals = np.where(wrong, np.stack(agreeing), 0).max(axis=0)
     inliers = ((depths > 0) & (np.abs(depths - exact) <= 3 * sigmas)).sum(axis=0)
     spread = np.where(depths > 0, np.abs(depths - exact) / np.maximum(exact, 1), 0).max(axis=0)
     inner = np.zeros(exact.shape, bool)
     inner[40:-40, 40:-40] = True
     calm = inner & (support == inliers) & (outliers == 0)
-    torn = inner & (support == inliers) & (inliers >= 3) & (spread < 0.25)
+    torn = inner & (support == inliers) & (inliers >= 3) & (rivals < inliers) & (spread < 0.25)
     scores = np.where(calm, inliers, 0), np.where(torn, 100 * outliers + inliers, 0)
     places = (np.unravel_index(int(np.argmax(score)), score.shape) for score in scores)
     return [(int(row), int(column)) for row, column in places]

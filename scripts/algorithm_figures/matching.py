@@ -21,20 +21,28 @@ NEAR, WIDE = ("N_0_1.jpg", "N_0_2.jpg"), ("N_0_2.jpg", "R_1.jpg")
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """What the matcher's kernel was given and found at one level of the pyramid.
+    """What the matcher's kernels were given and found at one level of the pyramid.
 
     Attributes
     ----------
-    left, right : census words
-    base : first offset that each pixel searches, pixels of the level
+    prediction : offset that each pixel is expected to have, 1/256 pixel of the level
+    margin : columns of the warped right image before the first pixel's expected one
+    warped : grey values of the warped right image
+    left, right : census words, those of the right image warped
+    base : first offset that each pixel searches in the warped image, pixels
+    surface : the same as aggregation sees it
     image, p1, p2, max_slant : what aggregation takes
     depth : offsets searched per pixel
-    offset : what came out, 1/256 pixel
+    offset : what came out, in the warped image, 1/256 pixel
     """
 
+    prediction: NDArray[np.int32]
+    margin: int
+    warped: NDArray[np.float32]
     left: NDArray[np.uint64]
     right: NDArray[np.uint64]
     base: NDArray[np.int32]
+    surface: NDArray[np.int32]
     image: NDArray[np.uint8]
     p1: int
     p2: NDArray[np.uint8]
@@ -42,20 +50,37 @@ class Level:
     depth: int
     offset: NDArray[np.int32]
 
+    def disparity(self, row: int, column: int, offset: NDArray[Any]) -> NDArray[np.float64]:
+        """Disparities, pixels, of a pixel's offsets in the warped image, pixels."""
+        residual = offset - self.margin
+        predicted = np.interp(column + residual, np.arange(self.prediction.shape[1]), self.prediction[row])
+        return np.asarray(-residual - predicted / 256)
+
+    def searched(self, row: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Least and largest disparity, pixels, that each pixel of a row searches."""
+        ends = np.array([self.depth - 1, 0])
+        reach = [self.disparity(row, column, base + ends) for column, base in enumerate(self.base[row])]
+        return np.min(reach, axis=1), np.max(reach, axis=1)
+
 
 @contextmanager
 def recorded() -> Iterator[list[Level]]:
     """Record every level that is matched meanwhile, the coarsest first."""
     levels: list[Level] = []
-    match = _native.match
+    predicted: list[tuple[NDArray[np.int32], int, NDArray[np.float32]]] = []
+    match, warp = _native.match, _native.warp
+
+    def warp_and_record(*arguments: Any) -> None:
+        warp(*arguments)
+        predicted.append((arguments[2].copy(), arguments[3], arguments[4].copy()))
 
     def match_and_record(*arguments: Any) -> None:
         match(*arguments)
-        _, left, right, base, image, p1, p2, max_slant, _, _, scratch, offset = arguments
-        copies = (left.copy(), right.copy(), base.copy(), image.copy(), p1, p2.copy(), max_slant)
-        levels.append(Level(*copies, scratch.shape[-1], offset.copy()))
+        _, left, right, _, _, base, surface, image, p1, p2, max_slant, _, _, scratch, offset = arguments
+        images = left.copy(), right.copy(), base.copy(), surface.copy(), image.copy()
+        levels.append(Level(*predicted[-1], *images, p1, p2.copy(), max_slant, scratch.shape[-1], offset.copy()))
 
-    with mock.patch.object(_native, "match", match_and_record):
+    with mock.patch.multiple(_native, match=match_and_record, warp=warp_and_record):
         yield levels
 
 
@@ -72,7 +97,7 @@ def _costs(level: Level) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
     cost = np.empty((*level.base.shape, level.depth), np.uint8)
     aggregated = np.empty_like(cost)
     _native.matching_cost(backend(), level.left, level.right, level.base, cost)
-    arguments = (level.base, level.image, level.p1, level.p2, level.max_slant)
+    arguments = (level.surface, level.image, level.p1, level.p2, level.max_slant)
     _native.aggregation(backend(), cost, *arguments, np.empty_like(cost), aggregated)
     return cost, aggregated
 
@@ -106,7 +131,7 @@ def matching(demo: Demo, path: Path) -> None:
     above.colorbar(drawn, ax=panels[2], shrink=0.7, label="[pixels]", extend="max")
 
     cost, aggregated = _costs(finest)
-    slot = -exact - finest.base
+    slot = -exact - finest.prediction / 256 + finest.margin - finest.base
     good = (error < 0.1) & np.isfinite(exact)
     good[:, : good.shape[1] // 4] = good[:, -good.shape[1] // 4 :] = False
     row, column = _telling_pixel(cost, np.where(good, slot, -1))
@@ -114,7 +139,7 @@ def matching(demo: Demo, path: Path) -> None:
         panel.plot(
             column, row, "o", markersize=9, markerfacecolor="none", markeredgecolor="tab:red", markeredgewidth=2
         )
-    searched = -(finest.base[row, column] + np.arange(finest.depth))
+    searched = finest.disparity(row, column, finest.base[row, column] + np.arange(finest.depth))
     truth, found = exact[row, column], disparity[row, column]
     panels = below.subplots(1, 3)
     for axes, values, title in (
@@ -134,8 +159,8 @@ def matching(demo: Demo, path: Path) -> None:
 
 
 def _draw_fit(axes: Any, level: Level, row: int, column: int, truth: float, found: float) -> None:
-    """The V of raw costs, summed over 5 x 5 pixels around each whole disparity beside the plane."""
-    whole = -int(np.rint(level.offset[row, column] / 256))
+    """The V of raw costs, summed over 5 x 5 pixels around each column of the warped image beside the plane."""
+    whole = int(np.rint(level.offset[row, column] / 256))
     shifts = np.arange(-2, 3)
     sums = []
     for shift in shifts:
@@ -144,11 +169,11 @@ def _draw_fit(axes: Any, level: Level, row: int, column: int, truth: float, foun
             for x in range(column - 2, column + 3):
                 offset = level.offset[y, x]
                 # Along the surface: each pixel from its own whole offset.
-                own = round(offset / 256) if offset > -(1 << 24) else -whole
-                own = own if abs(own + whole) <= 2 else -whole
-                total += (int(level.left[y, x]) ^ int(level.right[y, x + own - shift])).bit_count()
+                own = round(offset / 256) if offset > -(1 << 24) else whole
+                own = own if abs(own - whole) <= 2 else whole
+                total += (int(level.left[y, x]) ^ int(level.right[y, x + own + shift])).bit_count()
         sums.append(total)
-    axes.plot(whole + shifts, sums, ".-", color="0.35", linewidth=0.8)
+    axes.plot(level.disparity(row, column, whole + shifts), sums, ".-", color="0.35", linewidth=0.8)
     axes.axvline(truth, color="tab:green", linewidth=1, label=f"exact {truth:.2f}")
     axes.axvline(found, color="tab:red", linewidth=1, linestyle="--", label=f"fitted {found:.2f}")
     axes.set(xlabel="disparity [pixels]", ylabel="sum of 25 raw costs [bits]")
@@ -174,13 +199,11 @@ def search_ranges(demo: Demo, path: Path) -> None:
     colours = ("#dbe9f6", "#a5cde3", "#5ba3cf", "#2171b5", "#08306b")
     for number, level in enumerate(levels):
         step = 2 ** (len(levels) - 1 - number)
-        base = level.base[row // step].astype(float)
-        columns = (np.arange(len(base)) + 0.5) * step
-        low, high = -(base + level.depth - 1) * step, -base * step
+        low, high = level.searched(row // step)
         axes.fill_between(
-            columns,
-            low,
-            high,
+            (np.arange(len(low)) + 0.5) * step,
+            low * step,
+            high * step,
             step="mid",
             color=colours[number * (len(colours) - 1) // max(len(levels) - 1, 1)] if number else colours[0],
             alpha=0.75,
@@ -192,9 +215,37 @@ def search_ranges(demo: Demo, path: Path) -> None:
     axes.set(xlabel="column of the left rectified image", ylabel="disparity [pixels]", xlim=(0, width))
     axes.set_ylim(-300, 700)
     step = 2 ** (len(levels) - 1)
-    first = levels[0].base[0, 0]
-    last = levels[0].base[0, 0] + levels[0].depth - 1
-    axes.annotate(f"level {len(levels) - 1} reaches from {-last * step} to {-first * step}", (12, 650))
+    low, high = levels[0].searched(row // step)
+    axes.annotate(
+        f"level {len(levels) - 1} reaches from {low.min() * step:.0f} to {high.max() * step:.0f}", (12, 650)
+    )
     axes.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
     strip.set_xlim(0, width)
     save(figure, path)
+
+
+def warping(demo: Demo, path: Path) -> None:
+    """A part of the left image, what the right one shows of it, and that as it is warped for the finest level."""
+    pair, levels = matched(demo, WIDE)
+    finest = levels[-1]
+    rows = _around(0.73 * pair.geometry.height, 80)
+    middle = 0.46 * pair.geometry.left_width
+    columns = _around(middle, 120)
+    expected = finest.prediction[rows, columns] / 256
+    seen = _around(middle + float(expected.mean()), 120)
+    figure, axes = plt.subplots(1, 3, figsize=(9.6, 2.45), layout="constrained")
+    for panel, picture, title in (
+        (axes[0], pair.left_image.image[rows, columns], f"left: {WIDE[0]}"),
+        (axes[1], pair.right_image.image[rows, seen], f"right: {WIDE[1]}"),
+        (
+            axes[2],
+            finest.warped[rows, columns.start + finest.margin : columns.stop + finest.margin],
+            "right, warped",
+        ),
+    ):
+        show(panel, picture, title, cmap="gray", vmin=0, vmax=255)
+    save(figure, path)
+
+
+def _around(middle: float, reach: int) -> slice:
+    return slice(round(middle) - reach, round(middle) + reach)

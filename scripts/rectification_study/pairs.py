@@ -13,16 +13,23 @@ from numpy.typing import NDArray
 from colmap_sph.evaluation import DepthView, truth_at_pixel_origin, truth_normals_at_pixel_origin
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.pair_files import read_pair
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectified_pair import PairDisparity, Surface
 from colmap_sph.stereo.vote import depth_candidates, right_disparity
+from rectification_study.found import count_pair, summed
 from rectification_study.runs import SURFACES, Run
 
 CORRECT = 2.0
 """A depth is correct up to this error, in GSD of its pixel."""
-ANGLE_EDGES = (0.0, 10.0, 25.0, 40.0, 55.0, 75.0, 180.0)
+ANGLE_EDGES = (0.0, 8.0, 15.0, 25.0, 40.0, 50.0, 60.0, 75.0, 180.0)
+PARALLAX_EDGES = (0.0, 2.0, 4.0, 8.0, 15.0, 25.0, 40.0, 50.0, 60.0, 75.0, 180.0)
+"""Of the angle at the sparse points that both images see between the rays to their centres, degrees."""
 SLOPE_EDGES = (0.0, 20.0, 45.0, 70.0, 90.0)
 """Of surfaces against the plane that frame rectification uses, degrees."""
+
+# A street far ahead changes its depth by so much of it from pixel to pixel, and is no edge.
+_STEEPEST = 0.2
 
 PairScores = dict[str, Any]
 Map = NDArray[np.float32]
@@ -37,7 +44,14 @@ class ExactMaps:
         self.normals = lru_cache(maxsize=20)(self._normals)
 
     def _depth(self, name: str) -> Map | None:
-        return truth_at_pixel_origin(self.views[name].read_depth()) if name in self.views else None
+        if name not in self.views:
+            return None
+        return truth_at_pixel_origin(self.views[name].read_depth(), largest_step=_STEEPEST)
+
+    def known(self, view: View) -> Map:
+        """Exact depth of every pixel, 0 = unknown."""
+        depth = self.depth(view.name)
+        return np.zeros((view.height, view.width), np.float32) if depth is None else depth
 
     def _normals(self, name: str) -> Map | None:
         view = self.views.get(name)
@@ -62,11 +76,22 @@ class ExactMaps:
         return np.where(normals.any(axis=2), angle, np.float32(np.nan))
 
 
+def skipped_pairs(run: Run) -> list[tuple[str, str]]:
+    """Pairs that a run could not rectify, by the names of their images."""
+    parts = [pair.partition(" - ") for pair in run.report["skipped_pairs"]]
+    return [(left, right) for left, _, right in parts]
+
+
 @cache
 def pair_files(run: Run) -> dict[tuple[str, str], Path]:
     """File of every pair that a run matched, by the names of its images."""
+    return pair_files_of(run.workspace)
+
+
+def pair_files_of(workspace: Workspace) -> dict[tuple[str, str], Path]:
+    """File of every pair that was matched in a workspace, by the names of its images."""
     found = {}
-    for file in sorted((run.workspace.state_dir / "pairs").glob("*.sph")):
+    for file in sorted((workspace.state_dir / "pairs").glob("*.sph")):
         pair = read_pair(file)
         found[pair.left, pair.right] = file
     return found
@@ -88,22 +113,22 @@ def score_pairs(
     Returns
     -------
     list of dict
-        ``left``, ``right``, ``view_angle_deg`` between the viewing directions, and per surface either ``skipped``
-        (why), or: ``matched`` pixels of the two original images that the pair gives a depth; ``warped`` pixels,
-        those of the rectified images. With exact depth also ``correct`` pixels, those of every class of slopes
-        where the pair was matched on both, ``median_error_gsd``, and that of the pixels matched on both,
-        ``median_error_common_gsd``.
+        ``left``, ``right``, ``view_angle_deg`` between the viewing directions, ``parallax_deg`` (the median angle
+        at the sparse points of both between the rays to their centres), and per surface ``skipped`` (why), or:
+        ``matched`` pixels of the two original images that the pair gives a depth; ``warped`` pixels, those of the
+        rectified images. With exact depth also ``correct`` pixels, those of every class of slopes where the pair
+        was matched on both, ``median_error_gsd``, and that of the pixels matched on both,
+        ``median_error_common_gsd``; and, where it was skipped, too, the ``counts`` of `count_pair`.
     """
     maps = ExactMaps(exact)
-    names = sorted({pair for run in runs.values() for pair in pair_files(run)})
+    names = sorted({pair for run in runs.values() for pair in (*pair_files(run), *skipped_pairs(run))})
 
     def score(pair: tuple[str, str]) -> PairScores:
         views = scene.view(pair[0]), scene.view(pair[1])
-        cosine = float(np.clip(views[0].viewing_direction @ views[1].viewing_direction, -1, 1))
         found = {m: read_pair(pair_files(run)[pair]) for m, run in runs.items() if pair in pair_files(run)}
-        scores: PairScores = {"left": pair[0], "right": pair[1], "view_angle_deg": np.degrees(np.arccos(cosine))}
+        scores: PairScores = {"left": pair[0], "right": pair[1], **_geometry_of(scene, *views)}
         for surface, run in runs.items():
-            reason = run.report["skipped_pairs"].get(" - ".join(pair), "not matched")
+            reason = run.failure or run.report["skipped_pairs"].get(" - ".join(pair), "not matched")
             scores[surface] = {"skipped": reason} if surface not in found else {}
         depths = {surface: pair_depths(*views, disparity, options) for surface, disparity in found.items()}
         for surface, disparity in found.items():
@@ -114,10 +139,23 @@ def score_pairs(
             plane = found["frame"].geometry.rectified_from_world[2] if len(found) == len(SURFACES) else None
             for surface, of_surface in _exact_scores(views, depths, maps, plane).items():
                 scores[surface] |= of_surface
+            truths = maps.known(views[0]), maps.known(views[1])
+            for surface in runs:
+                scores[surface]["counts"] = count_pair(views, depths.get(surface), truths)
         return scores
 
     with ThreadPoolExecutor(options.num_threads) as pool:
         return list(pool.map(score, names))
+
+
+def _geometry_of(scene: Scene, left: View, right: View) -> dict[str, float]:
+    cosine = float(np.clip(left.viewing_direction @ right.viewing_direction, -1, 1))
+    both = scene.points[np.intersect1d(left.point_indices, right.point_indices)]
+    rays = [both - view.center for view in (left, right)]
+    first, second = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
+    angles = np.arccos(np.clip(np.sum(first * second, axis=1), -1, 1))
+    parallax = float(np.degrees(np.median(angles))) if len(both) else 0.0
+    return {"view_angle_deg": float(np.degrees(np.arccos(cosine))), "parallax_deg": parallax}
 
 
 def _exact_scores(
@@ -152,13 +190,34 @@ def _exact_scores(
 
 def by_angle(scored: Sequence[PairScores]) -> list[dict[str, Any]]:
     """Sums over the pairs of each class of angles between the viewing directions, and over all."""
+    return _classed(scored, "view_angle_deg", ANGLE_EDGES)
+
+
+def by_parallax(scored: Sequence[PairScores]) -> list[dict[str, Any]]:
+    """Sums over the pairs of each class of parallax angles, and over all."""
+    return _classed(scored, "parallax_deg", PARALLAX_EDGES)
+
+
+def _classed(scored: Sequence[PairScores], key: str, edges: Sequence[float]) -> list[dict[str, Any]]:
+    groups = [(low, high, [pair for pair in scored if low <= pair[key] < high]) for low, high in pairwise(edges)]
     rows = []
-    for low, high in [*pairwise(ANGLE_EDGES), (ANGLE_EDGES[0], ANGLE_EDGES[-1])]:
-        inside = [pair for pair in scored if low <= pair["view_angle_deg"] < high]
+    for low, high, inside in [*groups, (edges[0], edges[-1], list(scored))]:
         if inside:
-            row: dict[str, Any] = {"from_deg": low, "to_deg": high, "pairs": len(inside)}
-            rows.append(row | {surface: _summed([pair[surface] for pair in inside]) for surface in SURFACES})
+            row: dict[str, Any] = {"from": low, "to": high, "pairs": len(inside)}
+            row |= {surface: _summed([pair[surface] for pair in inside]) for surface in SURFACES}
+            rows.append(row | _found_rows(inside))
     return rows
+
+
+def _found_rows(inside: Sequence[PairScores]) -> dict[str, Any]:
+    """Sums per surface, in all pairs and in those that both surfaces have; found only with exact depth."""
+    common = [pair for pair in inside if not any("skipped" in pair[surface] for surface in SURFACES)]
+    warped = [sum(pair[surface]["warped"] for pair in common) for surface in SURFACES]
+    result: dict[str, Any] = {"common_pairs": len(common), "warped_common": warped}
+    if all("counts" in pair[surface] for pair in inside for surface in SURFACES):
+        for key, chosen in (("found", inside), ("found_common", common)):
+            result[key] = {surface: summed(pair[surface]["counts"] for pair in chosen) for surface in SURFACES}
+    return result
 
 
 def telling_pairs(scored: Sequence[PairScores], count: int) -> list[PairScores]:

@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import colmap_sph
-from colmap_sph.errors import InputError, OutputError
+from colmap_sph.errors import InputError, NoResultError, OutputError
 from colmap_sph.evaluation import write_json
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.rectified_pair import Surface
 
+_NOTHING: dict[str, Any] = {"coverage": {}, "points": 0, "skipped_pairs": {}}
 SURFACES: tuple[Surface, ...] = ("frame", "spherical")
 
 
@@ -32,11 +33,14 @@ class Run:
         The pipeline's report.
     cost : dict
         Stage → seconds, cpu_seconds, peak_bytes (of that stage alone).
+    failure : str
+        Why there is no result, and nothing in the workspace; "" where there is one.
     """
 
     workspace: Workspace
     report: dict[str, Any]
     cost: dict[str, dict[str, float]]
+    failure: str = ""
 
     def points(self) -> dict[str, Any]:
         """What the paper counts as points: per image its pixels with a geometric depth; and the fused cloud."""
@@ -99,7 +103,7 @@ def reconstruct(model: Path, images: Path | None, folder: Path, options: RunOpti
     content = json.loads(record.read_text(encoding="utf-8"))
     if {key: content[key] for key in asked} != asked:
         raise InputError(f"{folder} holds a study of another model or with other options; give another --output.")
-    return Run(Workspace(folder / "dense"), content["report"], content["cost"])
+    return Run(Workspace(folder / "dense"), content["report"], content["cost"], content["failure"])
 
 
 def plain(record: Any) -> dict[str, Any]:
@@ -118,6 +122,12 @@ def _make_empty(folder: Path) -> None:
 def _reconstruct(model: Path, images: Path | None, root: Path, options: RunOptions) -> dict[str, Any]:
     """In the child process: run and measure."""
     meter = StageMeter(options.rectification.surface)
-    report = colmap_sph.run(model, images=images, output=root, options=options, progress=meter)
+    failure = ""
+    report = _NOTHING
+    try:
+        report = plain(colmap_sph.run(model, images=images, output=root, options=options, progress=meter))
+    except NoResultError as error:
+        # Not one pair can be rectified on a plane where the cameras go where they look: a finding, too.
+        failure = str(error)
     meter.finish()
-    return {"report": plain(report), "cost": meter.cost}
+    return {"report": report, "cost": meter.cost, "failure": failure}

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 from benchmarking import table
 
+from rectification_study import found_tables
 from rectification_study.pairs import SLOPE_EDGES
+from rectification_study.runs import SURFACES
 
 _EMPTY = "-"
 _LISTED = 10
@@ -20,13 +22,26 @@ def markdown(content: Mapping[str, Any], figures: Sequence[Path]) -> str:
         f"# Frame against spherical rectification: {content['model']}",
         f"{content['images']} images, ground sampling distance {content['gsd_m']:.3g} (units of the model). "
         "The same pairs, matcher and options; differences are spherical against frame.",
-        "## Points (the paper's Figure 5)",
-        _points(content["points"]),
+        *_comparison(content),
     ]
+    if "same_pixels" in content:
+        again = content["same_pixels"]
+        changed = f"{again['scaled']} with sampling {again['sampling']:.3f}"
+        parts += [f"# With as many rectified pixels: {changed}", *_comparison(again)]
+    pictures = "\n".join(f"![{figure.stem}]({figure.name})" for figure in figures)
+    return "\n\n".join([*parts, "# Pictures", pictures]) + "\n"
+
+
+def _comparison(content: Mapping[str, Any]) -> list[str]:
+    """The sections of one comparison of the two surfaces."""
+    parts = [f"**{surface}: no result.** {failure}" for surface, failure in content["failures"].items()]
+    parts += ["## Points (the paper's Figure 5)", _points(content["points"])]
     if "lidar" in content:
         parts += ["## Distance to LiDAR (the paper's Table 2)", _lidar(content["lidar"])]
     if "exact_clouds" in content:
         parts += ["## Exact depth", _exact(content["exact_clouds"], content["exact_depth_maps"])]
+    if "found" in content["by_angle"][-1]:
+        parts += ["## Found of what both images see", found_tables.sections(content)]
     parts += [
         "## By angle between the viewing directions",
         _by_angle(content["by_angle"]),
@@ -37,10 +52,8 @@ def markdown(content: Mapping[str, Any], figures: Sequence[Path]) -> str:
         _skipped(content["skipped_pairs"]),
         "## Cost",
         _cost(content),
-        "## Pictures",
-        "\n".join(f"![{figure.stem}]({figure.name})" for figure in figures),
     ]
-    return "\n\n".join(parts) + "\n"
+    return parts
 
 
 def change(frame: float, spherical: float) -> str:
@@ -59,11 +72,12 @@ def _points(points: Mapping[str, Any]) -> str:
         [name, *_counts(frame.get(name, 0), spherical.get(name, 0))] for name in sorted({*frame, *spherical})
     ]
     header = ["", "frame", "spherical", "difference"]
-    mean = (
-        f"An image's points are its pixels with a geometric depth (confirmed by other views). On average over the "
-        f"images the difference is {100 * np.mean(ratios):+.2f} % (from {100 * min(ratios):+.2f} to "
-        f"{100 * max(ratios):+.2f} %)."
-    )
+    mean = "An image's points are its pixels with a geometric depth (confirmed by other views)."
+    if ratios:
+        mean += (
+            f" On average over the images the difference is {100 * np.mean(ratios):+.2f} % (from "
+            f"{100 * min(ratios):+.2f} to {100 * max(ratios):+.2f} %)."
+        )
     return "\n\n".join([table(header, rows), mean, table(["image", *header[1:]], per_image)])
 
 
@@ -100,28 +114,35 @@ def _lidar(lidar: Mapping[str, Any]) -> str:
 
 
 def _exact(clouds: Mapping[str, Any], depth_maps: Mapping[str, Any]) -> str:
-    frame, spherical = clouds["frame"], clouds["spherical"]
+    one = clouds["spherical"]
     rows = []
-    for one, other in zip(frame["thresholds"], spherical["thresholds"], strict=True):
-        tau = f"{one['tau_m'] / frame['gsd_m']:g} GSD"
-        rows += [
-            [f"cloud: {key.replace('_', '-')}, {tau}", *_shares(one[key], other[key])]
-            for key in ("accuracy", "completeness", "f_score")
-        ]
-    frame, spherical = depth_maps["frame"], depth_maps["spherical"]
-    rows.append(["geometric depth maps: coverage", *_shares(frame["coverage"], spherical["coverage"])])
-    for place, bound in enumerate(frame["thresholds_gsd"]):
+    for place, threshold in enumerate(one["thresholds"]):
+        tau = f"{threshold['tau_m'] / one['gsd_m']:g} GSD"
+        for key in ("accuracy", "completeness", "f_score"):
+            values = [clouds[m]["thresholds"][place][key] if m in clouds else None for m in SURFACES]
+            rows.append([f"cloud: {key.replace('_', '-')}, {tau}", *_shares(*values)])
+
+    def of_maps(key: str, place: int | None = None) -> list[float | None]:
+        found = [depth_maps[m][key] if m in depth_maps else None for m in SURFACES]
+        return [value if value is None or place is None else value[place] for value in found]
+
+    rows.append(["geometric depth maps: coverage", *_shares(*of_maps("coverage"))])
+    for place, bound in enumerate(depth_maps["spherical"]["thresholds_gsd"]):
         label = f"geometric depth maps: share of truth pixels within {bound:g} GSD"
-        rows.append([label, *_shares(frame["complete_within"][place], spherical["complete_within"][place])])
+        rows.append([label, *_shares(*of_maps("complete_within", place))])
     for key, label in (("median_error_gsd", "median error [GSD]"), ("median_normal_angle_deg", "normals [deg]")):
-        values = frame[key], spherical[key]
-        if None not in values:
-            rows.append([f"geometric depth maps: {label}", *(f"{v:.4f}" for v in values), change(*values)])
+        frame, spherical = of_maps(key)
+        if frame is not None and spherical is not None:
+            cells = [f"{frame:.4f}", f"{spherical:.4f}", change(frame, spherical)]
+            rows.append([f"geometric depth maps: {label}", *cells])
     return table(["", "frame", "spherical", "difference"], rows)
 
 
-def _shares(frame: float, spherical: float) -> list[str]:
-    return [f"{frame:.2%}", f"{spherical:.2%}", f"{100 * (spherical - frame):+.2f} points"]
+def _shares(frame: float | None, spherical: float | None) -> list[str]:
+    values = [_EMPTY if value is None else f"{value:.2%}" for value in (frame, spherical)]
+    if frame is None or spherical is None:
+        return [*values, _EMPTY]
+    return [*values, f"{100 * (spherical - frame):+.2f} points"]
 
 
 def _by_angle(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -134,7 +155,7 @@ def _by_angle(rows: Sequence[Mapping[str, Any]]) -> str:
     lines = []
     for row in rows:
         frame, spherical = row["frame"], row["spherical"]
-        line = [f"{row['from_deg']:g} to {row['to_deg']:g}", str(row["pairs"]), str(frame["skipped"])]
+        line = [f"{row['from']:g} to {row['to']:g}", str(row["pairs"]), str(frame["skipped"])]
         line += _counts(frame["matched"], spherical["matched"])
         if has_truth:
             line += _counts(frame["correct"], spherical["correct"])
@@ -162,9 +183,7 @@ def _by_slope(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     lines = []
     for row in rows:
         counts = zip(row["frame"]["correct_by_slope"], row["spherical"]["correct_by_slope"], strict=True)
-        lines.append(
-            [f"{row['from_deg']:g} to {row['to_deg']:g}", *(cell for pair in counts for cell in _counts(*pair))]
-        )
+        lines.append([f"{row['from']:g} to {row['to']:g}", *(cell for pair in counts for cell in _counts(*pair))])
     return [
         "## By slope of the surface",
         f"{table(header, lines)}\n\nCorrect pixels of the pairs matched on both surfaces, by the angle in degrees "
@@ -210,7 +229,6 @@ def _cost(content: Mapping[str, Any]) -> str:
     header = ["stage", "seconds: frame", "spherical", "processor seconds: frame", "spherical"]
     warped = content["by_angle"][-1]
     frame, spherical = warped["frame"]["warped"], warped["spherical"]["warped"]
-    note = (
-        f"Pixels warped: {frame:,} (frame) and {spherical:,} (spherical), {frame / spherical:.2f} times as many."
-    )
+    ratio = frame / max(spherical, 1)
+    note = f"Pixels warped: {frame:,} (frame) and {spherical:,} (spherical), {ratio:.2f} times as many."
     return f"{table([*header, 'peak GiB: frame', 'spherical'], rows)}\n\n{note}"

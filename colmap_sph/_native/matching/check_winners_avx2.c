@@ -79,6 +79,7 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
     const __m256i after = _mm256_and_si256(_mm256_srli_epi32(three, 16), byte);
 
     const __m256i best_sum = gather_bytes(buffers->best_sum, _mm256_add_epi32(r, depth), found);
+    const __m256i rival = _mm256_mask_i32gather_epi32(minus_one, buffers->rival, r, found, 4);
     const __m256i excess = _mm256_sub_epi32(sum, best_sum);
     __m256i mutual = _mm256_andnot_si256(_mm256_cmpgt_epi32(excess, _mm256_set1_epi32(check.max_excess)), found);
     for (int32_t step = 1; step <= check.max_difference && step < (int32_t)size.width; step++) {
@@ -86,10 +87,10 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
         if (_mm256_testz_si256(left, left)) {
             break;
         }
-        mutual =
-            _mm256_or_si256(mutual, agrees(sums, base, size, buffers->winner, column, -step, r, best_sum, left));
-        mutual =
-            _mm256_or_si256(mutual, agrees(sums, base, size, buffers->winner, column, step, r, best_sum, left));
+        mutual = _mm256_or_si256(mutual,
+                                 agrees(sums, base, size, buffers->winner, column, -step, rival, best_sum, left));
+        mutual = _mm256_or_si256(mutual,
+                                 agrees(sums, base, size, buffers->winner, column, step, rival, best_sum, left));
     }
     found = mutual;
 

@@ -1,4 +1,6 @@
 /* The matching kernels as Python's functions. */
+#include <stdlib.h>
+
 #include "boundary.h"
 
 _Static_assert(CENSUS_RADIUS_Y == 3 && CENSUS_RADIUS_X == 4, "H + 6, W + 8 below");
@@ -9,9 +11,17 @@ static int check_width(ptrdiff_t width) { return check(width <= 65535, "rows are
 
 static int check_widths(const sizes *size) { return check_width(size->W) && check_width(size->TARGET_W); }
 
+static int check_source_width(int width) {
+    return check(width >= 0, "the width must not be negative") && check_width(width);
+}
+
 static int check_depth(const sizes *size) {
     return check(size->D > 0 && size->D <= MAX_DEPTH && size->D % DEPTH_STEP == 0,
                  "the number of disparities must be a multiple of 32, at most 1024");
+}
+
+static int check_margin(int margin) {
+    return check(margin >= 0 && margin <= 65535, "the margin must lie in 0..65535");
 }
 
 static int check_penalties(int p1, const uint8_t *p2, int max_slant) {
@@ -30,7 +40,13 @@ static int check_left_right(int max_difference, int max_excess) {
 }
 
 static match_size match_size_of(const sizes *size) {
-    return (match_size){size->H, size->W, size->TARGET_W, size->D};
+    return (match_size){size->H, size->W, size->TARGET_W, size->D, 0};
+}
+
+static match_size warped_size_of(const sizes *size, int source_width) {
+    match_size warped = match_size_of(size);
+    warped.source_width = source_width;
+    return warped;
 }
 
 /* ---- functions --------------------------------------------------------------------------------------------- */
@@ -91,7 +107,7 @@ static int check_aggregation(const void *arguments) {
 
 static int run_aggregation(void *arguments) {
     const aggregation_arguments *a = arguments;
-    const match_size size = {a->size.H, a->size.W, 0, a->size.D};
+    const match_size size = {a->size.H, a->size.W, 0, a->size.D, 0};
     const path_penalties penalties = {(uint8_t)a->p1, a->p2, a->max_slant};
     return a->backend->aggregation(a->cost, a->base, a->image, size, penalties, a->detours, a->aggregated);
 }
@@ -105,6 +121,8 @@ FUNCTION(aggregation, AGGREGATION, check_aggregation,
     X(IN, int32, base, H, W) \
     X(IN, uint64, reference, H, W) \
     X(IN, uint64, target, H, TARGET_W) \
+    X(IN, int32, columns, H, TARGET_W) \
+    X(VALUE, int, source_width) \
     X(VALUE, int, max_difference) \
     X(VALUE, int, max_excess) \
     X(OUT, int32, offset, H, W)
@@ -112,14 +130,15 @@ ARGUMENTS(selection, SELECTION);
 
 static int check_selection(const void *arguments) {
     const selection_arguments *a = arguments;
-    return check_depth(&a->size) && check_widths(&a->size) && check_left_right(a->max_difference, a->max_excess);
+    return check_depth(&a->size) && check_widths(&a->size) && check_source_width(a->source_width) &&
+           check_left_right(a->max_difference, a->max_excess);
 }
 
 static int run_selection(void *arguments) {
     const selection_arguments *a = arguments;
     const left_right_check limits = {a->max_difference, a->max_excess};
-    return a->backend->selection(a->aggregated, a->base, a->reference, a->target, match_size_of(&a->size), limits,
-                                 a->offset);
+    return a->backend->selection(a->aggregated, a->base, a->reference, a->target, a->columns,
+                                 warped_size_of(&a->size, a->source_width), limits, a->offset);
 }
 
 FUNCTION(selection, SELECTION, check_selection,
@@ -129,7 +148,10 @@ FUNCTION(selection, SELECTION, check_selection,
     X(VALUE, backend, backend) \
     X(IN, uint64, reference, H, W) \
     X(IN, uint64, target, H, TARGET_W) \
+    X(IN, int32, columns, H, TARGET_W) \
+    X(VALUE, int, source_width) \
     X(IN, int32, base, H, W) \
+    X(IN, int32, surface, H, W) \
     X(IN, uint8, image, H, W) \
     X(VALUE, int, p1) \
     X(IN, uint8, p2, 256) \
@@ -142,7 +164,7 @@ ARGUMENTS(match, MATCH);
 
 static int check_match(const void *arguments) {
     const match_arguments *a = arguments;
-    return check_depth(&a->size) && check_widths(&a->size) &&
+    return check_depth(&a->size) && check_widths(&a->size) && check_source_width(a->source_width) &&
            check(a->size.BAND > 0 && (a->size.W == 0 || a->size.BAND % a->size.W == 0),
                  "scratch must have the size (2, pixels of one row or more, disparities)") &&
            check_penalties(a->p1, a->p2, a->max_slant) && check_left_right(a->max_difference, a->max_excess);
@@ -152,9 +174,11 @@ static int run_match(void *arguments) {
     const match_arguments *a = arguments;
     const match_input input = {a->reference,
                                a->target,
+                               a->columns,
                                a->base,
+                               a->surface,
                                a->image,
-                               match_size_of(&a->size),
+                               warped_size_of(&a->size, a->source_width),
                                {(uint8_t)a->p1, a->p2, a->max_slant},
                                {a->max_difference, a->max_excess}};
     const ptrdiff_t band_rows = a->size.W > 0 ? a->size.BAND / a->size.W : a->size.H + 1;
@@ -179,17 +203,91 @@ static int check_fit_offsets(const void *arguments) {
 
 static int run_fit_offsets(void *arguments) {
     const fit_offsets_arguments *a = arguments;
-    const match_size size = {a->size.H, a->size.W, a->size.TARGET_W, 0};
+    const match_size size = {a->size.H, a->size.W, a->size.TARGET_W, 0, 0};
     return a->backend->fit_offsets(a->offset, a->reference, a->target, size, a->fitted);
 }
 
 FUNCTION(fit_offsets, FIT_OFFSETS, check_fit_offsets,
          "Offsets fitted to the raw costs of a window around each pixel, in 1/256 pixel.");
 
-native_function *const matching_functions[] = {&census_function,
-                                               &matching_cost_function,
-                                               &aggregation_function,
-                                               &selection_function,
-                                               &match_function,
-                                               &fit_offsets_function,
-                                               NULL};
+#define WARP(X) \
+    X(IN, float32, source, H, SOURCE_W) \
+    X(IN, uint8, valid, H, SOURCE_W) \
+    X(IN, int32, prediction, H, W) \
+    X(VALUE, int, margin) \
+    X(OUT, float32, warped, H, TARGET_W) \
+    X(OUT, uint8, warped_valid, H, TARGET_W) \
+    X(OUT, int32, columns, H, TARGET_W)
+ARGUMENTS(warp, WARP);
+
+static int check_warp(const void *arguments) {
+    const warp_arguments *a = arguments;
+    return check_widths(&a->size) && check_width(a->size.SOURCE_W) && check_margin(a->margin) &&
+           check(a->size.W > 0 || a->size.H == 0, "without a reference column nothing is predicted");
+}
+
+static int run_warp(void *arguments) {
+    const warp_arguments *a = arguments;
+    const match_size size = {a->size.H, a->size.W, a->size.TARGET_W, 0, a->size.SOURCE_W};
+    warp(a->source, a->valid, a->prediction, a->margin, size, a->warped, a->warped_valid, a->columns);
+    return 0;
+}
+
+FUNCTION(warp, WARP, check_warp,
+         "An image as another one is expected to see it, by predicted offsets in 1/256 pixel, and its columns.");
+
+#define UNWARP_OFFSETS(X) \
+    X(IN, int32, offset, H, W) \
+    X(IN, int32, prediction, H, W) \
+    X(VALUE, int, margin) \
+    X(OUT, int32, unwarped, H, W)
+ARGUMENTS(unwarp_offsets, UNWARP_OFFSETS);
+
+static int check_unwarp_offsets(const void *arguments) {
+    const unwarp_offsets_arguments *a = arguments;
+    return check_width(a->size.W) && check_margin(a->margin);
+}
+
+static int run_unwarp_offsets(void *arguments) {
+    const unwarp_offsets_arguments *a = arguments;
+    const match_size size = {a->size.H, a->size.W, 0, 0, 0};
+    unwarp_offsets(a->offset, a->prediction, a->margin, size, a->unwarped);
+    return 0;
+}
+
+FUNCTION(unwarp_offsets, UNWARP_OFFSETS, check_unwarp_offsets,
+         "Offsets in a warped image, 1/256 pixel, to those in the image that it was warped from.");
+
+#define MEAN_OFFSETS(X) \
+    X(IN, int32, offset, H, W) \
+    X(VALUE, int, radius) \
+    X(VALUE, int, max_step) \
+    X(OUT, int32, mean, H, W)
+ARGUMENTS(mean_offsets, MEAN_OFFSETS);
+
+static int check_mean_offsets(const void *arguments) {
+    const mean_offsets_arguments *a = arguments;
+    return check_width(a->size.W) &&
+           check(a->radius >= 0 && a->radius <= MAX_MEAN_RADIUS, "the radius must lie in 0..10") &&
+           check(a->max_step >= 0 && a->max_step <= MAX_MEAN_STEP, "max_step must lie in 0..1048576");
+}
+
+static int run_mean_offsets(void *arguments) {
+    const mean_offsets_arguments *a = arguments;
+    int32_t *sums = malloc((size_t)(2 * a->size.W + 1) * sizeof *sums);
+    if (!sums) {
+        return -1;
+    }
+    mean_offsets(a->offset, a->size.H, a->size.W, a->radius, a->max_step, sums, a->mean);
+    free(sums);
+    return 0;
+}
+
+FUNCTION(mean_offsets, MEAN_OFFSETS, check_mean_offsets,
+         "Of every offset the mean of those near it that differ from it by no more than `max_step`.");
+
+native_function *const matching_functions[] = {&census_function,       &matching_cost_function,
+                                               &aggregation_function,  &selection_function,
+                                               &match_function,        &fit_offsets_function,
+                                               &warp_function,         &unwarp_offsets_function,
+                                               &mean_offsets_function, NULL};

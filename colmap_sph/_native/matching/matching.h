@@ -1,6 +1,7 @@
 /* Kernels of matching: a reference image is compared with a target image of the same height. Slot `i` of reference
  * pixel (y, x) stands for the target pixel (y, x + base[y, x] + i), 0 <= i < depth. `depth` is a multiple of 32.
- * All of them have versions per instruction set, equal to the bit. */
+ * The target is a source image warped by predicted offsets, so that surfaces lie as flat as they are expected to.
+ * Those on pixels with many slots have versions per instruction set, equal to the bit. */
 #ifndef COLMAP_SPH_MATCHING_H
 #define COLMAP_SPH_MATCHING_H
 
@@ -17,8 +18,11 @@ enum {
     NO_SLOT = 192,
     DEPTH_STEP = 32,
     MAX_DEPTH = 1024,
-    MAX_OFFSET_STEP = 512,  /* 1/256 pixel: neighbours whose offsets differ by more are not one surface */
-    MAX_OFFSET_CHANGE = 256 /* 1/256 pixel */
+    MAX_OFFSET_STEP = 512,   /* 1/256 pixel: neighbours whose offsets differ by more are not one surface */
+    MAX_OFFSET_CHANGE = 256, /* 1/256 pixel */
+    MAX_OFFSET = 1 << 24,    /* 1/256 pixel: widest row */
+    MAX_MEAN_RADIUS = 10,
+    MAX_MEAN_STEP = 1 << 20
 };
 
 /* Census images come in 1/64 grey value (_CENSUS_STEPS in matching.py); a difference up to half a grey value,
@@ -31,6 +35,7 @@ enum { CENSUS_MARGIN = 32 };
 
 typedef struct {
     ptrdiff_t height, width, target_width, depth;
+    ptrdiff_t source_width;
 } match_size;
 
 /* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}; bit set where the neighbour is darker by more than
@@ -54,19 +59,23 @@ typedef struct {
 typedef int aggregation_fn(const uint8_t *cost, const int32_t *base, const uint8_t *image, match_size size,
                            path_penalties penalties, uint8_t *detours, uint8_t *aggregated);
 
-/* Of all sums that point at a winner's target pixel there is a least one. The winner passes the check if its own
- * sum is larger by at most `max_excess`, or if one of the least is at most `max_difference` columns from it. */
+/* Of all sums that point at the source column of a winner's target pixel there is a least one. The winner passes
+ * the check if its own sum is larger by at most `max_excess`, or if that of the first target pixel which has it is
+ * at most `max_difference` columns from it. */
 typedef struct {
     int32_t max_difference, max_excess;
 } left_right_check;
 
-/* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. */
+/* Winner, left-right check from the same volume, sub-pixel offset in 1/256 pixel or OFFSET_INVALID. `columns` are
+ * those of the source that target pixels show; outside of it there is none. */
 typedef int selection_fn(const uint8_t *aggregated, const int32_t *base, const uint64_t *reference,
-                         const uint64_t *target, match_size size, left_right_check check, int32_t *offset);
+                         const uint64_t *target, const int32_t *columns, match_size size, left_right_check check,
+                         int32_t *offset);
 
+/* `surface` is the base as aggregation sees it, among the columns of the source. */
 typedef struct {
     const uint64_t *reference, *target;
-    const int32_t *base;
+    const int32_t *columns, *base, *surface;
     const uint8_t *image;
     match_size size;
     path_penalties penalties;
@@ -80,6 +89,22 @@ typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint8_t *scr
 /* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
 typedef int fit_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
                            match_size size, int32_t *fitted);
+
+/* A source image as the reference is expected to see it: target pixel w shows what lies `prediction` (1/256 pixel)
+ * from reference column w - margin; beyond the reference's sides the outermost predictions count, and beyond those
+ * of the source its outermost pixels. `columns` are the nearest ones of the source, -1 outside. Content is what
+ * lies in one of them and is made of content alone. */
+void warp(const float *source, const uint8_t *valid, const int32_t *prediction, ptrdiff_t margin, match_size size,
+          float *warped, uint8_t *warped_valid, int32_t *columns);
+
+/* From offsets to pixels of the target, as above, to offsets to the source. */
+void unwarp_offsets(const int32_t *offset, const int32_t *prediction, ptrdiff_t margin, match_size size,
+                    int32_t *unwarped);
+
+/* Every offset becomes the mean, rounded towards itself, of those within `radius` of it that differ from it by no
+ * more than `max_step`. `sums` has room for two rows. */
+void mean_offsets(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int radius, int max_step,
+                  int32_t *sums, int32_t *mean);
 
 census_fn census_scalar, census_avx2;
 fit_offsets_fn fit_offsets_scalar, fit_offsets_avx2, fit_offsets_avx512;

@@ -12,9 +12,40 @@ uint64_t *cost_row_buffer(match_size size) {
 int selection_begin(selection_buffers *buffers, match_size size) {
     /* Three more, as vectorised versions read four at once. */
     const ptrdiff_t best_sums = size.target_width + 2 * size.depth + 3;
-    buffers->winner = malloc((size_t)size.width * sizeof(int32_t) + (size_t)best_sums);
-    buffers->best_sum = buffers->winner ? (uint8_t *)(buffers->winner + size.width) : NULL;
-    return buffers->winner ? 0 : -1;
+    const size_t words = (size_t)(size.width + size.target_width + size.source_width);
+    buffers->winner = malloc(words * sizeof(int32_t) + (size_t)(best_sums + size.source_width));
+    if (!buffers->winner) {
+        return -1;
+    }
+    buffers->rival = buffers->winner + size.width;
+    buffers->place = buffers->rival + size.target_width;
+    buffers->best_sum = (uint8_t *)(buffers->place + size.source_width);
+    buffers->source_sum = buffers->best_sum + best_sums;
+    return 0;
+}
+
+void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, const selection_buffers *buffers) {
+    /* Where a surface is stretched, its target pixels skip columns of the source: they stand for these, too. */
+    enum { MAX_STRETCH = 4 };
+    const int32_t source_width = (int32_t)size.source_width, target_width = (int32_t)size.target_width;
+    memset(buffers->source_sum, UINT8_MAX, (size_t)source_width);
+    for (int32_t w = 0; w < target_width; w++) {
+        const int32_t first = columns[w] < 0 ? source_width : columns[w];
+        const int64_t step = w + 1 < target_width ? (int64_t)columns[w + 1] - first : 1;
+        const int64_t end = first + (step > 1 && step <= MAX_STRETCH ? step : 1);
+        for (int32_t c = first; c < end && c < source_width; c++) {
+            if (best_sum[w] < buffers->source_sum[c]) {
+                buffers->source_sum[c] = best_sum[w];
+                buffers->place[c] = w;
+            }
+        }
+    }
+    for (int32_t w = 0; w < target_width; w++) {
+        const int32_t c = columns[w];
+        const int shown = c >= 0 && c < source_width && buffers->source_sum[c] < UINT8_MAX;
+        buffers->rival[w] = shown ? buffers->place[c] : w;
+        best_sum[w] = shown ? buffers->source_sum[c] : best_sum[w];
+    }
 }
 
 int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
@@ -47,8 +78,8 @@ int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_
 }
 
 int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
-                const uint64_t *reference, const uint64_t *target, match_size size, left_right_check check,
-                int32_t *offset) {
+                const uint64_t *reference, const uint64_t *target, const int32_t *columns, match_size size,
+                left_right_check check, int32_t *offset) {
     selection_buffers buffers;
     if (selection_begin(&buffers, size)) {
         return -1;
@@ -56,7 +87,8 @@ int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int
     for (ptrdiff_t y = 0; y < size.height; y++) {
         const ptrdiff_t row = y * size.width;
         kernels->selection_row(aggregated + row * size.depth, base + row, reference + row,
-                               target + y * size.target_width, size, check, &buffers, offset + row);
+                               target + y * size.target_width, columns + y * size.target_width, size, check,
+                               &buffers, offset + row);
     }
     free(buffers.winner);
     return 0;
@@ -97,8 +129,9 @@ static void backward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, const uint8_t
     for (ptrdiff_t r = 0; r < rows; r++) {
         const ptrdiff_t row = (y - r) * in->size.width;
         m->kernels->selection_row(row_sums - r * m->row_size, in->base + row, in->reference + row,
-                                  in->target + (y - r) * in->size.target_width, in->size, in->check, &m->selection,
-                                  offset + row);
+                                  in->target + (y - r) * in->size.target_width,
+                                  in->columns + (y - r) * in->size.target_width, in->size, in->check,
+                                  &m->selection, offset + row);
     }
 }
 
@@ -139,8 +172,8 @@ int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band
     matcher m = {.kernels = kernels, .input = in, .band_rows = band_rows};
     m.row_size = in->size.width * in->size.depth;
     int status = -1;
-    if (!kernels->sweep_begin(&m.forward, in->base, in->image, in->size, in->penalties, 0) &&
-        !kernels->sweep_begin(&m.backward, in->base, in->image, in->size, in->penalties, 1) &&
+    if (!kernels->sweep_begin(&m.forward, in->surface, in->image, in->size, in->penalties, 0) &&
+        !kernels->sweep_begin(&m.backward, in->surface, in->image, in->size, in->penalties, 1) &&
         !selection_begin(&m.selection, in->size)) {
         m.cost_buffer = cost_row_buffer(in->size);
         m.row_sums = malloc(((size_t)(m.row_size * GROUP) + 1) * sizeof *m.row_sums);

@@ -44,15 +44,20 @@ typedef void sweep_rows_fn(sweep_state *state, ptrdiff_t y, ptrdiff_t rows, cons
 /* ---- selection --------------------------------------------------------------------------------------------- */
 
 typedef struct {
-    int32_t *winner;   /* of every pixel its best slot; -1 without content */
-    uint8_t *best_sum; /* of every target pixel, and `depth` more on both sides, the least sum that points at it */
+    int32_t *winner;     /* of every pixel its best slot; -1 without content */
+    int32_t *rival;      /* of every target pixel the one whose sum it is checked against, */
+    uint8_t *best_sum;   /* and that sum; at first the least of its own, with `depth` more on both sides */
+    int32_t *place;      /* of every source column the target pixel with the least sum, */
+    uint8_t *source_sum; /* and that sum */
 } selection_buffers;
 
 /* 0, or -1 without memory; ended by free(buffers->winner). */
 int selection_begin(selection_buffers *buffers, match_size size);
+/* Least sums of target pixels become those of the source columns that they show. */
+void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, const selection_buffers *buffers);
 typedef void selection_row_fn(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
-                              const uint64_t *target, match_size size, left_right_check check,
-                              selection_buffers *buffers, int32_t *offset);
+                              const uint64_t *target, const int32_t *columns, match_size size,
+                              left_right_check check, selection_buffers *buffers, int32_t *offset);
 
 /* The second half of the vectorised selection: what is left of `buffers->winner`, fitted. */
 void check_winners_avx2(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
@@ -77,8 +82,8 @@ int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const ui
 int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_t *base, const uint8_t *image,
                    match_size size, path_penalties penalties, uint8_t *detours, uint8_t *aggregated);
 int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
-                const uint64_t *reference, const uint64_t *target, match_size size, left_right_check check,
-                int32_t *offset);
+                const uint64_t *reference, const uint64_t *target, const int32_t *columns, match_size size,
+                left_right_check check, int32_t *offset);
 int match_rows(const row_kernels *kernels, const match_input *input, ptrdiff_t band_rows, uint8_t *scratch,
                int32_t *offset);
 

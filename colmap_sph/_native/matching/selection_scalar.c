@@ -57,18 +57,19 @@ static ptrdiff_t first_minimum(const uint8_t *sums, ptrdiff_t depth) {
 }
 
 void selection_row_scalar(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
-                          const uint64_t *target, match_size size, left_right_check check,
+                          const uint64_t *target, const int32_t *columns, match_size size, left_right_check check,
                           selection_buffers *buffers, int32_t *offset) {
     match_target_row(sums, base, reference, size, buffers->best_sum);
+    merge_columns(columns, size, buffers->best_sum, buffers);
     for (ptrdiff_t x = 0; x < size.width; x++) {
         const uint8_t *own = sums + x * size.depth;
         const ptrdiff_t best = first_minimum(own, size.depth), r = x + base[x] + best;
         /* At the end of the range the true minimum may lie beyond it. */
-        const int found =
-            !(reference[x] & CENSUS_INVALID) && best > 0 && best < size.depth - 1 && r >= 0 &&
-            r < size.target_width && !(target[r] & CENSUS_INVALID) &&
-            (own[best] - buffers->best_sum[r] <= check.max_excess ||
-             is_mutual(sums, base, reference, size, buffers->best_sum[r], x, r, check.max_difference));
+        const int found = !(reference[x] & CENSUS_INVALID) && best > 0 && best < size.depth - 1 && r >= 0 &&
+                          r < size.target_width && !(target[r] & CENSUS_INVALID) &&
+                          (own[best] - buffers->best_sum[r] <= check.max_excess ||
+                           is_mutual(sums, base, reference, size, buffers->best_sum[r], x, buffers->rival[r],
+                                     check.max_difference));
         offset[x] =
             found ? (int32_t)(base[x] + best) * 256 + subpixel_offset(own[best - 1], own[best], own[best + 1])
                   : OFFSET_INVALID;

@@ -85,11 +85,11 @@ ALWAYS_INLINE void first_pass(const uint8_t *sums, const int32_t *base, const ui
 }
 
 void VERSION_OF(selection_row)(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
-                               const uint64_t *target, match_size size, left_right_check check,
-                               selection_buffers *buffers, int32_t *offset) {
+                               const uint64_t *target, const int32_t *columns, match_size size,
+                               left_right_check check, selection_buffers *buffers, int32_t *offset) {
 #ifdef __AVX512F__
     if (size.depth % 64) { /* 32 slots fill half a register: nothing to gain */
-        selection_row_avx2(sums, base, reference, target, size, check, buffers, offset);
+        selection_row_avx2(sums, base, reference, target, columns, size, check, buffers, offset);
         return;
     }
 #endif
@@ -107,5 +107,6 @@ void VERSION_OF(selection_row)(const uint8_t *sums, const int32_t *base, const u
     default:
         first_pass(sums, base, reference, size, buffers, size.depth);
     }
+    merge_columns(columns, size, buffers->best_sum + size.depth, buffers);
     check_winners_avx2(sums, base, target, size, check, buffers, offset);
 }

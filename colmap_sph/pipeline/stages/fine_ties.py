@@ -23,7 +23,7 @@ CACHE_BYTES = 256 << 20
 """Of images that are kept while pairs are measured."""
 
 
-def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) -> dict[Pair, ImageTies]:
+def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) -> dict[tuple[str, str], ImageTies]:
     """Ties of all pairs; a pair whose file or images cannot be read has none.
 
     Parameters
@@ -37,7 +37,7 @@ def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) ->
     Returns
     -------
     dict
-        Of each pair of image names.
+        Of each pair of image names, left and right.
     """
     photos: LoadCache[Photo] = LoadCache(lambda photo: photo.nbytes)
 
@@ -46,16 +46,16 @@ def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) ->
 
     ties = {}
     with photos.holding(CACHE_BYTES):
-        for pair, path in sorted(pairs.items()):
+        for _, path in sorted(pairs.items()):
             with suppress(InputError):
-                left, right = (scene.view(name) for name in pair)
                 matched, found = read_pair_with_ties(path)
                 geometry = matched.geometry
+                left, right = scene.view(matched.left), scene.view(matched.right)
                 finer = _finer(left, right, geometry)
                 if finer > 1:
                     photos_of_pair = (left, photo(left).image), (right, photo(right).image)
                     found = find_ties(*photos_of_pair, geometry, matched.disparity, photo(left).corners, finer)
-                ties[pair] = ImageTies(
+                ties[left.name, right.name] = ImageTies(
                     image_coordinates(left, geometry, "left", found.left),
                     image_coordinates(right, geometry, "right", found.right),
                 )

@@ -25,11 +25,12 @@ from colmap_sph.project.state.ownership import remove_array_files
 from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
-from colmap_sph.stereo.partners.pairing import Pair
+from colmap_sph.stereo.partners.pairing import Pair, as_pair
 from colmap_sph.stereo.poses.ties import Ties, find_ties, row_residual, tolerable_sampling
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
 from colmap_sph.stereo.resampling import resample
+from colmap_sph.stereo.search.seeds import Seeds, finer_first, seeds_of_points, shared_points
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -46,7 +47,7 @@ _SECONDS = 0.1
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …
-_MATCH_BYTES = 44.0
+_MATCH_BYTES = 53.0
 # … while an image is read and rectified: per pixel of its own, and per left rectified pixel of both.
 _READ_BYTES = 11.0
 _RECTIFIED_BYTES = 10.0
@@ -75,12 +76,14 @@ class PhotoFile:
 class MatchTask:
     """A pair to match, with the bytes of scratch memory a thread may keep, and where its disparity map goes.
 
-    Where poses may be imprecise, the pair is matched at the share `trial` of its rows and columns first.
+    `seeds` are those of its sparse points, see `seeds_of_points`. Where poses may be imprecise, the pair is
+    matched at the share `trial` of its rows and columns first.
     """
 
     left: PhotoFile
     right: PhotoFile
     geometry: RectifiedPair
+    seeds: Seeds
     trial: float
     options: MatchingOptions
     scratch_bytes: int
@@ -111,6 +114,7 @@ def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32
         task.options,
         _thread.scratch,
         infinity=-geometry.disparity_origin,
+        seeds=task.seeds * (geometry.columns_per_radian / task.geometry.columns_per_radian),
     )
     left, right = _photo(task.left), _photo(task.right)
     photos = (task.left.view, left.image), (task.right.view, right.image)
@@ -156,10 +160,11 @@ class MatchStage(Stage[Pair, MatchTask]):
     def job(self, item: Pair) -> Job[MatchTask]:
         """See `Stage.job`; `RectificationError` for a pair that cannot be rectified."""
         context = self.context
-        left, right = (context.scene.view(name) for name in item)
+        left, right = finer_first(context.scene, *(context.scene.view(name) for name in item))
         geometry = self._geometry(left, right)
+        seeds = seeds_of_points(left, right, geometry, shared_points(context.scene, left, right))
         trial = self._trial(left, right, geometry)
-        key = context.keys.pair(left, right, geometry, trial)
+        key = context.keys.pair(left, right, geometry, seeds, trial)
         target = context.pair_path(*item)
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)
@@ -174,6 +179,7 @@ class MatchStage(Stage[Pair, MatchTask]):
             self._photo(left),
             self._photo(right),
             geometry,
+            seeds,
             trial,
             context.options.matching,
             self._scratch_bytes,
@@ -187,7 +193,7 @@ class MatchStage(Stage[Pair, MatchTask]):
             details = (self._detail(left), self._detail(right))
             return rectify_pair(self.context.scene, left, right, self.context.options.rectification, details)
         except RectificationError:
-            self._unfit.add((left.name, right.name))
+            self._unfit.add(as_pair(left.name, right.name))
             raise
 
     def _detail(self, view: View) -> float:

@@ -1,0 +1,95 @@
+/* Images warped by predicted offsets, row by row; see `warp` in matching.h. */
+#include <string.h>
+
+#include "matching/matching.h"
+
+ALWAYS_INLINE ptrdiff_t within(ptrdiff_t value, ptrdiff_t end) {
+    return value < 0 ? 0 : value < end ? value : end - 1;
+}
+
+void warp(const float *source, const uint8_t *valid, const int32_t *prediction, ptrdiff_t margin, match_size size,
+          float *warped, uint8_t *warped_valid, int32_t *columns) {
+    for (ptrdiff_t y = 0; y < size.height; y++) {
+        const ptrdiff_t out = y * size.target_width;
+        const float *row = source + y * size.source_width;
+        const uint8_t *row_valid = valid + y * size.source_width;
+        for (ptrdiff_t w = 0; w < size.target_width; w++) {
+            const int64_t place =
+                (int64_t)(w - margin) * 256 + prediction[y * size.width + within(w - margin, size.width)];
+            const int64_t nearest = (place + 128) >> 8;
+            const int inside = nearest >= 0 && nearest < size.source_width;
+            columns[out + w] = inside ? (int32_t)nearest : -1;
+            if (size.source_width == 0) {
+                warped[out + w] = 0;
+                warped_valid[out + w] = 0;
+                continue;
+            }
+            const int part = (int)(place & 255);
+            const ptrdiff_t column = within((ptrdiff_t)(place >> 8), size.source_width);
+            const ptrdiff_t next = within((ptrdiff_t)(place >> 8) + (part > 0), size.source_width);
+            const uint8_t both = row_valid[column] < row_valid[next] ? row_valid[column] : row_valid[next];
+            warped[out + w] = row[column] + (row[next] - row[column]) * ((float)part / 256);
+            warped_valid[out + w] = inside ? both : 0;
+        }
+    }
+}
+
+void unwarp_offsets(const int32_t *offset, const int32_t *prediction, ptrdiff_t margin, match_size size,
+                    int32_t *unwarped) {
+    /* Neighbours whose predictions differ by more are of two surfaces, between which nothing is interpolated. */
+    enum { MAX_STEP = 4 * 256 };
+    for (ptrdiff_t y = 0; y < size.height; y++) {
+        const int32_t *predicted = prediction + y * size.width;
+        for (ptrdiff_t x = 0; x < size.width; x++) {
+            const ptrdiff_t p = y * size.width + x;
+            if (offset[p] == OFFSET_INVALID) {
+                unwarped[p] = OFFSET_INVALID;
+                continue;
+            }
+            const int64_t residual = (int64_t)offset[p] - 256 * (int64_t)margin;
+            const int64_t place = 256 * (int64_t)x + residual;
+            const int part = (int)(place & 255);
+            const int64_t here = predicted[within((ptrdiff_t)(place >> 8), size.width)];
+            const int64_t next = predicted[within((ptrdiff_t)(place >> 8) + 1, size.width)];
+            const int64_t step = next - here;
+            const int64_t between =
+                step > MAX_STEP || step < -MAX_STEP ? (part < 128 ? 0 : step) : step * part >> 8;
+            const int64_t sum = residual + here + between;
+            unwarped[p] = sum > -MAX_OFFSET && sum < MAX_OFFSET ? (int32_t)sum : OFFSET_INVALID;
+        }
+    }
+}
+
+/* Sums of differences fit in 32 bits. */
+_Static_assert((2 * MAX_MEAN_RADIUS + 1) * (2 * MAX_MEAN_RADIUS + 1) * (int64_t)MAX_MEAN_STEP < INT32_MAX, "sums");
+
+/* To the sums and counts of a row's pixels, those of the pixels of another row that lie dx to the right. */
+static void add_row(const int32_t *own, const int32_t *other, ptrdiff_t width, ptrdiff_t dx, int32_t max_step,
+                    int32_t *sum, int32_t *count) {
+    const ptrdiff_t first = dx < 0 ? -dx : 0, end = dx > 0 ? width - dx : width;
+    for (ptrdiff_t x = first; x < end; x++) {
+        /* Unsigned, as the difference of extremes wraps round, to one of the other sign. */
+        const int32_t difference = (int32_t)((uint32_t)other[x + dx] - (uint32_t)own[x]);
+        const int32_t kept = -((difference <= max_step) & (difference >= -max_step) &
+                               ((difference < 0) == (other[x + dx] < own[x])));
+        sum[x] += difference & kept;
+        count[x] -= kept;
+    }
+}
+
+void mean_offsets(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int radius, int max_step,
+                  int32_t *sums, int32_t *mean) {
+    int32_t *counts = sums + width;
+    for (ptrdiff_t y = 0; y < height; y++) {
+        const int32_t *own = offset + y * width;
+        memset(sums, 0, (size_t)(2 * width) * sizeof *sums);
+        for (ptrdiff_t dy = -radius; dy <= radius; dy++) {
+            for (ptrdiff_t dx = -radius; dx <= radius && y + dy >= 0 && y + dy < height; dx++) {
+                add_row(own, own + dy * width, width, dx, max_step, sums, counts);
+            }
+        }
+        for (ptrdiff_t x = 0; x < width; x++) {
+            mean[y * width + x] = own[x] + sums[x] / counts[x];
+        }
+    }
+}

@@ -1,0 +1,203 @@
+"""Where the pixels of a level are expected to match, and what they search about that.
+
+The coarsest level starts from the pair's sparse points and searches the whole range; every other one from what the
+level above found, about which each pixel searches the same number of offsets (Rothermel et al. 2012, "tSGM", where
+each pixel has a number of its own, too: with one for all, memory stays regular). The right image is warped by what
+is predicted before the two are compared: surfaces that one image sees stretched or slanted lie flat then, and the
+windows that are compared show the same. Offsets are those of `offsets`; *residuals* are what they exceed the
+predicted ones by.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph import _native
+from colmap_sph.stereo.search.offsets import INVALID, MEDIAN_SIDE, SUBPIXEL
+from colmap_sph.stereo.search.ranges import SPARE, range_depth
+from colmap_sph.stereo.search.seeds import Seeds, interpolated_disparity
+
+# Predictions are the mean of those within this radius that differ by no more than so many pixels: of one surface.
+_MEAN_RADIUS = 4
+_MAX_STEP = 3
+# Residuals, of the finer level, that a neighbourhood's range must leave free at either end of the pixel's, and
+# those that the predicted offset must.
+_CLEARANCE = 4
+_OWN_CLEARANCE = 6
+# Within 3 x 3 pixels of a coarser level, offsets on one surface differ by no more (in pixels of the finer one).
+_MAX_SURFACE_STEP = 4
+# Steps to which what is interpolated between sparse points is rounded, so that its last bits do not count.
+_SEED_STEPS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a level's pixels search.
+
+    Attributes
+    ----------
+    offset : (H, W) int32 ndarray
+        Predicted offset, 1/256 pixel.
+    base : (H, W) int32 ndarray
+        First residual to search, pixels.
+    depth : int
+        Number of residuals to search.
+    exact : bool
+        Neighbours with the same residual are of one surface, whatever their `base`. Else those are of which
+        `first` differs by no more than a slope does, slot by slot: predictions may end where surfaces do.
+    """
+
+    offset: NDArray[np.int32]
+    base: NDArray[np.int32]
+    depth: int
+    exact: bool = False
+
+    @property
+    def first(self) -> NDArray[np.int32]:
+        """(H, W) int32 first offset to search, pixels."""
+        first = self.offset + np.int32(SUBPIXEL // 2)
+        first //= SUBPIXEL
+        first += self.base
+        return first
+
+    @property
+    def margin(self) -> int:
+        """Columns of a warped image beyond the sides of the reference that are searched from inside of it."""
+        return self.depth if self.exact else self.depth // 2
+
+
+def from_seeds(seeds: Seeds | None, shape: tuple[int, ...], level: int, low: int, high: int) -> Prediction:
+    """What the coarsest level searches: the whole range, about what sparse points tell.
+
+    Parameters
+    ----------
+    seeds : (n, 3) float32 ndarray, optional
+        As of `seeds_of_points`. Without any, the middle of the range is predicted.
+    shape : (int, int)
+        Of the level.
+    level : int
+        Its pixels are 2 to the power of `level` of full resolution.
+    low, high : int
+        Least and most offset, pixels of the level.
+
+    Returns
+    -------
+    Prediction
+    """
+    if seeds is None or not len(seeds):
+        predicted = np.full(shape, (low + high) // 2, dtype=np.float32)
+    else:
+        predicted = -interpolated_disparity(seeds, shape, 2.0**level)
+        predicted = np.clip(np.round(predicted * _SEED_STEPS) / _SEED_STEPS, low, high)
+    offset = _in_steps(predicted)
+    return Prediction(offset, low - SPARE - _nearest_pixel(offset), range_depth(low, high), exact=True)
+
+
+def from_coarser(
+    offset: NDArray[np.int32], prior: Prediction, shape: tuple[int, ...], depth: int, radius: int
+) -> Prediction:
+    """What a level searches, from the offsets of the level above.
+
+    A pixel searches about its predicted offset, or with the window shifted so that all offsets of its
+    neighbourhood lie inside, where they fit. What was not found lies as far from what was predicted as the nearest
+    that was.
+
+    Parameters
+    ----------
+    offset : (h, w) int32 ndarray
+        Of the coarser level, 1/256 of its pixels.
+    prior : Prediction
+        Of the coarser level.
+    shape : (int, int)
+        (H, W) of the finer level: 2 h and 2 w, or one less.
+    depth : int
+        Number of residuals that a pixel searches.
+    radius : int
+        Of the neighbourhood, pixels of the coarser level.
+
+    Returns
+    -------
+    Prediction
+    """
+    own = _filled(offset, prior)
+    predicted = _upsample(2 * _mean_on_surfaces(own), shape)
+    least, most = (_repeated(2 * values, shape) for values in _neighbourhood(own, radius))
+    del own
+    half = depth / 2
+    # In place: arrays of the finer level are large.
+    above = np.maximum(np.subtract(most, predicted, out=most) + (_CLEARANCE - half), 0, out=most)
+    below = np.maximum(np.subtract(predicted, least, out=least) + (_CLEARANCE - half), 0, out=least)
+    # Where the neighbourhood does not fit, towards its middle.
+    both = (above > 0) & (below > 0)
+    shift = np.subtract(above, below, out=above)
+    shift[both] /= 2
+    limit = half - _OWN_CLEARANCE
+    np.clip(shift, -limit, limit, out=shift)
+    shift -= half
+    base = np.round(shift, out=shift).astype(np.int32)
+    del most, least, above, below, both, shift
+    return Prediction(_in_steps(predicted), base, depth)
+
+
+def searched_depth(low: int, high: int, most: int) -> int:
+    """Number of residuals to search in a range of offsets, of which one knows where to look: `most`, or less."""
+    return min(range_depth(low, high), most)
+
+
+def _nearest_pixel(offset: NDArray[np.int32]) -> NDArray[np.int32]:
+    return (offset + SUBPIXEL // 2) // SUBPIXEL
+
+
+def _in_steps(offset: NDArray[np.float32]) -> NDArray[np.int32]:
+    return np.round(offset * SUBPIXEL).astype(np.int32)
+
+
+def _filled(offset: NDArray[np.int32], prior: Prediction) -> NDArray[np.float32]:
+    """Offsets in pixels, without gaps or single outliers."""
+    valid = offset != INVALID
+    predicted = prior.offset.astype(np.float32) * np.float32(1 / SUBPIXEL)
+    if not valid.any():
+        return predicted
+    residual = offset.astype(np.float32) * np.float32(1 / SUBPIXEL) - predicted
+    filled = predicted + _fill_nearest(residual, valid)
+    return np.asarray(cv2.medianBlur(filled, MEDIAN_SIDE), dtype=np.float32)
+
+
+def _mean_on_surfaces(offset: NDArray[np.float32]) -> NDArray[np.float32]:
+    steps = _in_steps(offset)
+    mean = np.empty_like(steps)
+    _native.mean_offsets(steps, _MEAN_RADIUS, _MAX_STEP * SUBPIXEL, mean)
+    return mean.astype(np.float32) * np.float32(1 / SUBPIXEL)
+
+
+def _neighbourhood(values: NDArray[np.float32], radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Least and largest value within `radius` of every pixel."""
+    window = np.ones((2 * radius + 1,) * 2, dtype=np.uint8)
+    return np.asarray(cv2.erode(values, window)), np.asarray(cv2.dilate(values, window))
+
+
+def _repeated(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Twice the size, cut to `shape`."""
+    doubled = (2 * values.shape[1], 2 * values.shape[0])
+    return np.asarray(cv2.resize(values, doubled, interpolation=cv2.INTER_NEAREST)[: shape[0], : shape[1]])
+
+
+def _upsample(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Twice the size, cut to `shape`: interpolated on surfaces and repeated at steps."""
+    doubled = (2 * values.shape[1], 2 * values.shape[0])
+    least, most = _neighbourhood(values, 1)
+    flat = (most - least <= _MAX_SURFACE_STEP).astype(np.float32)
+    interpolated = cv2.resize(values, doubled, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
+    return np.where(_repeated(flat, shape) > 0, interpolated, _repeated(values, shape))
+
+
+def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Give pixels that are not valid the value of the nearest one that is."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    of_label = np.zeros(int(labels.max()) + 1, dtype=np.float32)
+    of_label[labels[valid]] = values[valid]
+    return np.asarray(of_label[labels], dtype=np.float32)

@@ -1,0 +1,125 @@
+"""Sparse points of a pair → which image is the left one, and where its coarsest level is expected to match."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordinates_of_rays
+
+Seeds = NDArray[np.floating]
+"""(n, 3) left columns, left rows and disparities, pixels, of sparse points in a rectified pair."""
+
+# Seeds are rounded to so many parts of a pixel, so that the last digits of their points do not count.
+_STEPS = 4
+# So many tell what can be told, and travel well.
+_MOST = 256
+# A pixel is predicted from so many seeds around it, by a plane. Those nearer than this share of the image's
+# shorter side, or so many pixels of the level, count alike.
+_NEIGHBOURS = 12
+_ALIKE_SHARE = 0.04
+_LEAST_ALIKE = 2.0
+# Slopes are held back as if so many times as many seeds, at that distance and at the distance of the nearest one,
+# told of none: beyond the outermost seeds little is known.
+_STIFFNESS = 0.125
+_UNKNOWN_STIFFNESS = 0.1
+
+# Images that see their points equally fine, but for this share, stay in the order of their names.
+_EQUALLY_FINE = 1.02
+
+
+def shared_points(scene: Scene, left: View, right: View) -> Float:
+    """(n, 3) sparse points that both views observe, world frame."""
+    return scene.points[np.intersect1d(left.point_indices, right.point_indices)]
+
+
+def finer_first(scene: Scene, first: View, second: View) -> tuple[View, View]:
+    """The two views, that which sees their shared points finer before the other.
+
+    Pixels of the left image are looked for in the right one, which is stretched or squeezed to that end: a coarser
+    image can be stretched, while a finer one would lose pixels.
+    """
+    points = shared_points(scene, first, second)
+    if not len(points):
+        return first, second
+    fineness = [view.K[0, 0] / np.linalg.norm(points - view.center, axis=1) for view in (first, second)]
+    coarser = float(np.median(fineness[1] / fineness[0])) > _EQUALLY_FINE
+    return (second, first) if coarser else (first, second)
+
+
+def seeds_of_points(left: View, right: View, pair: RectifiedPair, points: Float) -> Seeds:
+    """Where a rectified pair shows points.
+
+    Parameters
+    ----------
+    left, right : View
+    pair : RectifiedPair
+    points : (n, 3) float64 ndarray
+        World frame.
+
+    Returns
+    -------
+    (m, 3) float32 ndarray
+        Column and row in the left rectified image, and disparity, of the points inside of both images, rounded to
+        quarters of a pixel; at most 256, from all over the points' order.
+    """
+    left_places = _places(left, pair, "left", points)
+    right_places = _places(right, pair, "right", points)
+    seeds = np.column_stack([left_places, left_places[:, 0] - right_places[:, 0]])
+    with np.errstate(invalid="ignore"):
+        inside = (np.abs(left_places - _middle(pair, "left")) <= _middle(pair, "left")).all(axis=1)
+        inside &= (np.abs(right_places - _middle(pair, "right")) <= _middle(pair, "right")).all(axis=1)
+    seeds = seeds[inside]
+    kept = np.linspace(0, len(seeds) - 1, min(len(seeds), _MOST)).astype(int)
+    return np.asarray(np.round(seeds[kept] * _STEPS) / _STEPS, dtype=np.float32)
+
+
+def _places(view: View, pair: RectifiedPair, side: Side, points: Float) -> Float:
+    rays = (points - view.center) @ pair.rectified_from_world.T
+    if pair.surface == "frame":
+        rays = np.where(rays[:, 2:] > 0, rays, np.nan)
+    return coordinates_of_rays(pair, side, rays)
+
+
+def _middle(pair: RectifiedPair, side: Side) -> Float:
+    return np.array([pair.width(side) - 1, pair.height - 1]) / 2
+
+
+def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -> NDArray[np.float32]:
+    """Disparity between seeds: of every pixel the plane through those around it, the near ones first.
+
+    Parameters
+    ----------
+    seeds : (n, 3) float32 ndarray
+        As of `seeds_of_points`; at least one.
+    shape : (int, int)
+        Rows and columns of the level.
+    scale : float
+        Pixels of full resolution to one of the level.
+
+    Returns
+    -------
+    (H, W) float32 ndarray
+        Pixels of the level.
+    """
+    seeds = seeds.astype(np.float64)
+    columns, rows = ((seeds[:, axis] + 0.5) / scale - 0.5 for axis in (0, 1))
+    alike = max(_ALIKE_SHARE * min(shape), _LEAST_ALIKE)
+    # Smooth at that distance: planes at the centres of cells half as wide, linear between these.
+    cell = max(int(alike / 2), 1)
+    height, width = (-(-side // cell) for side in shape)
+    across, down = np.meshgrid((np.arange(width) + 0.5) * cell - 0.5, (np.arange(height) + 0.5) * cell - 0.5)
+    places = np.column_stack([across.ravel(), down.ravel()])
+    tree = cKDTree(np.column_stack([columns, rows]))
+    distance, near = tree.query(places, k=np.arange(1, min(_NEIGHBOURS, len(seeds)) + 1))
+    weight = 1 / (distance**2 + alike**2)
+    terms = np.stack([np.ones_like(distance), columns[near] - places[:, :1], rows[near] - places[:, 1:]])
+    equations = np.einsum("ipk,pk,jpk->pij", terms, weight, terms)
+    ridge = weight.sum(axis=1) * (_STIFFNESS * alike**2 + _UNKNOWN_STIFFNESS * distance[:, 0] ** 2)
+    equations[:, 1, 1] += ridge
+    equations[:, 2, 2] += ridge
+    right_sides = np.einsum("ipk,pk,pk->pi", terms, weight, seeds[near, 2] / scale)
+    planes = np.linalg.solve(equations, right_sides[..., None])[:, 0, 0].astype(np.float32)
+    fine = cv2.resize(planes.reshape(height, width), (width * cell, height * cell))
+    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
