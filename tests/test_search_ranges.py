@@ -7,7 +7,7 @@ from scipy import ndimage
 from colmap_sph.errors import RectificationError
 from colmap_sph.stereo.disparity_range import columns_with_counterparts, few_digits, parallax_range
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
-from colmap_sph.stereo.search.prediction import Prediction, from_coarser, from_seeds, searched_depth
+from colmap_sph.stereo.search.prediction import Prediction, about_coarser, from_coarser, from_seeds, searched_depth
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, STEP, num_levels, range_depth
 
 
@@ -213,3 +213,64 @@ def test_the_first_offset_is_the_rounded_prediction_and_the_base() -> None:
     offset = np.array([[-385, -384, -129, -128, 127, 128, 384]], np.int32)
     prediction = Prediction(offset, np.full((1, 7), -16, np.int32), 32)
     np.testing.assert_array_equal(prediction.first + 16, np.floor(offset / 256 + 0.5))
+
+
+# ---- without warping ---------------------------------------------------------------------------------------
+
+
+def middles(
+    offset: np.ndarray, shape: tuple[int, int], depth: int, low: int, high: int, radius: int
+) -> np.ndarray:
+    prediction = about_coarser(offset, shape, depth, radius, low, high)
+    assert not prediction.warps and prediction.margin == 0 and not prediction.offset.any()
+    np.testing.assert_array_equal(prediction.first, prediction.base)
+    return prediction.base
+
+
+@pytest.mark.parametrize(("steep", "flat"), [(0.0, True), (0.05, True), (0.2, False), (1.0, False)])
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_level_is_flat_where_few_surfaces_are_steep(steep: float, flat: bool, axis: int) -> None:
+    """Slopes of .4 pixels per pixel on a share of the image, .2 on the rest; edges are no slopes."""
+    place = np.arange(400)
+    slope = np.where(place < steep * 400, 0.4, 0.2)
+    profile = np.cumsum(slope) + 30 * (place // 50 % 2)
+    offset = steps(np.broadcast_to(profile, (60, 400)))
+    offset = np.ascontiguousarray(offset.T if axis == 0 else offset)
+    assert Prediction(offset, np.zeros_like(offset), 32).is_flat() == flat
+
+
+def test_without_warping_a_slanted_surface_is_searched_for() -> None:
+    columns = np.arange(60)
+    offset = np.tile(np.round(0.3 * columns * SUBPIXEL).astype(np.int32), (50, 1))
+    offset[20:25, 10:30] = INVALID
+    base = middles(offset, (99, 119), 32, -1000, 1000, 4)
+    # Twice the size: 0.3 pixels per column as before, from half a pixel of the finer level on.
+    truth = 2 * 0.3 * ((np.arange(119) - 0.5) / 2)
+    assert base.shape == (99, 119)
+    assert np.abs(base + 16 - truth)[:, 8:-8].max() <= 2
+
+
+def test_without_warping_a_step_is_searched_for_on_both_sides() -> None:
+    """A range that fits holds both surfaces; one that does not holds each pixel's own, with room for its fit."""
+    for step in (5, 40):
+        offset = np.zeros((40, 60), np.int32)
+        offset[:, 30:] = step * SUBPIXEL
+        base = middles(offset, (80, 120), 32, -1000, 1000, 4)
+        truth = np.where(np.arange(120) < 60, 0, 2 * step)
+        room = np.minimum(truth - base, base + 31 - truth)
+        assert room.min() >= (4 if step == 5 else 5)
+        if step == 5:
+            both = slice(56, 64)
+            assert (base[:, both] <= 0).all() and (base[:, both] + 31 >= 10).all()
+
+
+def test_without_warping_windows_stay_in_the_whole_range() -> None:
+    offset = np.full((40, 60), 10 * SUBPIXEL, np.int32)
+    assert (middles(offset, (80, 120), 32, -5, 20, 4) == -6).all()
+    assert (middles(offset, (80, 120), 32, 3, 60, 4) == 4).all()
+    assert (middles(offset, (80, 120), 32, -60, 22, 4) == -8).all()
+
+
+def test_without_warping_or_any_match_the_middle_is_searched() -> None:
+    offset = np.full((5, 5), INVALID, np.int32)
+    assert (middles(offset, (10, 9), 32, 10, 90, 4) == 34).all()

@@ -20,7 +20,7 @@ from colmap_sph.errors import OptionError
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.resampling import half_size
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
-from colmap_sph.stereo.search.prediction import Prediction, from_coarser, from_seeds, searched_depth
+from colmap_sph.stereo.search.prediction import Prediction, about_coarser, from_coarser, from_seeds, searched_depth
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
 from colmap_sph.stereo.search.seeds import Seeds
 
@@ -237,6 +237,9 @@ def match_pair(
             prediction = from_seeds(seeds, shape, level, low, high)
         else:
             prediction = from_coarser(offset, prediction, shape, depth, options.range_radius)
+            np.clip(prediction.offset, low * SUBPIXEL, high * SUBPIXEL, out=prediction.offset)
+            if prediction.is_flat():
+                prediction = about_coarser(offset, shape, depth, options.range_radius, low, high)
         offset = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
         _drop_outside(offset, low - SPARE, max(high + SPARE, low - SPARE + depth - 1))
         if sky is not None:
@@ -353,6 +356,9 @@ def _warped(
 ) -> tuple[RectifiedImage, NDArray[np.int32]]:
     """The right image as the left one is expected to see it, with a margin; and its columns in the right one."""
     height, width = prediction.offset.shape
+    if not prediction.warps:
+        columns = np.arange(right.image.shape[1], dtype=np.int32)
+        return right, np.ascontiguousarray(np.broadcast_to(columns, right.image.shape))
     image = np.empty((height, width + 2 * margin), dtype=np.float32)
     valid = np.empty(image.shape, dtype=np.uint8)
     columns = np.empty(image.shape, dtype=np.int32)

@@ -15,6 +15,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.pair_files import read_pair
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.partners.pairing import as_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, Surface
 from colmap_sph.stereo.vote import depth_candidates, right_disparity
 from rectification_study.found import count_pair, summed
@@ -89,20 +90,24 @@ def pair_files(run: Run) -> dict[tuple[str, str], Path]:
 
 
 def pair_files_of(workspace: Workspace) -> dict[tuple[str, str], Path]:
-    """File of every pair that was matched in a workspace, by the names of its images."""
+    """File of every pair that was matched in a workspace, by the sorted names of its images."""
     found = {}
     for file in sorted((workspace.state_dir / "pairs").glob("*.sph")):
         pair = read_pair(file)
-        found[pair.left, pair.right] = file
+        found[as_pair(pair.left, pair.right)] = file
     return found
 
 
-def pair_depths(left: View, right: View, pair: PairDisparity, options: RunOptions) -> tuple[Map, Map]:
-    """Depth of both images' pixels from their pair alone; 0 = none."""
+def pair_depths(first: View, second: View, pair: PairDisparity, options: RunOptions) -> tuple[Map, Map]:
+    """Depth of both images' pixels from their pair alone, whichever of them is the left one; 0 = none."""
     carried = right_disparity(pair, options.vote.max_disparity_step)
-    left_depth, _ = depth_candidates(left, pair.disparity, pair.geometry, "left", options.vote)
-    right_depth, _ = depth_candidates(right, carried, pair.geometry, "right", options.vote)
-    return left_depth, right_depth
+
+    def depth_of(view: View) -> Map:
+        left = view.name == pair.left
+        disparity = pair.disparity if left else carried
+        return depth_candidates(view, disparity, pair.geometry, "left" if left else "right", options.vote)[0]
+
+    return depth_of(first), depth_of(second)
 
 
 def score_pairs(

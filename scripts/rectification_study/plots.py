@@ -83,8 +83,8 @@ def depth_side_by_side(
     for surface in SURFACES:
         disparity = read_pair(pair_files(runs[surface])[names])
         depths[surface] = pair_depths(left, right, disparity, options)[0]
-        sides: tuple[Side, Side] = ("left", "right")
-        for axes, view, side in zip(panels[SURFACES.index(surface)], (left, right), sides, strict=False):
+        for axes, view in zip(panels[SURFACES.index(surface)], (left, right), strict=False):
+            side: Side = "left" if view.name == disparity.left else "right"
             image = cv2.imread(str(runs[surface].workspace.image_path(view.name)), cv2.IMREAD_GRAYSCALE)
             rectified, valid = resample(np.asarray(image, np.uint8), view, disparity.geometry, side)
             axes.imshow(np.where(valid, rectified, 255), cmap="gray", vmin=0, vmax=255)

@@ -13,7 +13,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from colmap_sph.scene import View
-from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectified_pair import Float
 
 Indices = NDArray[np.int64]
@@ -61,7 +60,7 @@ class ImageTies:
     right: Float
 
 
-def tracks_of_ties(ties: Mapping[Pair, ImageTies], index_of: Mapping[str, int]) -> Tracks:
+def tracks_of_ties(ties: Mapping[tuple[str, str], ImageTies], index_of: Mapping[str, int]) -> Tracks:
     """Join ties at one corner of an image to tracks.
 
     Parameters

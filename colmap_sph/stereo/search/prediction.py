@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.stereo.search.offsets import INVALID, MEDIAN_SIDE, SUBPIXEL
-from colmap_sph.stereo.search.ranges import SPARE, range_depth
+from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, range_depth
 from colmap_sph.stereo.search.seeds import Seeds, interpolated_disparity
 
 # Predictions are the mean of those within this radius that differ by no more than so many pixels: of one surface.
@@ -28,6 +28,11 @@ _CLEARANCE = 4
 _OWN_CLEARANCE = 6
 # Within 3 x 3 pixels of a coarser level, offsets on one surface differ by no more (in pixels of the finer one).
 _MAX_SURFACE_STEP = 4
+# Where less than this share of an image shows surfaces that are steeper than so many pixels of offset per pixel
+# (and no edges), windows look alike without warping, which moves the edges of surfaces a little.
+_STEEP = 0.3
+_EDGE = 2.0
+_FLAT_SHARE = 0.1
 # Steps to which what is interpolated between sparse points is rounded, so that its last bits do not count.
 _SEED_STEPS = 16
 
@@ -47,12 +52,15 @@ class Prediction:
     exact : bool
         Neighbours with the same residual are of one surface, whatever their `base`. Else those are of which
         `first` differs by no more than a slope does, slot by slot: predictions may end where surfaces do.
+    warps : bool
+        Whether the right image is warped by `offset`; else that is zero.
     """
 
     offset: NDArray[np.int32]
     base: NDArray[np.int32]
     depth: int
     exact: bool = False
+    warps: bool = True
 
     @property
     def first(self) -> NDArray[np.int32]:
@@ -62,10 +70,19 @@ class Prediction:
         first += self.base
         return first
 
+    def is_flat(self) -> bool:
+        """Whether hardly any surface is stretched or slanted."""
+        places = self.offset[::2, ::2]
+        across = np.abs(np.diff(places, axis=1)[:-1])
+        slope = np.maximum(across, np.abs(np.diff(places, axis=0)[:, :-1]))
+        surface = int(np.count_nonzero(slope <= 2 * _EDGE * SUBPIXEL))
+        steep = surface - int(np.count_nonzero(slope <= 2 * _STEEP * SUBPIXEL))
+        return steep <= _FLAT_SHARE * surface
+
     @property
     def margin(self) -> int:
         """Columns of a warped image beyond the sides of the reference that are searched from inside of it."""
-        return self.depth if self.exact else self.depth // 2
+        return self.depth if self.warps else 0
 
 
 def from_seeds(seeds: Seeds | None, shape: tuple[int, ...], level: int, low: int, high: int) -> Prediction:
@@ -91,8 +108,10 @@ def from_seeds(seeds: Seeds | None, shape: tuple[int, ...], level: int, low: int
     else:
         predicted = -interpolated_disparity(seeds, shape, 2.0**level)
         predicted = np.clip(np.round(predicted * _SEED_STEPS) / _SEED_STEPS, low, high)
-    offset = _in_steps(predicted)
-    return Prediction(offset, low - SPARE - _nearest_pixel(offset), range_depth(low, high), exact=True)
+    # On either side as many as the range has at most: where predictions slope, residuals reach less far.
+    reach = int(np.ceil(max(high - float(predicted.min()), float(predicted.max()) - low))) + SPARE
+    depth = min(-(-(2 * reach + 1) // STEP) * STEP, MAX_DEPTH)
+    return Prediction(_in_steps(predicted), np.full(shape, -depth // 2, dtype=np.int32), depth, exact=True)
 
 
 def from_coarser(
@@ -139,6 +158,40 @@ def from_coarser(
     base = np.round(shift, out=shift).astype(np.int32)
     del most, least, above, below, both, shift
     return Prediction(_in_steps(predicted), base, depth)
+
+
+def about_coarser(
+    offset: NDArray[np.int32], shape: tuple[int, ...], depth: int, radius: int, low: int, high: int
+) -> Prediction:
+    """What a level searches without warping: about the middle of each neighbourhood's offsets.
+
+    Parameters
+    ----------
+    offset, shape, depth, radius
+        As of `from_coarser`.
+    low, high : int
+        Least and most offset, pixels of the finer level.
+
+    Returns
+    -------
+    Prediction
+    """
+    valid = offset != INVALID
+    if not valid.any():
+        base = np.full(shape, (low + high - depth) // 2, dtype=np.int32)
+        return Prediction(np.zeros_like(base), base, depth, warps=False)
+    filled = _fill_nearest(offset.astype(np.float32) * np.float32(1 / SUBPIXEL), valid)
+    own = np.asarray(cv2.medianBlur(filled, MEDIAN_SIDE), dtype=np.float32)
+    least, most = _neighbourhood(own, radius)
+    fits = 2 * (most - least) <= depth - 2 * _CLEARANCE
+    # A little towards the neighbourhood's middle even where it does not fit.
+    reach = np.float32((depth - 2 * _OWN_CLEARANCE) / 4)
+    middle = (least + most) / 2
+    centre = 2 * np.where(fits, middle, np.clip(middle, own - reach, own + reach))
+    fine = np.round(_upsample(centre, shape) - depth / 2).astype(np.int32)
+    first = low - SPARE
+    base = np.clip(fine, first, max(high + 1 + SPARE - depth, first))
+    return Prediction(np.zeros_like(base), base, depth, warps=False)
 
 
 def searched_depth(low: int, high: int, most: int) -> int:

@@ -24,6 +24,7 @@ _LEAST_ALIKE = 2.0
 # told of none: beyond the outermost seeds little is known.
 _STIFFNESS = 0.125
 _UNKNOWN_STIFFNESS = 0.1
+_MOST_PLACES = 8192
 
 # Images that see their points equally fine, but for this share, stay in the order of their names.
 _EQUALLY_FINE = 1.02
@@ -41,6 +42,7 @@ def finer_first(scene: Scene, first: View, second: View) -> tuple[View, View]:
     image can be stretched, while a finer one would lose pixels.
     """
     points = shared_points(scene, first, second)
+    points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         return first, second
     fineness = [view.K[0, 0] / np.linalg.norm(points - view.center, axis=1) for view in (first, second)]
@@ -61,14 +63,15 @@ def seeds_of_points(left: View, right: View, pair: RectifiedPair, points: Float)
     Returns
     -------
     (m, 3) float32 ndarray
-        Column and row in the left rectified image, and disparity, of the points inside of both images, rounded to
-        quarters of a pixel; at most 256, from all over the points' order.
+        Column and row in the left rectified image, and disparity, of the points inside of both images and of the
+        pair's range, rounded to quarters of a pixel; at most 256, from all over the points' order.
     """
     left_places = _places(left, pair, "left", points)
     right_places = _places(right, pair, "right", points)
     seeds = np.column_stack([left_places, left_places[:, 0] - right_places[:, 0]])
     with np.errstate(invalid="ignore"):
         inside = (np.abs(left_places - _middle(pair, "left")) <= _middle(pair, "left")).all(axis=1)
+        inside &= (seeds[:, 2] >= pair.min_disparity) & (seeds[:, 2] <= pair.max_disparity)
         inside &= (np.abs(right_places - _middle(pair, "right")) <= _middle(pair, "right")).all(axis=1)
     seeds = seeds[inside]
     kept = np.linspace(0, len(seeds) - 1, min(len(seeds), _MOST)).astype(int)
@@ -103,8 +106,8 @@ def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -
     (H, W) float32 ndarray
         Pixels of the level.
     """
-    seeds = seeds.astype(np.float64)
-    columns, rows = ((seeds[:, axis] + 0.5) / scale - 0.5 for axis in (0, 1))
+    exact = np.asarray(seeds, dtype=np.float64)
+    columns, rows = ((exact[:, axis] + 0.5) / scale - 0.5 for axis in (0, 1))
     alike = max(_ALIKE_SHARE * min(shape), _LEAST_ALIKE)
     # Smooth at that distance: planes at the centres of cells half as wide, linear between these.
     cell = max(int(alike / 2), 1)
@@ -112,14 +115,23 @@ def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -
     across, down = np.meshgrid((np.arange(width) + 0.5) * cell - 0.5, (np.arange(height) + 0.5) * cell - 0.5)
     places = np.column_stack([across.ravel(), down.ravel()])
     tree = cKDTree(np.column_stack([columns, rows]))
-    distance, near = tree.query(places, k=np.arange(1, min(_NEIGHBOURS, len(seeds)) + 1))
+    # In parts, as the equations of many places take much memory.
+    parts = np.array_split(places, -(-len(places) // _MOST_PLACES))
+    values = [_planes_at(part, tree, exact[:, 2] / scale, alike) for part in parts]
+    planes = np.concatenate(values).astype(np.float32)
+    fine = cv2.resize(planes.reshape(height, width), (width * cell, height * cell))
+    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
+
+
+def _planes_at(places: Float, tree: cKDTree, disparities: Float, alike: float) -> Float:
+    """Values, at (n, 2) places, of the planes through the seeds around them."""
+    distance, near = tree.query(places, k=np.arange(1, min(_NEIGHBOURS, tree.n) + 1))
     weight = 1 / (distance**2 + alike**2)
-    terms = np.stack([np.ones_like(distance), columns[near] - places[:, :1], rows[near] - places[:, 1:]])
+    beside = np.asarray(tree.data)[near] - places[:, None]
+    terms = np.stack([np.ones_like(distance), beside[..., 0], beside[..., 1]])
     equations = np.einsum("ipk,pk,jpk->pij", terms, weight, terms)
     ridge = weight.sum(axis=1) * (_STIFFNESS * alike**2 + _UNKNOWN_STIFFNESS * distance[:, 0] ** 2)
     equations[:, 1, 1] += ridge
     equations[:, 2, 2] += ridge
-    right_sides = np.einsum("ipk,pk,pk->pi", terms, weight, seeds[near, 2] / scale)
-    planes = np.linalg.solve(equations, right_sides[..., None])[:, 0, 0].astype(np.float32)
-    fine = cv2.resize(planes.reshape(height, width), (width * cell, height * cell))
-    return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
+    right_sides = np.einsum("ipk,pk,pk->pi", terms, weight, disparities[near])
+    return np.asarray(np.linalg.solve(equations, right_sides[..., None])[:, 0, 0])
