@@ -140,7 +140,7 @@ def view(name: str, focal: float, distance: float, indices: list[int]) -> View:
 
 def order(*views: View) -> str:
     points = np.zeros((10, 3))
-    return "".join(one.name for one in finer_first(Scene(views, points), *views))
+    return "".join(one.name for one in finer_first(shared_points(Scene(views, points), *views), *views))
 
 
 def test_shared_points_are_those_that_both_observe() -> None:
@@ -174,5 +174,6 @@ def test_half_of_the_points_decide() -> None:
     for at_second, expected in ((3, "ab"), (6, "ba")):
         points = np.zeros((9, 3))
         points[:at_second, 0] = 20
-        views = finer_first(Scene((first, second), points), first, second)
+        shared = shared_points(Scene((first, second), points), first, second)
+        views = finer_first(shared, first, second)
         assert "".join(one.name for one in views) == expected

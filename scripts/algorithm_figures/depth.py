@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from algorithm_figures.demo import Demo
 from algorithm_figures.drawing import faded, masked, save, show
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
-from colmap_sph.stereo.search.seeds import finer_first
+from colmap_sph.stereo.search.seeds import finer_first, shared_points
 from colmap_sph.stereo.vote import VoteOptions, depth_candidates, right_disparity
 
 NAME = "F_1.jpg"
@@ -29,7 +29,8 @@ def _candidates(demo: Demo, name: str, options: VoteOptions) -> tuple[list[str],
     for first, second in demo.selection.unique_pairs():
         if name not in (first, second):
             continue
-        finer, coarser = finer_first(demo.scene, demo.scene.view(first), demo.scene.view(second))
+        views = demo.scene.view(first), demo.scene.view(second)
+        finer, coarser = finer_first(shared_points(demo.scene, *views), *views)
         pair = demo.rectified(finer.name, coarser.name).as_voter
         is_left = finer.name == name
         disparity = pair.disparity if is_left else right_disparity(pair, options.max_disparity_step)

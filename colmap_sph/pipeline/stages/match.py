@@ -160,9 +160,11 @@ class MatchStage(Stage[Pair, MatchTask]):
     def job(self, item: Pair) -> Job[MatchTask]:
         """See `Stage.job`; `RectificationError` for a pair that cannot be rectified."""
         context = self.context
-        left, right = finer_first(context.scene, *(context.scene.view(name) for name in item))
+        first, second = (context.scene.view(name) for name in item)
+        points = shared_points(context.scene, first, second)
+        left, right = finer_first(points, first, second)
         geometry = self._geometry(left, right)
-        seeds = seeds_of_points(left, right, geometry, shared_points(context.scene, left, right))
+        seeds = seeds_of_points(left, right, geometry, points)
         trial = self._trial(left, right, geometry)
         key = context.keys.pair(left, right, geometry, seeds, trial)
         target = context.pair_path(*item)

@@ -180,8 +180,7 @@ def about_coarser(
     if not valid.any():
         base = np.full(shape, (low + high - depth) // 2, dtype=np.int32)
         return Prediction(np.zeros_like(base), base, depth, warps=False)
-    filled = _fill_nearest(offset.astype(np.float32) * np.float32(1 / SUBPIXEL), valid)
-    own = np.asarray(cv2.medianBlur(filled, MEDIAN_SIDE), dtype=np.float32)
+    own = _median(_fill_nearest(_in_pixels(offset), valid))
     least, most = _neighbourhood(own, radius)
     fits = 2 * (most - least) <= depth - 2 * _CLEARANCE
     # A little towards the neighbourhood's middle even where it does not fit.
@@ -199,30 +198,32 @@ def searched_depth(low: int, high: int, most: int) -> int:
     return min(range_depth(low, high), most)
 
 
-def _nearest_pixel(offset: NDArray[np.int32]) -> NDArray[np.int32]:
-    return (offset + SUBPIXEL // 2) // SUBPIXEL
-
-
 def _in_steps(offset: NDArray[np.float32]) -> NDArray[np.int32]:
     return np.round(offset * SUBPIXEL).astype(np.int32)
+
+
+def _in_pixels(offset: NDArray[np.int32]) -> NDArray[np.float32]:
+    return offset.astype(np.float32) * np.float32(1 / SUBPIXEL)
 
 
 def _filled(offset: NDArray[np.int32], prior: Prediction) -> NDArray[np.float32]:
     """Offsets in pixels, without gaps or single outliers."""
     valid = offset != INVALID
-    predicted = prior.offset.astype(np.float32) * np.float32(1 / SUBPIXEL)
+    predicted = _in_pixels(prior.offset)
     if not valid.any():
         return predicted
-    residual = offset.astype(np.float32) * np.float32(1 / SUBPIXEL) - predicted
-    filled = predicted + _fill_nearest(residual, valid)
-    return np.asarray(cv2.medianBlur(filled, MEDIAN_SIDE), dtype=np.float32)
+    return _median(predicted + _fill_nearest(_in_pixels(offset) - predicted, valid))
+
+
+def _median(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.medianBlur(values, MEDIAN_SIDE), dtype=np.float32)
 
 
 def _mean_on_surfaces(offset: NDArray[np.float32]) -> NDArray[np.float32]:
     steps = _in_steps(offset)
     mean = np.empty_like(steps)
     _native.mean_offsets(steps, _MEAN_RADIUS, _MAX_STEP * SUBPIXEL, mean)
-    return mean.astype(np.float32) * np.float32(1 / SUBPIXEL)
+    return _in_pixels(mean)
 
 
 def _neighbourhood(values: NDArray[np.float32], radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

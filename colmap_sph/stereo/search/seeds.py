@@ -35,13 +35,12 @@ def shared_points(scene: Scene, left: View, right: View) -> Float:
     return scene.points[np.intersect1d(left.point_indices, right.point_indices)]
 
 
-def finer_first(scene: Scene, first: View, second: View) -> tuple[View, View]:
-    """The two views, that which sees their shared points finer before the other.
+def finer_first(points: Float, first: View, second: View) -> tuple[View, View]:
+    """The two views, that which sees the (n, 3) points that they share finer before the other.
 
     Pixels of the left image are looked for in the right one, which is stretched or squeezed to that end: a coarser
     image can be stretched, while a finer one would lose pixels.
     """
-    points = shared_points(scene, first, second)
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points):
         return first, second
@@ -70,9 +69,8 @@ def seeds_of_points(left: View, right: View, pair: RectifiedPair, points: Float)
     right_places = _places(right, pair, "right", points)
     seeds = np.column_stack([left_places, left_places[:, 0] - right_places[:, 0]])
     with np.errstate(invalid="ignore"):
-        inside = (np.abs(left_places - _middle(pair, "left")) <= _middle(pair, "left")).all(axis=1)
+        inside = _inside(pair, "left", left_places) & _inside(pair, "right", right_places)
         inside &= (seeds[:, 2] >= pair.min_disparity) & (seeds[:, 2] <= pair.max_disparity)
-        inside &= (np.abs(right_places - _middle(pair, "right")) <= _middle(pair, "right")).all(axis=1)
     seeds = seeds[inside]
     kept = np.linspace(0, len(seeds) - 1, min(len(seeds), _MOST)).astype(int)
     return np.asarray(np.round(seeds[kept] * _STEPS) / _STEPS, dtype=np.float32)
@@ -85,8 +83,9 @@ def _places(view: View, pair: RectifiedPair, side: Side, points: Float) -> Float
     return coordinates_of_rays(pair, side, rays)
 
 
-def _middle(pair: RectifiedPair, side: Side) -> Float:
-    return np.array([pair.width(side) - 1, pair.height - 1]) / 2
+def _inside(pair: RectifiedPair, side: Side, places: Float) -> NDArray[np.bool_]:
+    middle = np.array([pair.width(side) - 1, pair.height - 1]) / 2
+    return np.asarray((np.abs(places - middle) <= middle).all(axis=1))
 
 
 def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -> NDArray[np.float32]:
