@@ -65,7 +65,7 @@ def score(
     """Counts of every pair that was matched or could not be rectified, with its angle and baseline."""
     maps = pairs.ExactMaps(exact)
     files = pairs.pair_files_of(workspace)
-    names = sorted({*files, *((left, right) for left, _, right in (pair.partition(" - ") for pair in skipped))})
+    names = sorted({*files, *pairs.skipped_pairs(skipped)})
     return [_score_pair(scene, maps, files, pair, options) for pair in names]
 
 

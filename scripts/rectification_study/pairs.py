@@ -1,6 +1,6 @@
 """What each pair's disparity map gives, on both surfaces, for the pixels of the original images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache, lru_cache
 from itertools import pairwise
@@ -17,6 +17,7 @@ from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.partners.pairing import as_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, Surface
+from colmap_sph.stereo.search.seeds import shared_points
 from colmap_sph.stereo.vote import depth_candidates, right_disparity
 from rectification_study.found import count_pair, summed
 from rectification_study.runs import SURFACES, Run
@@ -77,9 +78,9 @@ class ExactMaps:
         return np.where(normals.any(axis=2), angle, np.float32(np.nan))
 
 
-def skipped_pairs(run: Run) -> list[tuple[str, str]]:
-    """Pairs that a run could not rectify, by the names of their images."""
-    parts = [pair.partition(" - ") for pair in run.report["skipped_pairs"]]
+def skipped_pairs(skipped: Iterable[str]) -> list[tuple[str, str]]:
+    """Pairs that a run's report says it could not rectify, by the names of their images."""
+    parts = [pair.partition(" - ") for pair in skipped]
     return [(left, right) for left, _, right in parts]
 
 
@@ -126,7 +127,8 @@ def score_pairs(
         ``median_error_common_gsd``; and, where it was skipped, too, the ``counts`` of `count_pair`.
     """
     maps = ExactMaps(exact)
-    names = sorted({pair for run in runs.values() for pair in (*pair_files(run), *skipped_pairs(run))})
+    skipped = {pair for run in runs.values() for pair in skipped_pairs(run.report["skipped_pairs"])}
+    names = sorted(skipped.union(*(pair_files(run) for run in runs.values())))
 
     def score(pair: tuple[str, str]) -> PairScores:
         views = scene.view(pair[0]), scene.view(pair[1])
@@ -155,7 +157,7 @@ def score_pairs(
 
 def _geometry_of(scene: Scene, left: View, right: View) -> dict[str, float]:
     cosine = float(np.clip(left.viewing_direction @ right.viewing_direction, -1, 1))
-    both = scene.points[np.intersect1d(left.point_indices, right.point_indices)]
+    both = shared_points(scene, left, right)
     rays = [both - view.center for view in (left, right)]
     first, second = (ray / np.linalg.norm(ray, axis=1, keepdims=True) for ray in rays)
     angles = np.arccos(np.clip(np.sum(first * second, axis=1), -1, 1))
