@@ -33,11 +33,11 @@ if TYPE_CHECKING:
     from colmap_sph.scene import Scene as Scene
     from colmap_sph.scene import View as View
     from colmap_sph.stereo.anchor import anchored as anchored
+    from colmap_sph.stereo.census import RectifiedImage as RectifiedImage
     from colmap_sph.stereo.confirm import ConfirmOptions as ConfirmOptions
     from colmap_sph.stereo.confirm import confirm_depth as confirm_depth
     from colmap_sph.stereo.fusion import FusionOptions as FusionOptions
     from colmap_sph.stereo.matching import MatchingOptions as MatchingOptions
-    from colmap_sph.stereo.matching import RectifiedImage as RectifiedImage
     from colmap_sph.stereo.matching import match_pair as match_pair
     from colmap_sph.stereo.normals import NormalOptions as NormalOptions
     from colmap_sph.stereo.normals import fit_normals as fit_normals
@@ -65,7 +65,7 @@ _MODULE_OF = {
     "Progress": "pipeline.report",
     "Project": "project.project",
     "RectificationOptions": "stereo.rectification",
-    "RectifiedImage": "stereo.matching",
+    "RectifiedImage": "stereo.census",
     "RefinementOptions": "stereo.refinement",
     "RunOptions": "pipeline.options",
     "RunReport": "pipeline.report",

@@ -28,7 +28,8 @@ import numpy as np
 from benchmarking import machine, table
 from numpy.typing import NDArray
 
-from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.census import RectifiedImage
+from colmap_sph.stereo.matching import SINGLE_PAIR, MatchingOptions, match_pair
 
 Image = NDArray[np.uint8]
 _BLOCK = 3

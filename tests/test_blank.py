@@ -13,7 +13,8 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.blank import blank_pixels
-from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.census import RectifiedImage
+from colmap_sph.stereo.matching import MatchingOptions, match_pair
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
 DETAIL = syn.Noise(0.025, seed=3)

@@ -7,8 +7,9 @@ import pytest
 from rendered import SIDES, grey, scene_of
 
 from colmap_sph import synthetic as syn
+from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
-from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.matching import MatchingOptions, match_pair
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity

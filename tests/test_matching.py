@@ -14,12 +14,12 @@ from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.stages.match import _MATCH_BYTES
-from colmap_sph.stereo import matching
+from colmap_sph.stereo import census
+from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.matching import (
     SINGLE_PAIR,
     MatchingOptions,
-    RectifiedImage,
     Scratch,
     match_pair,
     scratch_bytes,
@@ -146,9 +146,7 @@ def test_a_pair_alone_is_matched_more_completely_and_smoothly(name):
 
 def test_sharpened_images_are_matched_wrong_less_often(monkeypatch):
     wrong = [[(np.abs(matched_scene(name).error) > 1).sum() for name in SCENES]]
-    monkeypatch.setattr(
-        matching, "_UNSHARP", matching._CENSUS_STEPS * np.outer((0, 1, 0), (0, 1, 0)).astype(float)
-    )
+    monkeypatch.setattr(census, "_UNSHARP", census._STEPS * np.outer((0, 1, 0), (0, 1, 0)).astype(float))
     wrong.append([(np.abs(Matched(scene).error) > 1).sum() for scene in SCENES.values()])
     assert sum(wrong[0]) < sum(wrong[1])
 

@@ -9,7 +9,6 @@ column minus reference column; with the left image as reference it is minus the 
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -17,21 +16,21 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
+from colmap_sph.stereo.census import RectifiedImage, census, pyramid
 from colmap_sph.stereo.kernels import backend
-from colmap_sph.stereo.resampling import half_size
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
-from colmap_sph.stereo.search.prediction import Prediction, about_coarser, from_coarser, from_seeds, searched_depth
+from colmap_sph.stereo.search.prediction import (
+    Prediction,
+    about_coarser,
+    from_coarser,
+    from_seeds,
+    searched_depth,
+    with_tears,
+)
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
 from colmap_sph.stereo.search.seeds import Seeds
+from colmap_sph.stereo.search.target import make_target
 
-_CENSUS_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
-# Census compares 1/64 grey values, see CENSUS_MARGIN in `matching.h`: on weak texture, whole ones are too coarse.
-_CENSUS_STEPS = 64
-# Unsharp masking, which gives back some of what lenses and resampling took away: so much of the difference from
-# the binomial mean of 3 x 3 pixels is added.
-_SHARPENING = 0.6
-_BINOMIAL = np.outer((1, 2, 1), (1, 2, 1)) / 16
-_UNSHARP = _CENSUS_STEPS * ((1 + _SHARPENING) * np.outer((0, 1, 0), (0, 1, 0)) - _SHARPENING * _BINOMIAL)
 _BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
 # Segments of fewer pixels than this are removed at every level, however coarse.
 _LEAST_SEGMENT = 4
@@ -40,8 +39,6 @@ _LEAST_SEGMENT = 4
 _NEAR_RANGE = 0.1
 # What poses that are not exact may add to the disparity of what is infinitely far away, pixels.
 _POSE_ERROR = 4
-_CONTENT = np.uint8(255)  # where an image has content, in masks; a level's pixel has where half of its four have
-_HALF_CONTENT = 128
 
 
 @dataclass(frozen=True)
@@ -155,14 +152,6 @@ def scratch_bytes(pixels: int, options: MatchingOptions) -> int:
     return _BYTES_PER_SLOT * pixels * max(options.disparities, options.coarse_disparities // 4)
 
 
-@dataclass(frozen=True, eq=False)
-class RectifiedImage:
-    """One image of a rectified pair: (H, W) float32 grey values (0..255), and 255 where they are image content."""
-
-    image: NDArray[np.float32]
-    valid: NDArray[np.uint8]
-
-
 def match_pair(
     left: RectifiedImage,
     right: RectifiedImage,
@@ -224,8 +213,8 @@ def match_pair(
     sky = _sky_offset(min_disparity, max_disparity, infinity)
     if sky is not None:
         most = int(np.ceil(sky)) + _POSE_ERROR
-    lefts = _pyramid(left, levels)
-    rights = _pyramid(right, levels)
+    lefts = pyramid(left, levels)
+    rights = pyramid(right, levels)
     del left, right  # each level goes when it has been matched
     offset: NDArray[np.int32] | None = None
     for level in range(levels, -1, -1):
@@ -238,8 +227,8 @@ def match_pair(
         else:
             prediction = from_coarser(offset, prediction, shape, depth, options.range_radius)
             np.clip(prediction.offset, low * SUBPIXEL, high * SUBPIXEL, out=prediction.offset)
-            if prediction.is_flat():
-                prediction = about_coarser(offset, shape, depth, options.range_radius, low, high)
+            unwarped = about_coarser(offset, shape, depth, options.range_radius, low, high)
+            prediction = unwarped if prediction.is_flat() else with_tears(prediction, unwarped)
         offset = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
         _drop_outside(offset, low - SPARE, max(high + SPARE, low - SPARE + depth - 1))
         if sky is not None:
@@ -277,34 +266,6 @@ def _drop_beyond(offset: NDArray[np.int32], farthest: int, sky: float, level: in
     offset[beyond] = INVALID
 
 
-def _pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
-    """Full resolution first. Odd rows and columns are doubled, so that pixel x of a level covers 2x, 2x + 1."""
-    pyramid = [image]
-    for _ in range(levels):
-        pixels = half_size(pyramid[-1].image)
-        valid = pyramid[-1].valid
-        height, width = valid.shape
-        if height % 2 or width % 2:
-            valid = _with_border(valid, (0, height % 2, 0, width % 2), cv2.BORDER_CONSTANT)
-        coarse_valid = cv2.resize(valid, pixels.shape[::-1], interpolation=cv2.INTER_AREA)
-        pyramid.append(RectifiedImage(pixels, np.where(coarse_valid >= _HALF_CONTENT, _CONTENT, np.uint8(0))))
-    return pyramid
-
-
-def _with_border(image: NDArray[Any], border: tuple[int, int, int, int], kind: int) -> NDArray[Any]:
-    """The image with rows and columns added at its top, bottom, left and right."""
-    return np.asarray(cv2.copyMakeBorder(image, *border, kind, value=0))
-
-
-def _census(image: RectifiedImage) -> NDArray[np.uint64]:
-    # Sharpened with its border, which a warped image has inside.
-    padded = _with_border(image.image, _CENSUS_BORDER, cv2.BORDER_REPLICATE)
-    padded = cv2.filter2D(padded, cv2.CV_32F, _UNSHARP, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
-    census = np.empty(image.image.shape, dtype=np.uint64)
-    _native.census(backend(), padded, np.ascontiguousarray(image.valid), census)
-    return census
-
-
 def _match_level(
     left: RectifiedImage,
     right: RectifiedImage,
@@ -316,22 +277,18 @@ def _match_level(
 ) -> NDArray[np.int32]:
     """Offsets of one level, 1/256 pixel; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
-    margin = prediction.margin
-    source_width = right.image.shape[1]
-    right, columns = _warped(right, prediction, margin)
-    right_census = _census(right)
-    del right
-    left_census = _census(left)
+    target = make_target(right, prediction)
+    left_census = census(left)
     image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
-    del left
+    del left, right
     offset = np.empty(image.shape, dtype=np.int32)
     _native.match(
         kernels,
         left_census,
-        right_census,
-        columns,
-        source_width,
-        prediction.base + np.int32(margin),
+        target.census,
+        target.columns,
+        target.right_width,
+        target.base,
         prediction.base if prediction.exact else prediction.first,
         image,
         options.p1,
@@ -344,34 +301,9 @@ def _match_level(
     )
     if finest:
         fitted = np.empty_like(offset)
-        _native.fit_offsets(kernels, offset, left_census, right_census, fitted)
+        _native.fit_offsets(kernels, offset, left_census, target.census, fitted)
         offset = fitted
-    unwarped = np.empty_like(offset)
-    _native.unwarp_offsets(offset, prediction.offset, margin, unwarped)
-    return unwarped
-
-
-def _warped(
-    right: RectifiedImage, prediction: Prediction, margin: int
-) -> tuple[RectifiedImage, NDArray[np.int32]]:
-    """The right image as the left one is expected to see it, with a margin; and its columns in the right one."""
-    height, width = prediction.offset.shape
-    if not prediction.warps:
-        columns = np.arange(right.image.shape[1], dtype=np.int32)
-        return right, np.ascontiguousarray(np.broadcast_to(columns, right.image.shape))
-    image = np.empty((height, width + 2 * margin), dtype=np.float32)
-    valid = np.empty(image.shape, dtype=np.uint8)
-    columns = np.empty(image.shape, dtype=np.int32)
-    _native.warp(
-        np.ascontiguousarray(right.image),
-        np.ascontiguousarray(right.valid),
-        prediction.offset,
-        margin,
-        image,
-        valid,
-        columns,
-    )
-    return RectifiedImage(image, valid), columns
+    return target.offsets_to_right(offset)
 
 
 def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:

@@ -15,8 +15,9 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.depth import DepthEstimate
-from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, match_pair
+from colmap_sph.stereo.matching import MatchingOptions, match_pair
 from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, pixel_from_rectified_ray

@@ -24,7 +24,8 @@ from colmap_sph.project.state.array_file import OLD_SUFFIX
 from colmap_sph.project.state.ownership import remove_array_files
 from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
-from colmap_sph.stereo.matching import MatchingOptions, RectifiedImage, Scratch, match_pair, scratch_bytes
+from colmap_sph.stereo.census import RectifiedImage
+from colmap_sph.stereo.matching import MatchingOptions, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair, as_pair
 from colmap_sph.stereo.poses.ties import Ties, find_ties, row_residual, tolerable_sampling
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of

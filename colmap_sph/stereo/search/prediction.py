@@ -8,7 +8,7 @@ windows that are compared show the same. Offsets are those of `offsets`; *residu
 predicted ones by.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -33,6 +33,10 @@ _MAX_SURFACE_STEP = 4
 _STEEP = 0.3
 _EDGE = 2.0
 _FLAT_SHARE = 0.1
+# Steps of the prediction from pixel to pixel that are larger than so many pixels tear windows apart, as far from
+# them as a window reaches.
+_TEAR = 3
+_TORN_RADIUS = 4
 # Steps to which what is interpolated between sparse points is rounded, so that its last bits do not count.
 _SEED_STEPS = 16
 
@@ -54,6 +58,8 @@ class Prediction:
         `first` differs by no more than a slope does, slot by slot: predictions may end where surfaces do.
     warps : bool
         Whether the right image is warped by `offset`; else that is zero.
+    torn : (H, W) bool ndarray, optional
+        Where the prediction tears windows apart: there the right image is searched as it is, from offset `base`.
     """
 
     offset: NDArray[np.int32]
@@ -61,6 +67,7 @@ class Prediction:
     depth: int
     exact: bool = False
     warps: bool = True
+    torn: NDArray[np.bool_] | None = None
 
     @property
     def first(self) -> NDArray[np.int32]:
@@ -68,7 +75,7 @@ class Prediction:
         first = self.offset + np.int32(SUBPIXEL // 2)
         first //= SUBPIXEL
         first += self.base
-        return first
+        return first if self.torn is None else np.where(self.torn, self.base, first)
 
     def is_flat(self) -> bool:
         """Whether hardly any surface is stretched or slanted."""
@@ -191,6 +198,30 @@ def about_coarser(
     first = low - SPARE
     base = np.clip(fine, first, max(high + 1 + SPARE - depth, first))
     return Prediction(np.zeros_like(base), base, depth, warps=False)
+
+
+def with_tears(warped: Prediction, unwarped: Prediction) -> Prediction:
+    """The one prediction, and near its steps the other.
+
+    Parameters
+    ----------
+    warped, unwarped : Prediction
+        Of the same pixels, from `from_coarser` and `about_coarser`.
+
+    Returns
+    -------
+    Prediction
+    """
+    steps = np.zeros(warped.offset.shape, dtype=np.uint8)
+    across, down = (np.abs(np.diff(warped.offset, axis=axis)) > _TEAR * SUBPIXEL for axis in (1, 0))
+    steps[:, 1:] |= across
+    steps[:, :-1] |= across
+    steps[1:] |= down
+    steps[:-1] |= down
+    torn = cv2.dilate(steps, np.ones((2 * _TORN_RADIUS + 1,) * 2, dtype=np.uint8)) > 0
+    if not torn.any():
+        return warped
+    return replace(warped, base=np.where(torn, unwarped.base, warped.base), torn=torn)
 
 
 def searched_depth(low: int, high: int, most: int) -> int:
