@@ -29,7 +29,7 @@ from colmap_sph.stereo.search.prediction import (
 )
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
 from colmap_sph.stereo.search.seeds import Seeds
-from colmap_sph.stereo.search.target import make_target
+from colmap_sph.stereo.search.target import Matches, make_target
 
 _BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
 # Segments of fewer pixels than this are removed at every level, however coarse.
@@ -229,7 +229,13 @@ def match_pair(
             np.clip(prediction.offset, low * SUBPIXEL, high * SUBPIXEL, out=prediction.offset)
             unwarped = about_coarser(offset, shape, depth, options.range_radius, low, high)
             prediction = unwarped if prediction.is_flat() else with_tears(prediction, unwarped)
-        offset = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
+        unseeded: Matches | None = None
+        if offset is None and level > 0 and seeds is not None and len(seeds):
+            whole_range = from_seeds(None, shape, level, low, high)
+            unseeded = _match_level(lefts[-1], rights[-1], whole_range, options, scratch, finest=False)
+        matches = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
+        offset = matches.offset if unseeded is None else matches.or_better(unseeded)
+        del matches, unseeded
         _drop_outside(offset, low - SPARE, max(high + SPARE, low - SPARE + depth - 1))
         if sky is not None:
             _drop_beyond(offset, farthest, sky, level)
@@ -274,8 +280,8 @@ def _match_level(
     scratch: Scratch,
     *,
     finest: bool,
-) -> NDArray[np.int32]:
-    """Offsets of one level, 1/256 pixel; those of the finest with a sub-pixel fit to the raw costs."""
+) -> Matches:
+    """Matches of one level; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
     target = make_target(right, prediction)
     left_census = census(left)
@@ -303,7 +309,7 @@ def _match_level(
         fitted = np.empty_like(offset)
         _native.fit_offsets(kernels, offset, left_census, target.census, fitted)
         offset = fitted
-    return target.offsets_to_right(offset)
+    return Matches(target, left_census, offset)
 
 
 def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:

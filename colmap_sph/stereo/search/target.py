@@ -6,14 +6,23 @@ image as it is, whose columns follow those of the warped one in the same row.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.stereo.census import CENSUS_INVALID, RectifiedImage, census
+from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
 from colmap_sph.stereo.search.prediction import Prediction
+from colmap_sph.stereo.search.ranges import STEP
+
+# Side of the windows whose mean costs are compared, and by how many bits another match must be better than ours
+# where they are more than a pixel apart.
+_WINDOW = 7
+_BETTER = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +64,52 @@ class Target:
         return unwarped
 
 
+@dataclass(frozen=True, eq=False)
+class Matches:
+    """What the left image's pixels match.
+
+    Attributes
+    ----------
+    target : Target
+    left_census : (H, W) uint64 ndarray
+    target_offset : (H, W) int32 ndarray
+        Offsets to columns of the target, 1/256 pixel; `INVALID` where nothing was found.
+    """
+
+    target: Target
+    left_census: NDArray[np.uint64]
+    target_offset: NDArray[np.int32]
+
+    @cached_property
+    def offset(self) -> NDArray[np.int32]:
+        """(H, W) int32 offsets to columns of the right image, 1/256 pixel."""
+        return self.target.offsets_to_right(self.target_offset)
+
+    def or_better(self, others: "Matches") -> NDArray[np.int32]:
+        """Return `offset`, or that of `others` where both tell, and windows differ less there.
+
+        Where sparse points predict a slanted surface, windows on it look alike; those on an object in front that
+        has no such point look the more different, and like themselves without a prediction.
+        """
+        better = np.abs(self.offset - others.offset) > SUBPIXEL
+        better &= (self.offset != INVALID) & (others.offset != INVALID)
+        better &= others._window_costs() < self._window_costs() - _BETTER
+        return np.where(better, others.offset, self.offset)
+
+    def _window_costs(self) -> NDArray[np.float32]:
+        """Mean cost of the matches in the window around each pixel, bits."""
+        found = self.target_offset != INVALID
+        nearest = (np.where(found, self.target_offset, 0) + SUBPIXEL // 2) // SUBPIXEL
+        costs = np.empty((*found.shape, STEP), dtype=np.uint8)
+        _native.matching_cost(backend(), self.left_census, self.target.census, nearest.astype(np.int32), costs)
+        cost = np.where(found, costs[..., 0], 0).astype(np.float32)
+        sums, numbers = (
+            cv2.boxFilter(values, cv2.CV_32F, (_WINDOW, _WINDOW), normalize=False)
+            for values in (cost, found.astype(np.float32))
+        )
+        return np.asarray(sums / np.maximum(numbers, 1), dtype=np.float32)
+
+
 def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     """Warp a level's right image as predicted.
 
@@ -84,12 +139,14 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     # Windows of torn pixels that begin left of the right image must not reach what lies before it here.
     gap = prediction.depth
     as_it_is = words.shape[1] + gap
-    unseen = np.full((height, gap), CENSUS_INVALID)
-    words = np.concatenate([words, unseen, census(right)], axis=1)
+    both = np.full((height, as_it_is + right_width), CENSUS_INVALID)
+    both[:, : words.shape[1]] = words
+    del words  # the widest arrays of a level, one at a time
+    both[:, as_it_is:] = census(right)
     columns = np.concatenate([columns, np.full((height, gap), -1, dtype=np.int32), own_columns], axis=1)
     nearest = -gap - np.arange(torn.shape[1], dtype=np.int32)
     np.copyto(base, np.maximum(prediction.base, nearest) + np.int32(as_it_is), where=torn)
-    return Target(words, columns, base, right_width, as_it_is, prediction)
+    return Target(both, columns, base, right_width, as_it_is, prediction)
 
 
 def _warped(right: RectifiedImage, prediction: Prediction) -> tuple[RectifiedImage, NDArray[np.int32]]:
