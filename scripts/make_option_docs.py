@@ -25,6 +25,7 @@ def page() -> str:
     plain, *stages = option_groups(RunCommand)
     known = {option.flag: option for group in (plain, *stages) for option in group.options}
     parts = [_HEAD, "## Everyday options", _table([known[flag] for flag in EVERYDAY])]
+    parts += ["## The run", _table([option for option in plain.options if option.flag not in EVERYDAY])]
     for group in stages:
         rest = [option for option in group.options if option.flag not in EVERYDAY]
         if rest:

@@ -57,7 +57,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
         for word in ("N_0_0.jpg", "coverage", "<= 1 GSD", "fused.ply", "acc 1 GSD", "comp 1 GSD"):
             assert word in output
     log = (tmp_path / "demo/dense/colmap_sph/log.txt").read_text()
-    assert log.count("DemoCommand(") == 2
+    assert log.count(f"colmap_sph demo --output {tmp_path}/demo --threads 2") == 2
     assert "Match pairs" in log
 
 

@@ -62,6 +62,11 @@ class Project:
             )
 
     @property
+    def is_named(self) -> bool:
+        """Whether it says which dense workspace it is of."""
+        return any(path is not None for path in (self.workspace, self.output, self.model))
+
+    @property
     def root(self) -> Path:
         """Folder of the dense workspace, of a project without contradictions."""
         if self.workspace is not None:
