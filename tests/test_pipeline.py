@@ -204,7 +204,7 @@ def test_a_run_can_be_repeated(project: Path) -> None:
     assert results(dense) == before
     assert (dense / "images" / NADIR[0]).stat() == image
     smaller = replace(FEW_PAIRS, undistortion=UndistortionOptions(max_image_size=200))
-    with pytest.raises(InputError, match="different options"):
+    with pytest.raises(InputError, match="made with --max-image-size -1, not 200"):
         colmap_sph.run(model, options=smaller)
     assert results(dense) == before
 

@@ -148,8 +148,8 @@ def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[s
     print_summary(result.report, result.workspace, terminal)
     terminal.say("")
     terminal.say("in pixels on the ground (GSD)", label="Against exact depth,", style="bold")
-    terminal.say_lines(format_depth_maps(result.depth_maps))
-    terminal.say_lines(format_clouds([result.cloud]))
+    terminal.say_lines(format_depth_maps(result.depth_maps, terminal.width))
+    terminal.say_lines(format_clouds([result.cloud], terminal.width))
     return 0
 
 
