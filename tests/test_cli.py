@@ -80,6 +80,7 @@ EVERYDAY = [
     "masks",
     "output",
     "workspace",
+    "quality",
     "max-image-size",
     "num-pairs",
     "threads",

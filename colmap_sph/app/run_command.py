@@ -24,6 +24,7 @@ from colmap_sph.app.spelling import EVERYDAY
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
+from colmap_sph.pipeline.presets import Quality
 from colmap_sph.pipeline.reconstruct import check_input, run_project
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.project.project import Project
@@ -49,6 +50,8 @@ class RunCommand:
     options: Annotated[RunOptions, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = field(
         default_factory=RunOptions
     )
+    quality: Quality = "normal"
+    """Preview takes a quarter of the time of normal, best about twice as much. Options given beside it win."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only say what is to do, and about how much time, memory and disk it takes. Nothing is written."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False

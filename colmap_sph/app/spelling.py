@@ -16,6 +16,7 @@ EVERYDAY = (
     "--masks",
     "--output",
     "--workspace",
+    "--quality",
     "--max-image-size",
     "--num-pairs",
     "--threads",

@@ -24,8 +24,7 @@ class Project:
     """Masks: a.jpg.png or a.png for image a.jpg, with its folders; black = ignored. Of the original images, or
     with --workspace of the undistorted ones."""
     output: Path | None = None
-    """Dense workspace to create. Default: the folder `dense` beside the model's `sparse`; of sparse/1 and so on
-    the folder `dense-1`."""
+    """Dense workspace to create. Default: `dense` beside `sparse`, for sparse/1 `dense-1`."""
     workspace: Path | None = None
     """Existing dense workspace, instead of --model, --images and --output."""
 
