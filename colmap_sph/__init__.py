@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from colmap_sph.errors import ColmapSphError as ColmapSphError
     from colmap_sph.pipeline.options import RunOptions as RunOptions
+    from colmap_sph.pipeline.presets import preset as preset
     from colmap_sph.pipeline.reconstruct import reconstruct as reconstruct
     from colmap_sph.pipeline.reconstruct import run as run
     from colmap_sph.pipeline.reconstruct import run_project as run_project
@@ -78,6 +79,7 @@ _MODULE_OF = {
     "confirm_depth": "stereo.confirm",
     "fit_normals": "stereo.normals",
     "match_pair": "stereo.matching",
+    "preset": "pipeline.presets",
     "read_depth_map": "project.map_files",
     "read_grey": "project.images.reading",
     "read_normal_map": "project.map_files",

@@ -52,7 +52,7 @@ def _command() -> int:
     try:
         code = cli.main()
     except SystemExit as stop:  # the parser, after help or a mistake
-        code = stop.code if isinstance(stop.code, int) else 2
+        code = 0 if stop.code is None else stop.code if isinstance(stop.code, int) else 2
     try:
         sys.stdout.flush()
     except BrokenPipeError:

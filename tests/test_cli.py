@@ -80,6 +80,7 @@ EVERYDAY = [
     "masks",
     "output",
     "workspace",
+    "quality",
     "max-image-size",
     "num-pairs",
     "threads",
@@ -195,8 +196,9 @@ def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # The log file.
     log = (small / "dense/colmap_sph/log.txt").read_text().splitlines()
     assert all(re.match(r"20\d\d-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} INFO colmap_sph\.[\w.]+: ", line) for line in log)
-    assert f"colmap_sph {colmap_sph.__version__}: RunCommand(" in log[0]
-    assert "max_reproj_error=1" in log[0]
+    typed = f"run --model sparse/0 {' '.join(FAST)} --fusion.max-reproj-error 1"
+    assert log[0].endswith(f"colmap_sph {colmap_sph.__version__}: cd {small} && colmap_sph {typed}")
+    assert "RunCommand(" in log[1] and "max_reproj_error=1" in log[1]
     assert any("Undistorted 3 of 3 images" in line for line in log)
     assert any("3 pairs of 3 images" in line for line in log)
     assert "Fuse: " in log[-1]
@@ -212,7 +214,7 @@ def test_the_log_of_a_second_run_follows_the_first(small: Path, capsys: pytest.C
     log = (small / "dense/colmap_sph/log.txt").read_text()
     assert log.startswith(first)
     added = log.removeprefix(first)
-    assert "workspace=" in added.splitlines()[0]
+    assert added.splitlines()[0].endswith(" run --workspace dense --min-shared-points 100000")
     assert "Stopped: No pair of images overlaps" in added
     assert "Traceback" not in added
 

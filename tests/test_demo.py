@@ -1,5 +1,7 @@
 """The built-in example on a small block: what it gives, and what it says."""
 
+import json
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,6 +16,7 @@ from colmap_sph.errors import OutputError
 from colmap_sph.evaluation import mean_of_depth_maps
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.stereo.partners.pairs import PairOptions
+from colmap_sph.synthetic import BlockOptions
 
 TINY = replace(SMALL_BLOCK, strips=1, strip_images=3, oblique_images=0, supersample=1, width=240, height=180)
 TWO_PAIRS = RunOptions(threads=2, pairs=PairOptions(num_pairs=2))
@@ -57,7 +60,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeyp
         for word in ("N_0_0.jpg", "coverage", "<= 1 GSD", "fused.ply", "acc 1 GSD", "comp 1 GSD"):
             assert word in output
     log = (tmp_path / "demo/dense/colmap_sph/log.txt").read_text()
-    assert log.count("DemoCommand(") == 2
+    assert log.count(f"colmap_sph demo --output {tmp_path}/demo --threads 2") == 2
     assert "Match pairs" in log
 
 
@@ -125,3 +128,24 @@ def test_a_demo_follows_no_link_out_of_its_folder(place: str, tmp_path: Path) ->
     with pytest.raises(OutputError, match=f"{place} is a link to {elsewhere}"):
         run_demo(tmp_path / "demo", block=TINY)
     assert not list(elsewhere.iterdir())
+
+
+def test_its_truth_can_be_given_to_evaluate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command of the documentation says what the demo itself says, up to what interpolation of depth costs."""
+    result = run_demo(tmp_path / "demo", options=TWO_PAIRS, block=TINY)
+    monkeypatch.chdir(tmp_path)
+    text = (Path(__file__).parents[1] / "docs/usage.md").read_text(encoding="utf-8")
+    (command,) = re.findall(r"^colmap_sph (evaluate demo/.*)$", text, re.MULTILINE)
+    gsd = str(TINY.nadir_gsd)
+    assert command.endswith(f"--gsd {BlockOptions().nadir_gsd}")
+    assert cli.main([*command.split()[:-1], gsd, "--register", "False", "--json", "scores.json"]) == 0
+    scores = json.loads(Path("scores.json").read_text())
+    assert list(scores["depth_maps"]["images"]) == list(result.depth_maps)
+    for name, mine in result.depth_maps.items():
+        found = scores["depth_maps"]["images"][name]
+        assert found["coverage"] == pytest.approx(mine.coverage, abs=0.02)
+        assert found["within"][1] == pytest.approx(mine.within[1], abs=0.02)
+    (cloud,) = scores["clouds"]
+    assert cloud["point_count"] == result.cloud.point_count
+    f_scores = [threshold["f_score"] for threshold in cloud["thresholds"]]
+    assert f_scores == pytest.approx([threshold.f_score for threshold in result.cloud.thresholds], abs=0.02)

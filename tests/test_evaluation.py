@@ -2,6 +2,7 @@
 
 import json
 import math
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -264,3 +265,18 @@ def test_map_coordinates_against_a_local_model_say_what_to_do():
     degrees = PointCloud("lidar.laz", plane(), crs="geographic (WGS 84)")
     with pytest.raises(InputError, match="reproject"):
         evaluate_cloud(cloud, make_reference(degrees, FIXED), FIXED)
+
+
+@pytest.mark.parametrize("width", [40, 60, 100, 146])
+def test_tables_fit_a_width(width: int) -> None:
+    """Columns that find no room stand below; none is lost, and each has its row's name."""
+    scores = [scores_of(plane(), plane()), scores_of(plane() + np.array([0, 0, 0.1]), plane())]
+    text = format_clouds(scores, width)
+    wide = format_clouds(scores).split("\n\n")[1].splitlines()
+    tables = text.split("\n\n")[1:-1]
+    assert all(len(line) <= width for table in tables for line in table.splitlines())
+    columns = [re.split(r" {2,}", line) for line in wide]
+    for row, cells in enumerate(columns):
+        parts = [re.split(r" {2,}", table.splitlines()[row]) for table in tables]
+        assert {part[0] for part in parts} == {cells[0]}
+        assert [cell for part in parts for cell in part[1:]] == cells[1:]

@@ -22,6 +22,7 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import with_good_images
+from colmap_sph.pipeline.report import Silent
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import _MATCH_BYTES, MatchStage
@@ -174,18 +175,21 @@ def test_stages_one_by_one(project: Path) -> None:
 
 
 def test_progress_tells_every_step(project: Path) -> None:
-    class Steps(list):
-        def start(self, stage: str, total: int) -> None:
-            self.append([stage, total, 0])
+    class Steps(Silent):
+        def __init__(self) -> None:
+            self.told: list = []
 
-        def advance(self) -> None:
-            self[-1][2] += 1
+        def start(self, stage: str, total: int) -> None:
+            self.told.append([stage, total, 0])
+
+        def advance(self, seconds: float = 0.0) -> None:
+            self.told[-1][2] += 1
 
     keep_images(project, NADIR)
     steps = Steps()
     colmap_sph.run(project / "sparse/0", options=FEW_PAIRS, progress=steps)
-    assert all(total == done for _, total, done in steps)
-    assert {stage: total for stage, total, _ in steps}["vote on depth"] == len(NADIR)
+    assert all(total == done for _, total, done in steps.told)
+    assert {stage: total for stage, total, _ in steps.told}["vote on depth"] == len(NADIR)
 
 
 def test_a_run_can_be_repeated(project: Path) -> None:
@@ -200,7 +204,7 @@ def test_a_run_can_be_repeated(project: Path) -> None:
     assert results(dense) == before
     assert (dense / "images" / NADIR[0]).stat() == image
     smaller = replace(FEW_PAIRS, undistortion=UndistortionOptions(max_image_size=200))
-    with pytest.raises(InputError, match="different options"):
+    with pytest.raises(InputError, match="made with --max-image-size -1, not 200"):
         colmap_sph.run(model, options=smaller)
     assert results(dense) == before
 

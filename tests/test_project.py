@@ -30,7 +30,10 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ("model", "expected"),
     [
         ("project/sparse/0", "project/dense"),
-        ("project/sparse/12", "project/dense"),
+        ("project/sparse/12", "project/dense-12"),
+        ("project/sparse/1", "project/dense-1"),
+        ("project/sparse/00", "project/dense"),
+        ("project/sparse/best", "project/sparse/best/dense"),
         ("project/sparse", "project/dense"),
         ("2024/sparse/0", "2024/dense"),
         ("2024", "dense"),

@@ -433,7 +433,7 @@ def test_overwrite_does_everything_again(finished: Finished) -> None:
 
 def test_overwrite_takes_other_undistortion_options(finished: Finished) -> None:
     smaller = replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=100))
-    with pytest.raises(InputError, match=r"different options; .*--overwrite"):
+    with pytest.raises(InputError, match=r"made with --max-image-size -1, not 100; .*--overwrite"):
         colmap_sph.run(finished.project / "sparse/0", options=smaller)
     colmap_sph.run(finished.project / "sparse/0", options=smaller, overwrite=True)
     assert {view.width for view in read_scene(finished.dense / "sparse").views} == {100}

@@ -12,11 +12,12 @@ from pathlib import Path
 
 import pytest
 from conftest import keep_images
+from rich.cells import cell_len
 
 from colmap_sph.app import cli, display, run_command
 from colmap_sph.app.display import Display
 from colmap_sph.app.log_file import workspace_log
-from colmap_sph.app.terminal import Terminal, warnings_shown
+from colmap_sph.app.terminal import Terminal, shortened, warnings_shown, wrapped
 from colmap_sph.errors import OutputError, printable
 from colmap_sph.project.workspace import Workspace
 
@@ -200,6 +201,56 @@ def test_files_get_no_bars_boxes_or_colours(
         "caption",
         "error: words",
     ]
+
+
+# ---- narrow terminals --------------------------------------------------------------------------------------
+
+
+def test_lists_break_between_their_parts() -> None:
+    assert wrapped("12.5 (match pairs 10.0, vote on depth 2.0, fuse 0.5)", 24) == [
+        "12.5 (match pairs 10.0,",
+        "vote on depth 2.0,",
+        "fuse 0.5)",
+    ]
+    assert wrapped("one two three four", 9) == ["one two", "three", "four"]
+    path = "/data/" + "long/" * 20 + "fused.ply"
+    assert wrapped(f"939,782 points in {path}", 30) == ["939,782 points in", path]
+    assert wrapped("", 10) == [""]
+
+
+@pytest.mark.parametrize("width", range(5, 40))
+@pytest.mark.parametrize("name", ["survey/2024-05-01/left/IMG_00012.jpg", "東京" * 20, "short.jpg"])
+def test_names_are_shortened_in_the_middle(name: str, width: int) -> None:
+    short = shortened(name, width).plain
+    assert cell_len(short) <= width or (short == name and cell_len(name) <= width)
+    if short != name:
+        start, end = short.split("…")
+        assert cell_len(name) > width
+        assert name.startswith(start) and name.endswith(end) and len(end) >= len(start)
+
+
+SUMMARY = """
+    from colmap_sph.app.terminal import Terminal
+    terminal = Terminal()
+    names = [f"survey of the village/2024-05-01/camera {side}/IMG_{number:05d}.jpg"
+             for side in ("left", "right") for number in range(3)]
+    terminal.table("Depth maps", ["image", "coverage", "agreement"], [(name, "90.1%", "99.5%") for name in names])
+    terminal.facts([("seconds", "48.5 (check originals 0.1, match pairs 34.8, vote on depth 4.6, fuse 2.4)"),
+                    ("cloud", "939,782 points in " + "/data/some/where" * 10 + "/fused.ply")])
+"""
+
+
+@pytest.mark.parametrize("width", [60, 80, 100])
+def test_a_summary_fits_its_terminal(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys.modules[__name__], "DRAWING", SUMMARY)
+    lines = COLOURS.sub("", drawn(COLUMNS=str(width))).splitlines()
+    *table, path = lines
+    assert all(cell_len(line) <= width for line in table)
+    images = [line.split("│")[1].strip() for line in table if "IMG" in line]
+    assert [re.search(r"IMG_\d{5}\.jpg$", name) is not None for name in images] == [True] * 6
+    assert path.strip() == "/data/some/where" * 10 + "/fused.ply"
+    for part in ("check originals 0.1", "match pairs 34.8", "vote on depth 4.6"):
+        assert any(part in line for line in table)
 
 
 # ---- terminals ---------------------------------------------------------------------------------------------

@@ -179,10 +179,12 @@ def test_finished_workspace_is_reused(tmp_path: Path) -> None:
     before = times(workspace)
     prepare(sparse, tmp_path / "dense")
     assert times(workspace) == before
-    with pytest.raises(InputError, match="different options"):
+    with pytest.raises(
+        InputError, match=r"dense was made with --max-image-size -1, not 48; give that, .*--overwrite"
+    ):
         prepare(sparse, tmp_path / "dense", UndistortionOptions(48))
     other = make_project(tmp_path / "other", "OPENCV", (0.1, 0.0, 0.0, 0.0))
-    with pytest.raises(InputError, match="different model"):
+    with pytest.raises(InputError, match=r"made from another sparse model .*--overwrite"):
         prepare(other, tmp_path / "dense")
     assert times(workspace) == before
 
@@ -393,7 +395,7 @@ def test_workspace_of_an_earlier_version(tmp_path: Path) -> None:
     old.state_dir.mkdir()
     old.marker_path.write_text(json.dumps(marker))
     old.patch_match_cfg_path.write_text("a.png\nb.png\n")
-    with pytest.raises(InputError, match="different options"):
+    with pytest.raises(InputError, match="made with --max-image-size -1, not 48"):
         prepare(sparse, dense, UndistortionOptions(48))
     prepare(sparse, dense)
     assert not list(dense.glob("run-colmap-*"))

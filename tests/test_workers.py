@@ -16,7 +16,7 @@ from colmap_sph.pipeline.workers import for_all
 class Count(Silent):
     done = 0
 
-    def advance(self) -> None:
+    def advance(self, seconds: float = 0.0) -> None:
         self.done += 1
 
 
@@ -24,7 +24,7 @@ def run(work, items, threads=3):
     """(results, skipped, number of steps told)."""
     skipped: dict = {}
     progress = Count()
-    results = for_all(work, items, threads=threads, progress=progress, skip=skipped.__setitem__)
+    results = for_all(work, items, threads=threads, advance=lambda _: progress.advance(), skip=skipped.__setitem__)
     return results, skipped, progress.done
 
 

@@ -4,37 +4,41 @@
 #     workflows/batch.sh ROOT [options of `colmap_sph run`]
 #
 # A project is a folder, at any depth below ROOT, with a sparse model in sparse/0; its result goes to dense/ beside
-# sparse/. A failure does not stop the batch. A project that finished without some of its images counts as done, with
-# a warning. The exit code is 1 where a project failed. Run it again to try those once more: finished results are kept.
+# sparse/, and that of sparse/1 to dense-1/. A failure does not stop the batch. A project that finished without some of
+# its images counts as done, with a warning. At the end a table says what became of each, and why; it is also in
+# ROOT/colmap_sph_batch.tsv, and as a page with links to the reports in ROOT/colmap_sph_batch.html. The exit code is 1
+# where a project failed. Run it again to try those once more: finished results are kept.
 set -u
+here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 root=${1:?usage: batch.sh ROOT [options of colmap_sph run]}
 shift
 
-mapfile -d '' models < <(find "$root" -type d -path '*/sparse/0' -print0 | sort -z)
+# The program on the PATH, or that of the README's virtual environment beside this folder.
+program=$(command -v colmap_sph) || program=$here/../.venv/bin/colmap_sph
+[ -x "$program" ] || { echo "colmap_sph is neither on the PATH nor in $here/../.venv" >&2; exit 2; }
+
+has_model() { [ -e "$1/images.bin" ] || [ -e "$1/images.txt" ]; }
+
+mapfile -d '' models < <(find "$root" -type d -regex '.*/sparse/[0-9]+' -print0 | sort -zV)
+for index in "${!models[@]}"; do has_model "${models[index]}" || unset "models[index]"; done
 [ "${#models[@]}" -gt 0 ] || { echo "no folder with sparse/0 below $root" >&2; exit 2; }
 
-points() { sed -n 's/^ "points": \([0-9]*\).*/\1/p' "$1/dense/colmap_sph/report.json"; }
-
-failed=0 summary=()
+scratch=$(mktemp -d) || exit 3
+trap 'rm -rf "$scratch"' EXIT
 for model in "${models[@]}"; do
-    project=${model%/sparse/0}
-    echo "==== $project"
-    colmap_sph run --model "$model" --output "$project/dense" "$@"
-    code=$?
+    number=${model##*/}
+    dense=${model%/sparse/*}/dense
+    [[ $number =~ ^0+$ ]] || dense=$dense-$number
+    echo "==== $model"
+    # Messages go on to the standard error stream, and are kept for their last one.
+    { "$program" run --model "$model" --output "$dense" "$@" 2>&1 >&3 | tee -i "$scratch/messages" >&2; } 3>&1
+    code=${PIPESTATUS[0]}
     case $code in
-        130 | 143) echo "interrupted at $project; the same command goes on there" >&2; exit "$code" ;;
-        0) result="$(points "$project") points" ;;
-        5) result="$(points "$project") points; WARNING: without some images, see dense/colmap_sph/report.json" ;;
-        2) result="FAILED: input or options" ;;
-        3) result="FAILED: cannot write" ;;
-        4) result="FAILED: nothing to reconstruct" ;;
-        6) result="FAILED: not enough memory" ;;
-        *) result="FAILED: exit code $code" ;;
+        130 | 143) echo "interrupted at $model; the same command goes on there" >&2; exit "$code" ;;
     esac
-    case $code in 0 | 5) ;; *) failed=$((failed + 1)) ;; esac
-    summary+=("$(printf '%-40s %s' "$project" "$result")")
+    reason=$(sed -n 's/^error: //p' "$scratch/messages" | tail -n 1)
+    printf '%s\0' "$model" "$dense" "$code" "$reason" >>"$scratch/results"
 done
 
-printf '\n==== %d projects, %d failed\n' "${#models[@]}" "$failed"
-printf '%s\n' "${summary[@]}"
-[ "$failed" -eq 0 ]
+echo
+python3 "$here/batch_summary.py" "$scratch/results" --output "$root/colmap_sph_batch"

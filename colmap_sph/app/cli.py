@@ -10,13 +10,16 @@ import cv2
 import tyro
 
 import colmap_sph
+from colmap_sph.app.completion import short_completion
 from colmap_sph.app.demo import run_demo
 from colmap_sph.app.display import Display
 from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
+from colmap_sph.app.events import Events
+from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
-from colmap_sph.app.spelling import flag_of, in_full
+from colmap_sph.app.spelling import flag_of
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError, reason_of
 from colmap_sph.evaluation import format_clouds, format_depth_maps
@@ -49,19 +52,27 @@ def main(arguments: list[str] | None = None) -> int:
     with warnings_shown(terminal):
         try:
             return _answer(arguments, terminal)
-        except ColmapSphError as error:
-            return _print_error(error, terminal)
-        except (MemoryError, cv2.error, RuntimeError) as error:
-            if not is_memory_error(error):
+        except Exception as error:
+            told = _in_words(error)
+            if told is None:
                 raise
-            return _print_error(OutOfMemoryError(), terminal)
-        except OSError as error:
-            if error.errno is None or isinstance(error, BrokenPipeError):
-                raise
-            what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
-            return _print_error(
-                OutputError(f"{what} ({reason_of(error)}); check space and permissions."), terminal
-            )
+            terminal.settle()
+            terminal.say(told, label="error:", style="bold red")
+            return told.exit_code
+
+
+def _in_words(error: BaseException) -> ColmapSphError | None:
+    """What a user is told of an error, with options as they are typed; None for one of the program itself."""
+    if isinstance(error, OptionError):
+        return error.spelled(flag_of)
+    if isinstance(error, ColmapSphError):
+        return error
+    if isinstance(error, (MemoryError, cv2.error, RuntimeError)) and is_memory_error(error):
+        return OutOfMemoryError()
+    if isinstance(error, OSError) and error.errno is not None and not isinstance(error, BrokenPipeError):
+        what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
+        return OutputError(f"{what} ({reason_of(error)}); check space and permissions.")
+    return None
 
 
 def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
@@ -73,23 +84,37 @@ def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
         print_result(help_text(everything=asks_for_all))
         return 0
     command = _parsed(arguments)
+    events = _events_of(command)
 
-    def last_words(_: Interrupted) -> None:
+    def last_words(stop: Interrupted) -> None:
         logger.info("Interrupted")
         _print_interrupted(command, terminal)
+        events.end(stop.exit_code, "interrupted")
 
     try:
         with stop_on_signals(last_words):
-            return _do(command, terminal)
+            code = _do(command, arguments, terminal, events)
     except Interrupted as stop:
         _print_interrupted(command, terminal)
+        events.end(stop.exit_code, "interrupted")
         return stop.exit_code
+    except Exception as error:
+        told = _in_words(error)
+        events.end(*((1, f"{type(error).__name__}: {error}") if told is None else (told.exit_code, str(told))))
+        raise
+    events.end(code)
+    return code
+
+
+def _events_of(command: Command) -> Events:
+    is_wanted = isinstance(command, RunCommand) and command.progress == "json"
+    return Events(sys.stdout if is_wanted else None)
 
 
 def _parsed(arguments: Sequence[str]) -> Command:
     if arguments[:1] == ["run"]:
-        arguments = ["run", *in_full(arguments[1:])]
-    with standard_output():
+        arguments = ["run", *all_arguments(arguments[1:], RunCommand)]
+    with standard_output(), short_completion(arguments):
         command: Command = tyro.extras.subcommand_cli_from_dict(
             # `run` alone has flags without a value, among its own options.
             {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
@@ -101,38 +126,31 @@ def _parsed(arguments: Sequence[str]) -> Command:
     return command
 
 
-def _do(command: Command, terminal: Terminal) -> int:
+def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: Events) -> int:
     try:
         Path.cwd()
     except OSError as error:
         raise InputError(f"The current folder cannot be used ({reason_of(error)}); change to another.") from error
     if isinstance(command, RunCommand):
-        return run_command(command, terminal)
+        return run_command(command, terminal, arguments, events)
     if isinstance(command, DemoCommand):
-        return demo_command(command, terminal)
+        return demo_command(command, terminal, arguments)
     return evaluate_command(command, terminal)
 
 
-def demo_command(command: DemoCommand, terminal: Terminal) -> int:
+def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str]) -> int:
     """`colmap_sph demo`."""
     options = RunOptions(threads=command.threads)
     options.check()
-    with workspace_log(Workspace(command.output / "dense"), header(command)), Display(terminal) as display:
+    log = workspace_log(Workspace(command.output / "dense"), header(arguments))
+    with log, Display(terminal, options.num_threads) as display:
         result = run_demo(command.output, options=options, progress=display)
     print_summary(result.report, result.workspace, terminal)
     terminal.say("")
     terminal.say("in pixels on the ground (GSD)", label="Against exact depth,", style="bold")
-    terminal.say_lines(format_depth_maps(result.depth_maps))
-    terminal.say_lines(format_clouds([result.cloud]))
+    terminal.say_lines(format_depth_maps(result.depth_maps, terminal.width))
+    terminal.say_lines(format_clouds([result.cloud], terminal.width))
     return 0
-
-
-def _print_error(error: ColmapSphError, terminal: Terminal) -> int:
-    if isinstance(error, OptionError):
-        error = error.spelled(flag_of)
-    terminal.settle()
-    terminal.say(error, label="error:", style="bold red")
-    return error.exit_code
 
 
 def _print_interrupted(command: Command, terminal: Terminal) -> None:

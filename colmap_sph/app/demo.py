@@ -27,7 +27,7 @@ from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES
 from colmap_sph.project.undistortion.marker import check_ours
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.synthetic import BlockOptions, Camera, DemoBlock, demo_cameras, make_demo_block
+from colmap_sph.synthetic import BlockOptions, Camera, DemoBlock, demo_cameras, exact_geometry, make_demo_block
 
 _RECORD = "colmap_sph_demo.json"
 """Names the files that a demo makes beside its dense workspace: another may replace them."""
@@ -102,6 +102,7 @@ def run_demo(
         progress=progress,
         overwrite=True,
     )
+    _write_exact_depth(demo)
     workspace = Workspace(output / "dense")
     progress.start("compare with truth", 2)
     depth_maps = _score_demo_maps(demo, workspace)
@@ -115,9 +116,10 @@ def _make_room(output: Path, block: BlockOptions) -> None:
     """Make sure that only an earlier demo's files will be replaced, and record those of this one."""
     names = demo_cameras(block)
     parts = [f"images/{name}" for name in names] + [f"truth/{name}.npz" for name in names]
+    parts += [f"depth/{_depth_name(name)}" for name in names]
     parts += [f"sparse/0/{stem}.bin" for stem in (*MODEL_FILES, *RIG_FILES)]
     dense = Workspace(output / "dense")
-    check_ways_out(output, (output / name for name in ("images", "sparse", "truth", _RECORD)))
+    check_ways_out(output, (output / name for name in ("images", "sparse", "truth", "depth", _RECORD)))
     check_links(dense, is_given=False)
     try:
         is_empty = not output.exists() or not any(output.iterdir())
@@ -144,6 +146,20 @@ def _recorded_files(record: Path) -> set[str]:
         raise OutputError(
             f"{record.parent} already holds other files than those of a demo; choose another --output."
         ) from error
+
+
+def _depth_name(name: str) -> str:
+    return f"{Path(name).stem}.npy"
+
+
+def _write_exact_depth(demo: DemoBlock) -> None:
+    """Write exact depth at the pixels' centres, as `colmap_sph evaluate` takes it."""
+    folder = demo.root / "depth"
+    make_dir(folder)
+    for name, camera in zip(demo.names, demo.cameras, strict=True):
+        depth, _, _ = exact_geometry(demo.surfaces, camera, origin=0.5)
+        with atomic_file(folder / _depth_name(name)) as file:
+            np.save(file, depth.astype(np.float32))
 
 
 def _score_demo_maps(demo: DemoBlock, workspace: Workspace) -> dict[str, DepthMapScores]:

@@ -12,7 +12,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from colmap_sph.app.terminal import Terminal, print_result
+from colmap_sph.app.terminal import Terminal, output_width, print_result
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import (
     CloudScores,
@@ -108,11 +108,12 @@ def evaluate_command(command: EvaluateCommand, terminal: Terminal) -> int:
             workspace = Workspace(command.workspace)
             depth_maps = score_depth_maps(workspace, views, kind=command.map_kind, gsd=command.options.gsd)
     clouds = _score_clouds(command, views, terminal)
-    blocks = [format_clouds(clouds)] if clouds else []
+    width = output_width()
+    blocks = [format_clouds(clouds, width)] if clouds else []
     if depth_maps:
         gsd = "depth / focal length" if command.options.gsd is None else f"{command.options.gsd:g} m"
         title = f"{command.map_kind} depth maps of {command.workspace}; GSD = {gsd}"
-        blocks.append(f"{title}\n\n{format_depth_maps(depth_maps)}")
+        blocks.append(f"{title}\n\n{format_depth_maps(depth_maps, width)}")
     if command.json is not None:
         write_json(command.json, as_plain_values(command, clouds, depth_maps))
     print_result("\n\n".join(blocks))

@@ -26,12 +26,28 @@ class Option:
         Empty where there is none to speak of.
     text : str
         What it does, in whole sentences.
+    place : str
+        In the records, such as "vote.min_support".
+    kind : type
+        Of its values.
     """
 
     flag: str
     values: str
     default: str
     text: str
+    place: str
+    kind: Any
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether it is typed without a value."""
+        return "." not in self.place and self.kind is bool
+
+    @property
+    def full_flag(self) -> str:
+        """The flag that the records give it, which is how the parser knows it."""
+        return f"--{self.place.replace('_', '-')}"
 
     @property
     def text_with_default(self) -> str:
@@ -90,7 +106,7 @@ def _stage_group(name: str, record: type) -> OptionGroup:
 def _option(place: str, kind: Any, default: object, text: str) -> Option:
     is_switch = "." not in place and kind is bool
     shown = "" if default in (None, "", MISSING) or is_switch else str(default)
-    return Option(flag_of(place), "" if is_switch else _values_of(kind), shown, text)
+    return Option(flag_of(place), "" if is_switch else _values_of(kind), shown, text, place, kind)
 
 
 def _values_of(kind: Any) -> str:

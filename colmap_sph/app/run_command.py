@@ -1,9 +1,12 @@
 """`colmap_sph run`: its options, its help, the plan of a dry run, and the closing summary."""
 
 import io
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Annotated
+from pathlib import Path
+from typing import Annotated, Literal
 
 import tyro
 from rich.console import Console
@@ -13,16 +16,21 @@ from rich.text import Text
 
 import colmap_sph
 from colmap_sph.app.display import Display, duration
+from colmap_sph.app.events import Events
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.option_list import Option, option_groups
+from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.spelling import EVERYDAY
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
+from colmap_sph.pipeline.presets import Quality
 from colmap_sph.pipeline.reconstruct import check_input, run_project
-from colmap_sph.pipeline.report import RunReport
+from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.project.project import Project
 from colmap_sph.project.workspace import Workspace
+
+logger = logging.getLogger(__name__)
 
 PARTIAL_EXIT_CODE = 5
 """The run finished, but some images of the model have no depth map, or are not in the cloud."""
@@ -42,6 +50,8 @@ class RunCommand:
     options: Annotated[RunOptions, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = field(
         default_factory=RunOptions
     )
+    quality: Quality = "normal"
+    """Preview takes a quarter of the time of normal, best about twice as much. Options given beside it win."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only say what is to do, and about how much time, memory and disk it takes. Nothing is written."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -49,28 +59,52 @@ class RunCommand:
     programs made are kept under another name."""
     verify: tyro.conf.FlagCreatePairsOff[bool] = False
     """Look at every byte of earlier results first, and make again what is damaged."""
+    config: Path | None = None
+    """File with options, which those typed here win over: TOML, or the report.json of an earlier run."""
+    progress: Literal["auto", "json", "none"] = "auto"
+    """How the run tells how far it is: bars, or lines off a terminal; events as lines of JSON on the standard
+    output; or not at all."""
 
 
-def run_command(command: RunCommand, terminal: Terminal) -> int:
-    """`colmap_sph run`."""
+def run_command(
+    command: RunCommand, terminal: Terminal, arguments: Sequence[str] = (), events: Events | None = None
+) -> int:
+    """`colmap_sph run`, as it was typed; the last event is the caller's."""
+    events = Events(None) if events is None else events
     project = command.project
     options = command.options
+    events.begin(arguments, project.root if project.is_named else None, options.num_threads)
     check_input(project, options)
     workspace = Workspace(project.root)
     if command.dry_run:
-        print_plan(make_plan(project, options, overwrite=command.overwrite), workspace, terminal)
+        plan = make_plan(project, options, overwrite=command.overwrite)
+        events.plan(plan)
+        print_plan(plan, workspace, terminal)
         return 0
-    with workspace_log(workspace, header(command)), Display(terminal) as display:
+    with workspace_log(workspace, header(arguments)), _progress(command, terminal, events) as progress:
+        logger.info("Options: %s", command)
         report = run_project(
-            project, options, progress=display, overwrite=command.overwrite, verify=command.verify
+            project, options, progress=progress, overwrite=command.overwrite, verify=command.verify
         )
+    events.note(report)
     print_summary(report, workspace, terminal)
     return PARTIAL_EXIT_CODE if report.skipped_images or report.incomplete else 0
 
 
-def header(command: object) -> str:
-    """First line of a command in the workspace's log."""
-    return f"colmap_sph {colmap_sph.__version__}: {command}"
+@contextmanager
+def _progress(command: RunCommand, terminal: Terminal, events: Events) -> Iterator[Progress]:
+    if command.progress == "json":
+        yield events
+    elif command.progress == "none":
+        yield Silent()
+    else:
+        with Display(terminal, command.options.num_threads) as display:
+            yield display
+
+
+def header(arguments: Sequence[str]) -> str:
+    """First line of a command in the workspace's log: how to repeat it."""
+    return f"colmap_sph {colmap_sph.__version__}: {to_repeat(arguments)}"
 
 
 # ---- help --------------------------------------------------------------------------------------------------
@@ -89,7 +123,8 @@ def _print_help(console: Console, *, everything: bool) -> None:
     console.print("       colmap_sph run --workspace DENSE [OPTIONS]\n", highlight=False, markup=False)
     console.print(plain.text, highlight=False, markup=False)
     known = {option.flag: option for group in (plain, *stages) for option in group.options}
-    _print_options([known[flag] for flag in EVERYDAY], console)
+    others = [option for option in plain.options if option.flag not in EVERYDAY] if everything else []
+    _print_options([*(known[flag] for flag in EVERYDAY), *others], console)
     if not everything:
         console.print(
             "\nAll other options, stage by stage: colmap_sph run --help-all", highlight=False, markup=False

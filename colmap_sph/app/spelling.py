@@ -16,6 +16,7 @@ EVERYDAY = (
     "--masks",
     "--output",
     "--workspace",
+    "--quality",
     "--max-image-size",
     "--num-pairs",
     "--threads",
@@ -51,10 +52,18 @@ _RENAMED = {
     "--fusion-input": "--fusion.input",
 }
 
+_FULL = {flag: f"--{place.replace('_', '-')}" for place, flag in SHORT.items()} | _RENAMED
+
 
 def flag_of(place: str) -> str:
     """An option as the user types it, from its place in the records, such as "vote.min_support"."""
     return SHORT.get(place, f"--{place.replace('_', '-')}")
+
+
+def full_flag(flag: str) -> str:
+    """A flag in the spelling that the records give it, from a short or an earlier one."""
+    flag = flag.replace("_", "-")
+    return _FULL.get(flag, flag)
 
 
 def in_full(arguments: Sequence[str]) -> list[str]:
@@ -62,15 +71,13 @@ def in_full(arguments: Sequence[str]) -> list[str]:
 
     Short and earlier spellings are replaced, and a first argument that is no option is the model.
     """
-    full = {flag: f"--{place.replace('_', '-')}" for place, flag in SHORT.items()} | _RENAMED
     spelled: list[str] = []
     for argument in [*arguments, "--"]:
         if spelled and spelled[-1] in _ALONE and argument.startswith("-"):
             spelled.append(_ALONE[spelled[-1]])
         flag, equals, value = argument.partition("=")
         if flag.startswith("--"):
-            flag = flag.replace("_", "-")
-            argument = full.get(flag, flag) + equals + value
+            argument = full_flag(flag) + equals + value
         spelled.append(argument)
     spelled.pop()
     is_named = any(argument.partition("=")[0] == "--model" for argument in spelled)

@@ -6,6 +6,8 @@ names that strangers chose; none of them reaches the terminal otherwise than thr
 """
 
 import logging
+import re
+import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
@@ -21,6 +23,8 @@ from colmap_sph.errors import OutputError, printable, reason_of
 
 # Columns that bars and tables need; a narrower terminal, or one that hides its width, gets plain lines.
 _LEAST_WIDTH = 40
+# Columns of a table's rules and spaces, for each of its columns; one more closes it.
+_RULES = 3
 
 
 class Terminal:
@@ -37,6 +41,11 @@ class Terminal:
         """Whether somebody looks at it now, and there is room for lines that are drawn again."""
         has_room = self._console.width >= _LEAST_WIDTH
         return self._stream.isatty() and has_room and not self._console.is_dumb_terminal
+
+    @property
+    def width(self) -> int | None:
+        """Columns, where somebody looks at it."""
+        return self._console.width if self.is_interactive else None
 
     def say(self, text: object, *, label: str = "", style: str = "") -> None:
         """Say something in one line, behind a label of that style."""
@@ -59,10 +68,7 @@ class Terminal:
     def facts(self, rows: Sequence[tuple[str, str]]) -> None:
         """Show names and what is known of them, one a line."""
         if self.is_interactive:
-            table = Table.grid(padding=(0, 2))
-            for row in rows:
-                table.add_row(*map(_cell, row))
-            self._console.print(table)
+            self._print_facts(rows)
         else:
             self._write_columns(rows)
 
@@ -70,8 +76,11 @@ class Terminal:
         """Show a table."""
         if self.is_interactive:
             table = Table(*header, title=title, title_justify="left", caption=caption or None)
-            for row in rows:
-                table.add_row(*map(_cell, row))
+            widths = [max(map(cell_len, map(printable, column))) for column in zip(header, *rows, strict=True)]
+            # Names are in the first column; the others are short.
+            room = self._console.width - sum(widths[1:]) - _RULES * len(widths) - 1
+            for name, *others in rows:
+                table.add_row(shortened(printable(name), room), *map(_cell, others))
             self._console.print(table)
         else:
             self._write(title)
@@ -111,6 +120,13 @@ class Terminal:
             if not had_bars:
                 self._write("")
 
+    def _print_facts(self, rows: Sequence[tuple[str, str]]) -> None:
+        indent = max((cell_len(printable(name)) for name, _ in rows), default=0) + 2
+        for name, value in rows:
+            first, *more = wrapped(printable(value), self._console.width - indent)
+            lines = [set_cell_size(printable(name), indent) + first, *(" " * indent + line for line in more)]
+            self._console.print(Text("\n".join(lines)), soft_wrap=True)
+
     def _write(self, line: str) -> None:
         self._stream.write(f"{line}\n")
         self._stream.flush()
@@ -124,6 +140,40 @@ class Terminal:
 
 def _cell(text: object) -> Text:
     return Text(printable(text))
+
+
+def wrapped(text: str, width: int) -> list[str]:
+    """Lines of a text, broken between the parts of a list, or where these are too long between words.
+
+    A word that is longer, such as a path, stays whole: the terminal breaks it, and it can be copied.
+    """
+    parts: list[str] = []
+    for part in re.split(r"(?<=[,;]) ", text):
+        parts += [part] if cell_len(part) <= width else part.split(" ")
+    lines = [parts[0]]
+    for part in parts[1:]:
+        if cell_len(f"{lines[-1]} {part}") <= width:
+            lines[-1] += f" {part}"
+        else:
+            lines.append(part)
+    return lines
+
+
+def shortened(name: str, width: int) -> Text:
+    """A name, or where it is wider its beginning and its end, which tells images apart."""
+    if cell_len(name) <= width:
+        return Text(name)
+    end = max((width - 1) * 2 // 3, 1)
+    start = max(width - 1 - end, 1)
+    tail = name
+    while cell_len(tail) > end:
+        tail = tail[1:]
+    return Text(f"{set_cell_size(name, start).rstrip()}…{tail}", no_wrap=True)
+
+
+def output_width() -> int | None:
+    """Columns of the standard output, where that is a terminal."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def print_result(text: str) -> None:

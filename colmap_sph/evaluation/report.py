@@ -14,8 +14,19 @@ from colmap_sph.evaluation.cloud_scores import CloudScores
 from colmap_sph.evaluation.depth_maps import DepthMapScores
 
 
-def format_clouds(scores: Sequence[CloudScores]) -> str:
-    """A plain-text report of clouds against one reference: a table, and the registrations below it."""
+def format_clouds(scores: Sequence[CloudScores], width: int | None = None) -> str:
+    """A plain-text report of clouds against one reference: a table, and the registrations below it.
+
+    Parameters
+    ----------
+    scores : sequence of CloudScores
+    width : int, optional
+        Most columns of text; the columns of a table that has more are put below each other.
+
+    Returns
+    -------
+    str
+    """
     if not scores:
         return ""
     header = ["cloud", "points", "judged", "mean [m]", "std [m]"]
@@ -28,11 +39,11 @@ def format_clouds(scores: Sequence[CloudScores]) -> str:
     lines = [f"reference: {printable(first.reference)}, {samples}"]
     if first.cloud_to_reference.cap is not None:
         lines.append(f"distances above {first.cloud_to_reference.cap:g} m count as that")
-    return "\n".join([*lines, "", _aligned(rows), "", *(_registration_line(cloud) for cloud in scores)])
+    return "\n".join([*lines, "", _aligned(rows, width), "", *(_registration_line(cloud) for cloud in scores)])
 
 
-def format_depth_maps(scores: Mapping[str, DepthMapScores]) -> str:
-    """A plain-text table of depth maps, one row per image and their mean."""
+def format_depth_maps(scores: Mapping[str, DepthMapScores], width: int | None = None) -> str:
+    """A plain-text table of depth maps, one row per image and their mean; see `format_clouds`."""
     if not scores:
         return ""
     first = next(iter(scores.values()))
@@ -51,7 +62,7 @@ def format_depth_maps(scores: Mapping[str, DepthMapScores]) -> str:
             angle = one.median_normal_angle
             row.append("-" if angle is None else f"{angle:.2f}")
         rows.append(row)
-    return _aligned(rows)
+    return _aligned(rows, width)
 
 
 def mean_of_depth_maps(scores: Mapping[str, DepthMapScores]) -> DepthMapScores:
@@ -136,15 +147,29 @@ def _percent(share: float) -> str:
     return f"{100 * share:.2f} %"
 
 
-def _aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Columns to the right, the first to the left."""
-    rows = [[printable(cell) for cell in row] for row in rows]
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = []
-    for row in rows:
-        cells = [
-            row[0].ljust(widths[0]),
-            *(cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)),
-        ]
-        lines.append("  ".join(cells).rstrip())
-    return "\n".join(lines)
+def _aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> str:
+    """Columns to the right, the first to the left; where they need more than `width`, below each other."""
+    texts = list(zip(*([printable(cell) for cell in row] for row in rows), strict=True))
+    widths = [max(map(len, column)) for column in texts]
+    columns = [
+        [cell.rjust(each) if number else cell.ljust(each) for cell in column]
+        for number, (column, each) in enumerate(zip(texts, widths, strict=True))
+    ]
+    parts = []
+    for numbers in _parts(widths, width):
+        chosen = [columns[0], *(columns[number] for number in numbers)]
+        parts.append("\n".join("  ".join(cells).rstrip() for cells in zip(*chosen, strict=True)))
+    return "\n\n".join(parts)
+
+
+def _parts(widths: Sequence[int], width: int | None) -> list[list[int]]:
+    """Which columns stand side by side, behind the first one."""
+    parts: list[list[int]] = [[]]
+    taken = widths[0]
+    for number, each in enumerate(widths[1:], start=1):
+        if width is not None and parts[-1] and taken + 2 + each > width:
+            parts.append([])
+            taken = widths[0]
+        parts[-1].append(number)
+        taken += 2 + each
+    return parts

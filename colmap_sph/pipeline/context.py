@@ -92,11 +92,13 @@ class Context:
     def leave_incomplete(self, name: str, reason: str) -> None:
         """Report that a view's results, or the cloud, had to do without something; the next run tries again."""
         self.report.incomplete[name] = reason
+        self.progress.leave_out("incomplete", name, reason)
         logger.warning("%s incomplete: %s", name, reason)
 
     def skip_view(self, name: str, reason: str) -> None:
         """Report that a view could not be done."""
         self.report.skipped_images[name] = reason
+        self.progress.leave_out("image", name, reason)
         logger.warning("%s skipped: %s", name, reason)
 
 

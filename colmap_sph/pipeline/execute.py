@@ -38,9 +38,9 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
         if job.done is not None:
             return Result(job.key, made=False, facts=job.done)
         if stage.whole:
-            return Result(job.key, made=True, facts=stage.make(job.task))
+            return Result(job.key, made=True, facts=stage.make(job.task), seconds=job.cost.seconds)
         with gate.reserve(job.cost.memory, stage.label(item)):
-            return Result(job.key, made=True, facts=stage.make(job.task))
+            return Result(job.key, made=True, facts=stage.make(job.task), seconds=job.cost.seconds)
 
     with stage.opened(), context.stage(stage.name, len(stage.items)):
         with stage.holding(kept), vouching_in_background():
@@ -57,9 +57,11 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
 
 def _by_threads(work: Callable[[Item], Result], stage: Stage[Item, Task]) -> dict[Item, Result]:
     context = stage.context
-    return for_all(
-        work, stage.items, threads=context.options.num_threads, progress=context.progress, skip=stage.skip
-    )
+
+    def advance(result: Result | None) -> None:
+        context.progress.advance(0.0 if result is None else result.seconds)
+
+    return for_all(work, stage.items, threads=context.options.num_threads, advance=advance, skip=stage.skip)
 
 
 def _one_by_one(work: Callable[[Item], Result], stage: Stage[Item, Task]) -> dict[Item, Result]:
@@ -67,5 +69,5 @@ def _one_by_one(work: Callable[[Item], Result], stage: Stage[Item, Task]) -> dic
     results = {}
     for item in stage.items:
         results[item] = work(item)
-        stage.context.progress.advance()
+        stage.context.progress.advance(results[item].seconds)
     return results

@@ -19,9 +19,10 @@ from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.foresight import foreseen_stages
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.polishing import with_polished_poses
+from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
@@ -211,7 +212,9 @@ def reconstruct(
         scene = anchored(read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         for name in sorted({*expected} - scene.index_of.keys()):
-            report.skipped_images.setdefault(name, "the model has no possible pose or calibration of it")
+            if name not in report.skipped_images:
+                report.skipped_images[name] = "the model has no possible pose or calibration of it"
+                progress.leave_out("image", name, report.skipped_images[name])
         context = with_good_images(context, execute, verify=verify)
         scene = context.scene
         workspace.create_stereo_dirs(scene.index_of)
@@ -224,8 +227,11 @@ def reconstruct(
         if verify:
             _verify(context)
         if given is not None and is_polishing:
+            first = (MatchToPolishStage(context, selection.unique_pairs()),)
+            progress.foresee(foreseen_stages(context, selection.unique_pairs(), first))
             context = with_polished_poses(context, selection.unique_pairs(), execute, given)
         judge_reprojection(report, context.scene)
+        progress.foresee(foreseen_stages(context, selection.unique_pairs()))
         go_through_stages(context, selection.unique_pairs(), execute)
         judge_agreement(report)
     _write_report(context)

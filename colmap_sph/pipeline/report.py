@@ -1,28 +1,65 @@
 """What a run tells while it works and when it is done."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Literal, Protocol
 
 from colmap_sph.pipeline.stages.facts import Agreement
 
+Left = Literal["image", "pair", "incomplete"]
+"""What is left out: an image, a pair of images, or something that an image has to do without for now."""
+
+
+@dataclass(frozen=True)
+class StageEstimate:
+    """What a stage that is to come is expected to take.
+
+    Attributes
+    ----------
+    name : str
+    items : int
+        Its steps.
+    seconds : float
+        Processor seconds of those that are to be made.
+    item_seconds : float
+        Of a step that is to be made, on average.
+    """
+
+    name: str
+    items: int
+    seconds: float
+    item_seconds: float
+
 
 class Progress(Protocol):
-    """What the pipeline tells a progress display."""
+    """What the pipeline tells a progress display. Derive from `Silent` to hear some of it only."""
+
+    def foresee(self, stages: Sequence[StageEstimate]) -> None:
+        """These stages are to come, and no others; told once pairs are selected, and again where that changes."""
 
     def start(self, stage: str, total: int) -> None:
         """A stage of `total` steps begins."""
 
-    def advance(self) -> None:
-        """One step is done."""
+    def advance(self, seconds: float = 0.0) -> None:
+        """One step is done, which was expected to take that many processor seconds; 0: it was there already."""
+
+    def leave_out(self, what: Left, name: str, reason: str) -> None:
+        """Something is left out; may be told from any thread."""
 
 
 class Silent:
     """A display that shows nothing."""
 
+    def foresee(self, stages: Sequence[StageEstimate]) -> None:
+        """Nothing."""
+
     def start(self, stage: str, total: int) -> None:
         """Nothing."""
 
-    def advance(self) -> None:
+    def advance(self, seconds: float = 0.0) -> None:
+        """Nothing."""
+
+    def leave_out(self, what: Left, name: str, reason: str) -> None:
         """Nothing."""
 
 

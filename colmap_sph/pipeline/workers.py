@@ -8,7 +8,6 @@ from typing import TypeVar
 import cv2
 
 from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError
-from colmap_sph.pipeline.report import Progress
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -22,7 +21,7 @@ def for_all(
     items: Sequence[T],
     *,
     threads: int,
-    progress: Progress,
+    advance: Callable[[R | None], None],
     skip: Callable[[T, str], None],
 ) -> dict[T, R]:
     """`work` on all items in worker threads.
@@ -34,8 +33,8 @@ def for_all(
     items : sequence
         Hashable, each once.
     threads : int
-    progress : Progress
-        Advanced once per item.
+    advance : callable
+        Called once per item, in this thread, with its result, or None where there is none.
     skip : callable
         Called with an item that raised a `ColmapSphError` or found no memory, and the reason. Any other error,
         a wrong option and an output that cannot be written end the stage.
@@ -51,8 +50,9 @@ def for_all(
             futures = _submit(pool, work, items)
             for future in as_completed(list(futures)):
                 item = futures.pop(future)
+                result = None
                 try:
-                    results[item] = future.result()
+                    results[item] = result = future.result()
                 except _FATAL:
                     raise
                 except ColmapSphError as error:
@@ -63,7 +63,7 @@ def for_all(
                     skip(item, str(OutOfMemoryError()))
                 # Nothing may keep a future: with its exception it keeps all arrays of the item that failed.
                 del future
-                progress.advance()
+                advance(result)
         except BaseException:
             pool.shutdown(wait=True, cancel_futures=True)
             raise

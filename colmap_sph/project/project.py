@@ -24,7 +24,7 @@ class Project:
     """Masks: a.jpg.png or a.png for image a.jpg, with its folders; black = ignored. Of the original images, or
     with --workspace of the undistorted ones."""
     output: Path | None = None
-    """Dense workspace to create. Default: the folder `dense` beside the model's `sparse`."""
+    """Dense workspace to create. Default: `dense` beside `sparse`, for sparse/1 `dense-1`."""
     workspace: Path | None = None
     """Existing dense workspace, instead of --model, --images and --output."""
 
@@ -62,6 +62,11 @@ class Project:
             )
 
     @property
+    def is_named(self) -> bool:
+        """Whether it says which dense workspace it is of."""
+        return any(path is not None for path in (self.workspace, self.output, self.model))
+
+    @property
     def root(self) -> Path:
         """Folder of the dense workspace, of a project without contradictions."""
         if self.workspace is not None:
@@ -70,11 +75,14 @@ class Project:
             return self.output
         assert self.model is not None
         project = real_path(self.model)
-        if project.name.isdigit():  # sparse/0, but not a project that is called 2024
+        number = project.name if project.name.isdigit() else ""
+        if number:  # sparse/0, but not a project that is called 2024
             project = project.parent
+        is_one_of_many = project.name == "sparse" and number.strip("0")
         if project.name == "sparse":
             project = project.parent
-        return project / "dense"
+        # COLMAP's mapper leaves sparse/0, and sparse/1 of images that do not connect with it.
+        return project / (f"dense-{number}" if is_one_of_many else "dense")
 
     def database(self) -> Path | None:
         """COLMAP's ``database.db`` beside or above the model, if there is one; None with a workspace."""

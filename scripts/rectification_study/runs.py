@@ -14,6 +14,7 @@ import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
 from colmap_sph.evaluation import write_json
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.report import Silent
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.rectified_pair import Surface
@@ -50,7 +51,7 @@ class Run:
         return {"pixels_per_image": pixels, "fused": int(self.report["points"])}
 
 
-class StageMeter:
+class StageMeter(Silent):
     """Progress of a run that notes every stage's time, processor time and peak memory."""
 
     def __init__(self, label: str) -> None:
@@ -68,9 +69,6 @@ class StageMeter:
         # Linux: forget the peak so far. Where that is not allowed peaks are those since the start.
         with suppress(OSError):
             Path("/proc/self/clear_refs").write_text("5")
-
-    def advance(self) -> None:
-        """Nothing: only whole stages are measured."""
 
     def finish(self) -> None:
         """The last stage is done."""

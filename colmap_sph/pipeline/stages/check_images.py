@@ -199,6 +199,7 @@ class CheckStage(Stage[str, ImageFile]):
     def skip(self, item: str, reason: str) -> None:
         """See `Stage.skip`."""
         self.context.report.skipped_images[item] = reason
+        self.context.progress.leave_out("image", item, reason)
         self._bad[item] = reason.removeprefix(f"{self._places.path(item)} ")
 
     def close(self, results: Mapping[str, Result]) -> None:

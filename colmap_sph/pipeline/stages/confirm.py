@@ -195,7 +195,9 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         if failures and not report.images:
             raise NoResultError(f"No image has a depth map ({failures[0]})")
         for name in (name for name, share in report.coverage.items() if share == 0):
-            report.skipped_images.setdefault(name, self._why_empty(name))
+            if name not in report.skipped_images:
+                report.skipped_images[name] = self._why_empty(name)
+                self.context.progress.leave_out("image", name, report.skipped_images[name])
         if not report.images:
             raise NoResultError(self._why_nothing())
 

@@ -40,7 +40,7 @@ from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace, mask_path
-from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.partners.pairing import Pair, partners_of
 
 if TYPE_CHECKING:
@@ -123,6 +123,17 @@ def make_cloud_by_colmap(task: ColmapFuseTask) -> Facts:
         partners=task.partners,
     )
     return Facts(points=points)
+
+
+def foreseen_fusion(context: "Context") -> tuple[int, float]:
+    """Items of the last stage, and processor seconds of each on average, where all images have some depth."""
+    options = context.options.fusion
+    views = context.scene.views
+    megapixels = sum(view.num_pixels for view in views) / 1e6
+    if options.method == "colmap":
+        return 1, _COLMAP_SECONDS * megapixels
+    partners = min(options.check_num_images, MAX_PARTNERS, len(views) - 1)
+    return len(views), (_SECONDS + _PARTNER_SECONDS * partners) * megapixels / len(views)
 
 
 def fuse_stage(context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> "Stage[str, Any]":

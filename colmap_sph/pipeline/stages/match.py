@@ -221,6 +221,7 @@ class MatchStage(Stage[Pair, MatchTask]):
     def skip(self, item: Pair, reason: str) -> None:
         """See `Stage.skip`."""
         self.context.report.skipped_pairs[" - ".join(item)] = reason
+        self.context.progress.leave_out("pair", " - ".join(item), reason)
         logger.warning("%s - %s skipped: %s", *item, reason)
         if item not in self._unfit:  # for a reason that may pass
             for name in item:

@@ -68,11 +68,12 @@ class Job(Generic[Task]):
 
 @dataclass(frozen=True)
 class Result:
-    """Outcome of one item: its key, whether this run made it, and what is known of it."""
+    """Outcome of one item: its key, whether this run made it, what is known of it, and what it was to cost."""
 
     key: str
     made: bool
     facts: Facts
+    seconds: float = 0.0
 
 
 class Stage(ABC, Generic[Item, Task]):

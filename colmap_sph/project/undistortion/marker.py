@@ -126,12 +126,14 @@ def check_made_from(workspace: Workspace, marker: Marker) -> Marker | None:
         )
     if found is None or not found.is_finished:
         return found
-    changed = [name for name in ("model", "options") if getattr(found, name) != getattr(marker, name)]
-    if changed:
-        raise InputError(
-            f"{workspace.root} was made with different {' and '.join(changed)}; "
-            "choose another --output, or start afresh with --overwrite."
-        )
+    again = "choose another --output, or start afresh with --overwrite"
+    if found.model != marker.model:
+        raise InputError(f"{workspace.root} was made from another sparse model than the one given; {again}.")
+    for name in sorted({*found.options, *marker.options}):
+        was, now = found.options.get(name), marker.options.get(name)
+        if was != now:
+            flag = f"--{name.replace('_', '-')}"
+            raise InputError(f"{workspace.root} was made with {flag} {was}, not {now}; give that, {again}.")
     return found
 
 

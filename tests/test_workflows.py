@@ -1,0 +1,156 @@
+"""Batches of projects: each is run, and what became of it is said."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import keep_images
+
+WORKFLOWS = Path(__file__).parents[1] / "workflows"
+HOSTILE = "a <script>alert(1)</script>&\"'"
+
+# Does as it is told by the file `do` in the model: an exit code, and a message.
+STUB = """#!/bin/bash
+echo "$@" >> "$CALLS"
+while [ $# -gt 0 ]; do
+    case $1 in --model) model=$2 ;; --output) dense=$2 ;; esac
+    shift
+done
+read -r code message < "$model/do"
+if [ "$code" = 0 ] || [ "$code" = 5 ]; then
+    mkdir -p "$dense/colmap_sph"
+    cp "$model/report.json" "$dense/colmap_sph/"
+else
+    echo "warning: something else" >&2
+    echo "error: $message" >&2
+fi
+exit "$code"
+"""
+
+
+@pytest.fixture
+def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A program in place of ours; the file it lists its calls in."""
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    (folder / "colmap_sph").write_text(STUB)
+    (folder / "colmap_sph").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
+    monkeypatch.setenv("CALLS", str(tmp_path / "calls"))
+    return tmp_path / "calls"
+
+
+def add_model(root: Path, name: str, code: int, message: str = "") -> Path:
+    model = root / name
+    model.mkdir(parents=True)
+    (model / "images.txt").touch()
+    (model / "do").write_text(f"{code} {message}\n")
+    report = {
+        "images": 2,
+        "points": 1234,
+        "coverage": {"a": 0.5, "b": 1.0},
+        "seconds": {"match": 10.0, "fuse": 2.0},
+        "skipped_images": {"c.jpg": "it is missing"} if code == 5 else {},
+    }
+    (model / "report.json").write_text(json.dumps(report))
+    return model
+
+
+def called(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(list(map(str, arguments)), capture_output=True, text=True, timeout=120, cwd=cwd)
+
+
+def test_a_batch_of_all_kinds(tmp_path: Path, stub: Path) -> None:
+    root = tmp_path / "survey"
+    add_model(root, "one/sparse/0", 0)
+    add_model(root, "one/sparse/1", 5)
+    add_model(root, "two/deep/sparse/0", 2, "The model is damaged; mend it.")
+    add_model(root, f"{HOSTILE}/sparse/0", 4, f"No pair of {HOSTILE} overlaps.")
+    (root / "empty/sparse/0").mkdir(parents=True)
+    (root / "one/sparse/10/images").mkdir(parents=True)
+    done = called(WORKFLOWS / "batch.sh", root, "--num-pairs", "3")
+    assert done.returncode == 1, done.stderr
+    calls = [
+        f"run --model {root}/{name} --output {root}/{dense} --num-pairs 3"
+        for name, dense in (
+            (f"{HOSTILE}/sparse/0", f"{HOSTILE}/dense"),
+            ("one/sparse/0", "one/dense"),
+            ("one/sparse/1", "one/dense-1"),
+            ("two/deep/sparse/0", "two/deep/dense"),
+        )
+    ]
+    assert sorted(stub.read_text().splitlines()) == sorted(calls)
+    assert "error: The model is damaged" in done.stderr
+    assert "==== 4 projects, 2 failed" in done.stdout
+    rows = [line.split("\t") for line in (root / "colmap_sph_batch.tsv").read_text().splitlines()]
+    found = {row[0].removeprefix(f"{root}/"): row[1:] for row in rows[1:]}
+    numbers = ["2", "1234", "75.0%", "12"]
+    assert found == {
+        "one/sparse/0": ["done", *numbers, ""],
+        "one/sparse/1": ["incomplete", *numbers, "c.jpg: it is missing"],
+        "two/deep/sparse/0": ["FAILED (2)", "", "", "", "", "The model is damaged; mend it."],
+        f"{HOSTILE}/sparse/0": ["FAILED (4)", "", "", "", "", f"No pair of {HOSTILE} overlaps."],
+    }
+    page = (root / "colmap_sph_batch.html").read_text()
+    assert "<script" not in page and page.count("<tr") == 5
+    assert '<a href="./one/dense-1/colmap_sph/report.json">' in page
+
+
+def test_a_batch_of_nothing(tmp_path: Path, stub: Path) -> None:
+    done = called(WORKFLOWS / "batch.sh", tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert "no folder with sparse/0" in done.stderr
+
+
+def test_an_interrupted_batch_ends(tmp_path: Path, stub: Path) -> None:
+    for name in ("a/sparse/0", "b/sparse/0"):
+        add_model(tmp_path, name, 130)
+    done = called(WORKFLOWS / "batch.sh", tmp_path)
+    assert done.returncode == 130
+    assert len(stub.read_text().splitlines()) == 1
+
+
+def test_an_array_of_slurm(tmp_path: Path, stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    models = [add_model(tmp_path, f"p{number}/sparse/0", number) for number in (0, 5, 2)]
+    (tmp_path / "models.txt").write_text("".join(f"{model}\n" for model in models))
+    codes = []
+    for task in (1, 2, 3, 4):
+        monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(task))
+        codes.append(
+            called(WORKFLOWS / "slurm_array.sh", tmp_path / "models.txt", "--output", tmp_path).returncode
+        )
+    assert codes == [0, 0, 2, 2]
+    assert [line.split()[2] for line in stub.read_text().splitlines()] == [str(model) for model in models]
+
+
+def test_batch_and_summary_of_real_projects(
+    project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two models of one project, of which one is damaged; the summary of a list finds the same afterwards."""
+    root = tmp_path_factory.mktemp("survey")
+    keep_images(project, ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"])
+    shutil.copytree(project / "sparse", root / "p/sparse")
+    shutil.copytree(project / "images", root / "p/images")
+    shutil.copytree(root / "p/sparse/0", root / "p/sparse/1")
+    (root / "p/sparse/1/points3D.bin").write_bytes(b"")
+    programs = tmp_path_factory.mktemp("bin")
+    (programs / "colmap_sph").write_text(f'#!/bin/sh\nexec "{sys.executable}" -P -m colmap_sph "$@"\n')
+    (programs / "colmap_sph").chmod(0o755)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    done = called(WORKFLOWS / "batch.sh", root, "--num-pairs", "2", "--threads", "2")
+    assert done.returncode == 1, done.stderr
+    header, good, bad = (line.split("\t") for line in (root / "colmap_sph_batch.tsv").read_text().splitlines())
+    report = json.loads((root / "p/dense/colmap_sph/report.json").read_text())
+    assert good[1:4] == ["done", "3", str(report["points"])]
+    assert bad[1] == "FAILED (2)" and "points3D.bin" in bad[6]
+    (root / "models.txt").write_text(f"{root}/p/sparse/0\n{root}/p/sparse/1\n")
+    done = called(sys.executable, WORKFLOWS / "batch_summary.py", "models.txt", "--output", "list", cwd=root)
+    assert done.returncode == 1, done.stderr
+    again = [line.split("\t") for line in (root / "list.tsv").read_text().splitlines()]
+    assert again[:2] == [header, good]
+    assert again[2][1] == "not run"
+    assert '<a href="./p/dense/colmap_sph/report' in (root / "list.html").read_text()
