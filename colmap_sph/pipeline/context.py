@@ -85,6 +85,13 @@ class Context:
         maps = [map_place(self.workspace, name, kind) for name in names for kind in get_args(MapKind)]
         return [*maps, self.cloud_place]
 
+    def places_until(self, last: str) -> list[Place]:
+        """All that a run writes in COLMAP's formats, up to "photometric" or "geometric" maps, or the "cloud"."""
+        if last == "cloud":
+            return self.places
+        kinds: tuple[MapKind, ...] = ("photometric",) if last == "photometric" else get_args(MapKind)
+        return [map_place(self.workspace, view.name, kind) for view in self.scene.views for kind in kinds]
+
     def stage(self, name: str, total: int) -> AbstractContextManager[None]:
         """Announce a stage of `total` steps, and report its wall time."""
         return timed_stage(name, total, self.progress, self.report)

@@ -17,11 +17,11 @@ from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import read_whole_grey
-from colmap_sph.project.masks import read_mask
+from colmap_sph.project.masks import read_view_mask
 from colmap_sph.scene import View
 from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
-from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
@@ -69,6 +69,7 @@ class ConfirmTask:
     confirm_options: ConfirmOptions
     normal_options: NormalOptions
     refinement_options: RefinementOptions
+    depths: Depths | None
     maps: MapFiles
     key: str
 
@@ -91,8 +92,9 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
             task.refinement_options,
             _usual(task.residuals),
         )
-    mask = read_mask(task.mask, view.width, view.height)
+    mask = read_view_mask(task.mask, view)
     normals, depth = planes
+    drop_other_depths(depth, task.depths)
     agreement = Agreement(*compare_with_sparse(view, depth, task.sights, mask))
     return task.maps.write(normals, depth, task.key, agreement)
 
@@ -106,7 +108,8 @@ def _estimate(file: EstimateFile) -> DepthEstimate:
 
 
 def _image(file: EstimateFile) -> NDArray[np.uint8]:
-    return _images.get(file_stamp(file.image), lambda: read_whole_grey(file.image))
+    size = (file.view.width, file.view.height)
+    return _images.get(f"{file_stamp(file.image)} {size}", lambda: read_whole_grey(file.image, size))
 
 
 class ConfirmStage(Stage[str, ConfirmTask]):
@@ -142,6 +145,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
             options.confirm,
             options.normals,
             options.refinement,
+            options.rectification.depths,
             maps,
             key,
         )

@@ -19,7 +19,7 @@ from colmap_sph.pipeline.stages.photo import Grey, Photo
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import grey_bytes
-from colmap_sph.project.masks import read_mask
+from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX
 from colmap_sph.project.state.ownership import remove_array_files
 from colmap_sph.scene import View
@@ -122,7 +122,8 @@ def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32
 
 
 def _photo(file: PhotoFile) -> Photo:
-    return _photos.get(file_stamp(file.image), lambda: Photo.read(file.image))
+    size = (file.view.width, file.view.height)
+    return _photos.get(f"{file_stamp(file.image)} {size}", lambda: Photo.read(file.image, size))
 
 
 def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> RectifiedImage:
@@ -137,7 +138,7 @@ def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> Rectifie
 
 def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
     """255 where an image takes part in matching, else 0; None where all of it does."""
-    mask = read_mask(photo.mask, photo.view.width, photo.view.height)
+    mask = read_view_mask(photo.mask, photo.view)
     blank = None if keep_blank else blank_pixels(image)
     if blank is None or not blank.any():
         return mask

@@ -27,9 +27,9 @@ class Photo:
     corners: NDArray[np.float64]
 
     @classmethod
-    def read(cls, path: Path) -> "Photo":
-        """Read an image; `InputError` where it is missing or damaged."""
-        image = read_grey(path)
+    def read(cls, path: Path, size: tuple[int, int] | None = None) -> "Photo":
+        """Read an image, reduced to a size (width, height); `InputError` where it is missing or damaged."""
+        image = read_grey(path, size)
         return cls(image, find_corners(image))
 
     @property
