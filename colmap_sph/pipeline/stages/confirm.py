@@ -131,7 +131,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         options = self.context.options
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
-        sights = self._tracks.sights(item)
+        sights = self._tracks.sights(item).between(options.rectification.depths)
         residuals = [self._residuals[as_pair(item, name)] for name in partners]
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights)
         maps = self.context.map_files(item, "geometric")

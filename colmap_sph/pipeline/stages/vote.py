@@ -88,7 +88,8 @@ def report_photometric(context: "Context", votes: Mapping[str, Result]) -> None:
         view = context.scene.view(name)
         depth = read_depth_map(context.map_files(name, "photometric").depth)
         mask = read_view_mask(context.workspace.mask_path(name), view)
-        agreement = Agreement(*compare_with_sparse(view, depth, context.sparse_tracks.sights(name), mask))
+        sights = context.sparse_tracks.sights(name).between(context.options.rectification.depths)
+        agreement = Agreement(*compare_with_sparse(view, depth, sights, mask))
         report.coverage[name] = float((depth > 0).mean())
         report.agreement[name] = agreement.share
         report.sparse_points += agreement
