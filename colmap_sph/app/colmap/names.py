@@ -73,6 +73,11 @@ OTHERS = frozenset(
 _TRIED = "COLMAP_SPH_TRIED"
 
 
+def is_handed_over(arguments: Sequence[str]) -> bool:
+    """Whether a command line is for COLMAP."""
+    return bool(arguments) and arguments[0] in OTHERS
+
+
 def hand_over(arguments: Sequence[str]) -> None:
     """Become COLMAP, with these arguments.
 

@@ -148,11 +148,13 @@ def _read_project(path: Path, command: ColmapCommand, flags: Mapping[str, Colmap
     section = ""
     for number, line in enumerate(text.split("\n"), 1):
         line = line.partition("#")[0].strip()
+        if not line:
+            continue
         if line.startswith("[") and line.endswith("]"):
             section = line[1:-1].strip()
             continue
         name, equals, word = (part.strip() for part in line.partition("="))
-        if line and not equals:
+        if not equals:
             raise InputError(f"{path}, line {number}: {line!r} is not name=value; mend it.")
         flag = f"{section}.{name}" if section else name
         if flag in flags:
