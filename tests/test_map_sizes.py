@@ -53,7 +53,7 @@ def test_no_depth_stays_none_and_surfaces_are_not_mixed():
     depth = np.where(np.arange(640) < 320, np.float32(2), np.float32(9)) * np.ones((480, 1), np.float32)
     depth[:, 100:200] = 0
     normals = np.zeros((3, 480, 640), np.float32)
-    normals[2] = -(depth > 0)
+    normals[2, depth > 0] = -1
     small = VIEW.resized(213, 160)
     reduced, reduced_normals = reduced_maps(depth, normals, VIEW, small)
     assert set(np.unique(reduced)) == {0, 2, 9}

@@ -75,9 +75,9 @@ class Known:
     size: Size
     digest: str
     stamp: tuple[int, ...]
-    detail_size: Size | None
     sample: ValueSample | None = None
     detail: float | None = None
+    detail_size: Size | None = None
 
 
 class KnownFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -186,7 +186,7 @@ class CheckStage(Stage[str, ImageFile]):
         known = self._known.get(item)
         is_read = known is not None and known.stamp == stamp
         digest = known.digest if known is not None and is_read else file_digest(image.path)
-        self._seen[item] = Known(image.size, digest, stamp, image.detail_size)
+        self._seen[item] = Known(image.size, digest, stamp, detail_size=image.detail_size)
         facts = None
         wanted = (digest, image.size, image.detail_size)
         if known is not None and (known.digest, known.size, known.detail_size) == wanted:
