@@ -81,6 +81,15 @@ def test_each_option_acts_or_is_named(command):
             assert hasattr(getattr(RunOptions(), stage) if stage else RunOptions(), name), flag
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_documents_say_what_each_option_does(command):
+    text = (Path(__file__).parents[1] / "docs/usage.md").read_text(encoding="utf-8")
+    section = text.partition("## In COLMAP's place")[2].partition("\n## ")[0]
+    for option in COMMANDS[command].sectioned:
+        row = f"| `--{COMMANDS[command].section}.{option.name}` | {option.text} |"
+        assert (row if option.acts else f"`{option.name}`") in section
+
+
 # ---- how they are read -------------------------------------------------------------------------------------
 
 

@@ -73,7 +73,7 @@ PATCH_MATCH_STEREO = (
     ColmapOption(
         "filter_geom_consistency_max_cost",
         1.0,
-        "two images' depths agree when the point projects back within so many pixels",
+        "depths of two images agree when the point projects back within so many pixels; 2 where it is not given",
         "confirm.max_reprojection_error",
     ),
     _idle("cache_size", 32.0, _CACHE),
