@@ -3,7 +3,6 @@
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -27,12 +26,13 @@ from colmap_sph.project.cloud_output import CloudOutput
 from colmap_sph.project.map_files import has_depth, map_size
 from colmap_sph.project.pair_lists import read_lines
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.array_file import SUFFIX
 from colmap_sph.project.state.ownership import map_place, named
 from colmap_sph.project.state.records import altered_files, read_record, whole_digests
 from colmap_sph.project.workspace import MapKind, Workspace, mask_path
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.anchor import anchored
-from colmap_sph.stereo.partners.pairing import Pair
+from colmap_sph.stereo.partners.pairing import Pair, as_pair
 
 logger = logging.getLogger(__name__)
 
@@ -156,9 +156,13 @@ def _matched_pairs(context: Context) -> list[Pair]:
     """Pairs that this program has matched in the workspace."""
     if not context.workspace.pairs_dir.is_dir():
         return []
-    there = {path.name for path in context.workspace.pairs_dir.iterdir()}
-    names = sorted(context.scene.index_of)
-    return [pair for pair in combinations(names, 2) if context.pair_path(*pair).name in there]
+    name_of = {view.image_id: view.name for view in context.scene.views}
+    pairs = []
+    for path in sorted(context.workspace.pairs_dir.glob(f"*{SUFFIX}")):
+        ids = [int(word) for word in path.stem.split("-") if word.isdecimal()]
+        if len(ids) == 2 and ids[0] in name_of and ids[1] in name_of:
+            pairs.append(as_pair(name_of[ids[0]], name_of[ids[1]]))
+    return pairs
 
 
 def _sources(context: Context, mapped: dict[str, View]) -> dict[str, MapSources]:

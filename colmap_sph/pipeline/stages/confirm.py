@@ -14,6 +14,7 @@ from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
+from colmap_sph.pipeline.stages.photo import bytes_to_reduce
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import read_whole_grey
@@ -168,6 +169,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         memory = _CONFIRM_BYTES * pixels
         if refinement.rounds:
             memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + _IMAGE_BYTES * sum(map(self._pixels, partners))
+        memory += bytes_to_reduce(*map(self.context.scene.view, [name, *partners]))
         return Cost(seconds * pixels / 1e6, memory, MAP_BYTES * pixels)
 
     def _pixels(self, name: str) -> int:

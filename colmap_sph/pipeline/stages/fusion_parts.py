@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.photo import bytes_to_reduce
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.cloud_files import write_part
@@ -135,7 +136,8 @@ class PartsStage(Stage[str, FuseTask]):
         pixels = scene.view(item).num_pixels
         partners, stations = self._partners[item]
         seconds = _SECONDS + _PARTNER_SECONDS * len(partners)
-        cost = Cost(seconds * pixels / 1e6, _FUSE_BYTES * pixels, CLOUD_BYTES * pixels)
+        memory = _FUSE_BYTES * pixels + bytes_to_reduce(*map(scene.view, [item, *partners]))
+        cost = Cost(seconds * pixels / 1e6, memory, CLOUD_BYTES * pixels)
         task = FuseTask(
             self._sources[item],
             tuple(self._sources[partner] for partner in partners),

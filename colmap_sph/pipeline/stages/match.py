@@ -15,7 +15,7 @@ from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
-from colmap_sph.pipeline.stages.photo import Grey, Photo
+from colmap_sph.pipeline.stages.photo import Grey, Photo, bytes_to_reduce
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import grey_bytes
@@ -171,10 +171,11 @@ class MatchStage(Stage[Pair, MatchTask]):
         target = context.pair_path(*item)
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)
+        reading = max(_READ_BYTES * pixels, bytes_to_reduce(left, right))
         both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
             seconds=_SECONDS * both_pixels / 1e6 * (1 + trial**2 * (trial < 1)),
-            memory=max(_MATCH_BYTES * left_pixels, _READ_BYTES * pixels + _RECTIFIED_BYTES * left_pixels),
+            memory=max(_MATCH_BYTES * left_pixels, reading + _RECTIFIED_BYTES * left_pixels),
             disk=_FILE_BYTES * left_pixels,
             scratch=scratch_bytes(left_pixels, context.options.matching),
         )
