@@ -14,6 +14,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from colmap_sph.app.colmap.python import patch_match_stereo as patch_match_stereo
+    from colmap_sph.app.colmap.python import stereo_fusion as stereo_fusion
     from colmap_sph.errors import ColmapSphError as ColmapSphError
     from colmap_sph.pipeline.options import RunOptions as RunOptions
     from colmap_sph.pipeline.presets import preset as preset
@@ -79,6 +81,7 @@ _MODULE_OF = {
     "confirm_depth": "stereo.confirm",
     "fit_normals": "stereo.normals",
     "match_pair": "stereo.matching",
+    "patch_match_stereo": "app.colmap.python",
     "preset": "pipeline.presets",
     "read_depth_map": "project.map_files",
     "read_grey": "project.images.reading",
@@ -91,6 +94,7 @@ _MODULE_OF = {
     "run": "pipeline.reconstruct",
     "run_project": "pipeline.reconstruct",
     "select_pairs": "stereo.partners.pairs",
+    "stereo_fusion": "app.colmap.python",
     "vote_depth": "stereo.vote",
     "write_depth_map": "project.map_files",
     "write_normal_map": "project.map_files",

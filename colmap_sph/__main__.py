@@ -1,10 +1,12 @@
 """The program's entry: the command line, once it is loaded, which takes a second or so."""
 
 import sys
+from contextlib import suppress
 from types import TracebackType
 
+from colmap_sph.app.colmap.names import hand_over, is_handed_over
 from colmap_sph.app.standard_streams import prepare_process, silence
-from colmap_sph.errors import OutOfMemoryError, OutputError, printable, reason_of
+from colmap_sph.errors import InputError, OutOfMemoryError, OutputError, printable, reason_of
 
 # What loaders and libraries say where the system refuses memory, threads or open files.
 _REFUSALS = (
@@ -47,6 +49,9 @@ def main() -> int:
 
 
 def _command() -> int:
+    if is_handed_over(sys.argv[1:]):
+        with suppress(InputError):  # said below
+            hand_over(sys.argv[1:])
     from colmap_sph.app import cli
 
     try:

@@ -44,6 +44,8 @@ class View:
     reprojection_error : float
         Median distance in pixels between where the view observes sparse points, as the model says, and where they
         project; NaN where that is not known.
+    full_size : (int, int), optional
+        Width and height of its image's file, where the view is smaller: the image is reduced when it is read.
     """
 
     image_id: int
@@ -55,11 +57,17 @@ class View:
     t: NDArray[np.float64]
     point_indices: NDArray[np.int64]
     reprojection_error: float = math.nan
+    full_size: tuple[int, int] | None = None
 
     @property
     def num_pixels(self) -> int:
         """Pixels of the image."""
         return self.width * self.height
+
+    @property
+    def file_size(self) -> tuple[int, int]:
+        """Width and height that the image's file must have."""
+        return self.full_size or (self.width, self.height)
 
     @property
     def center(self) -> NDArray[np.float64]:
@@ -79,6 +87,38 @@ class View:
     def without_points(self) -> "View":
         """The view as if it observed no sparse point: all that a worker needs of it."""
         return replace(self, point_indices=self.point_indices[:0])
+
+    def resized(self, width: int, height: int) -> "View":
+        """The view with as many pixels: its image is reduced, or enlarged, when it is read.
+
+        Examples
+        --------
+        >>> K = np.array([[100.0, 0, 320], [0, 100, 240], [0, 0, 1]])
+        >>> view = View(1, "a.jpg", 640, 480, K, np.eye(3), np.zeros(3), np.empty(0, np.int64))
+        >>> half = view.resized(320, 240)
+        >>> half.K[:2].tolist(), half.file_size
+        ([[50.0, 0.0, 160.0], [0.0, 50.0, 120.0]], (640, 480))
+        """
+        if (width, height) == (self.width, self.height):
+            return self
+        scale = np.array([width / self.width, height / self.height, 1.0])
+        error = self.reprojection_error * float(scale[:2].mean())
+        full_size = None if (width, height) == self.file_size else self.file_size
+        return replace(
+            self,
+            width=width,
+            height=height,
+            K=self.K * scale[:, None],
+            reprojection_error=error,
+            full_size=full_size,
+        )
+
+    def no_larger_than(self, max_size: int) -> "View":
+        """The view reduced, as COLMAP does it, so that no side has more pixels; -1 or 0: as it is."""
+        factor = max_size / max(self.width, self.height)
+        if max_size <= 0 or factor >= 1:
+            return self
+        return self.resized(max(round(self.width * factor), 1), max(round(self.height * factor), 1))
 
     def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project points into the image, wherever its borders are.
@@ -165,6 +205,10 @@ class Scene:
     def only(self, names: Collection[str]) -> "Scene":
         """The scene with the views of these images alone."""
         return replace(self, views=tuple(view for view in self.views if view.name in names))
+
+    def no_larger_than(self, max_size: int) -> "Scene":
+        """The scene with views that have at most as many pixels on a side; -1: as they are."""
+        return replace(self, views=tuple(view.no_larger_than(max_size) for view in self.views))
 
     def view(self, name: str) -> View:
         """Return the view of image `name`; `InputError` where the scene has none."""

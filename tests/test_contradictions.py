@@ -18,6 +18,7 @@ from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages import match
 from colmap_sph.project.project import Project
+from colmap_sph.scene import View
 from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.vote import VoteOptions
@@ -102,17 +103,17 @@ def test_masks_of_everything_are_not_blamed_on_confirmation(project):
 
 def test_a_pair_lost_for_a_moment_makes_the_run_incomplete(project, monkeypatch):
     """The disk fails once while a pair is read: said of both images, and done by the next run."""
-    original = match.read_mask
+    original = match.read_view_mask
     calls = []
 
-    def fails_once(path: Path, width: int, height: int):
+    def fails_once(path: Path, view: View):
         calls.append(path)
         if len(calls) == 1:
             raise InputError(f"{path} cannot be read (Input/output error).")
-        return original(path, width, height)
+        return original(path, view)
 
     shutil.rmtree(project / "dense/colmap_sph/pairs")
-    monkeypatch.setattr(match, "read_mask", fails_once)
+    monkeypatch.setattr(match, "read_view_mask", fails_once)
     report = colmap_sph.run(workspace=project / "dense", options=OPTIONS)
     assert report.skipped_images == {}
     assert len(report.skipped_pairs) == 1 and len(report.incomplete) == 2

@@ -9,7 +9,7 @@ from projects import make_context, prepare
 
 import colmap_sph
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.foresight import foreseen_stages
+from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.reconstruct import choose_pairs, with_good_images

@@ -22,6 +22,7 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import parse_memory
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages import fuse as fuse_module
+from colmap_sph.pipeline.stages import fusion_parts as parts_module
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.stage import Result
@@ -223,7 +224,7 @@ NEEDED = int(1.15 * 60 * WIDTH * HEIGHT)
 @contextmanager
 def counted(monkeypatch):
     """Largest number of images in work at a time."""
-    original, lock, counts = fuse_module.write_part, threading.Lock(), [0, 0]
+    original, lock, counts = parts_module.write_part, threading.Lock(), [0, 0]
 
     def write(stem, bands):
         with lock:
@@ -236,7 +237,7 @@ def counted(monkeypatch):
                 counts[0] -= 1
 
     with monkeypatch.context() as patch:
-        patch.setattr(fuse_module, "write_part", write)
+        patch.setattr(parts_module, "write_part", write)
         patch.setattr(memory, "resident", lambda: 100 << 20)
         yield counts
 
@@ -388,7 +389,7 @@ def test_a_partner_that_cannot_be_read_for_a_moment_is_made_up_for(workspace, mo
     """One read of c.png fails while a.png is fused: the cloud lacks something, and nothing vouches for it."""
     fuse(workspace)
     whole = cloud_bytes(workspace)
-    original = fuse_module.read_view_maps
+    original = parts_module.read_view_maps
     failed: list[str] = []
 
     def fails_once(sources):
@@ -398,7 +399,7 @@ def test_a_partner_that_cannot_be_read_for_a_moment_is_made_up_for(workspace, mo
         return original(sources)
 
     shutil.rmtree(workspace.state_dir)
-    monkeypatch.setattr(fuse_module, "read_view_maps", fails_once)
+    monkeypatch.setattr(parts_module, "read_view_maps", fails_once)
     report = fuse(workspace)
     assert failed and cloud_bytes(workspace) != whole
     assert list(report.incomplete) == ["c.png"]

@@ -10,6 +10,8 @@ import cv2
 import tyro
 
 import colmap_sph
+from colmap_sph.app.colmap.commands import answer as colmap_answer
+from colmap_sph.app.colmap.commands import is_colmap_command
 from colmap_sph.app.completion import short_completion
 from colmap_sph.app.demo import run_demo
 from colmap_sph.app.display import Display
@@ -79,6 +81,8 @@ def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
     if arguments and arguments[0] in ("--version", "-V"):
         print_result(f"colmap_sph {colmap_sph.__version__}")
         return 0
+    if arguments and is_colmap_command(arguments[0]):
+        return _answer_as_colmap(arguments, terminal)
     asks_for_all = not {"--help-all", "--help_all"}.isdisjoint(arguments)
     if arguments[:1] == ["run"] and (asks_for_all or not {"-h", "--help"}.isdisjoint(arguments)):
         print_result(help_text(everything=asks_for_all))
@@ -109,6 +113,19 @@ def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
 def _events_of(command: Command) -> Events:
     is_wanted = isinstance(command, RunCommand) and command.progress == "json"
     return Events(sys.stdout if is_wanted else None)
+
+
+def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal) -> int:
+    def last_words(_: Interrupted) -> None:
+        logger.info("Interrupted")
+        _print_interrupted(None, terminal)
+
+    try:
+        with stop_on_signals(last_words):
+            return colmap_answer(arguments, terminal)
+    except Interrupted as stop:
+        _print_interrupted(None, terminal)
+        return stop.exit_code
 
 
 def _parsed(arguments: Sequence[str]) -> Command:
@@ -153,7 +170,7 @@ def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[s
     return 0
 
 
-def _print_interrupted(command: Command, terminal: Terminal) -> None:
+def _print_interrupted(command: Command | None, terminal: Terminal) -> None:
     words = (
         "what is finished is kept, run the same command again to go on" if isinstance(command, RunCommand) else ""
     )

@@ -212,7 +212,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     facts.append(("pairs", f"{report.pairs} matched ({report.pair_source})"))
     if report.polishing:
         facts.append(("poses", report.polishing))
-    facts.append(("cloud", f"{report.points:,} points in {workspace.fused_path}"))
+    if report.points:  # there are none where only maps were asked for
+        facts.append(("cloud", f"{report.points:,} points in {workspace.fused_path}"))
     if any(report.reused.values()):
         kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
         facts.append(("up to date", kept))

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import get_args
+from typing import Literal, get_args
 
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
@@ -21,6 +21,9 @@ from colmap_sph.stereo.agreement import SparseTracks
 from colmap_sph.stereo.partners.stations import Stations
 
 logger = logging.getLogger(__name__)
+
+Until = Literal["photometric", "geometric", "cloud"]
+"""The last results that a run makes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +87,13 @@ class Context:
         names = [view.name for view in self.scene.views]
         maps = [map_place(self.workspace, name, kind) for name in names for kind in get_args(MapKind)]
         return [*maps, self.cloud_place]
+
+    def places_until(self, last: str) -> list[Place]:
+        """All that a run writes in COLMAP's formats, up to "photometric" or "geometric" maps, or the "cloud"."""
+        if last == "cloud":
+            return self.places
+        kinds: tuple[MapKind, ...] = ("photometric",) if last == "photometric" else get_args(MapKind)
+        return [map_place(self.workspace, view.name, kind) for view in self.scene.views for kind in kinds]
 
     def stage(self, name: str, total: int) -> AbstractContextManager[None]:
         """Announce a stage of `total` steps, and report its wall time."""

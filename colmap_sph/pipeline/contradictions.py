@@ -22,7 +22,7 @@ def check_numbers(context: Context, pairs: Sequence[Pair]) -> None:
     """
     partners = partners_of(pairs)
     most = max((len(set(context.stations.elsewhere(name, partners[name])[1])) for name in partners), default=0)
-    _check_fusion(context)
+    check_fusion(context)
     support = context.options.vote.min_support
     if support > most:
         raise OptionError(
@@ -41,8 +41,11 @@ def check_numbers(context: Context, pairs: Sequence[Pair]) -> None:
         )
 
 
-def _check_fusion(context: Context) -> None:
-    """COLMAP's fusion counts several pixels of one image, too."""
+def check_fusion(context: Context) -> None:
+    """Raise `OptionError` where no point can have as many images that agree as are asked for.
+
+    COLMAP's fusion counts several pixels of one image, too.
+    """
     options = context.options.fusion
     images = len(context.scene.views)
     if options.method == "colmap":

@@ -74,6 +74,11 @@ class Keys:
         path = self._workspace.mask_path(name)
         return self._masks.get(name, lambda: None if self.fresh else _digest_if_there(path))
 
+    @property
+    def _depths(self) -> tuple[float, ...]:
+        """Depths that maps are cut to, if they are."""
+        return self._options.rectification.depths or ()
+
     def _key(self, kind: str, *parts: object) -> str:
         return digest(kind, self._programs.get(kind), self.fresh, *parts)
 
@@ -134,7 +139,8 @@ class Keys:
     ) -> str:
         """Of a photometric estimate, from the keys of its pairs as they vote, their stations and residuals."""
         mask = self._mask(view.name)
-        return self._key("vote", _camera(view), mask, pair_keys, stations, residuals, self._options.vote)
+        options = (self._options.vote, *self._depths)
+        return self._key("vote", _camera(view), mask, pair_keys, stations, residuals, *options)
 
     def photometric(self, vote: str) -> str:
         """Of the photometric maps of the view with this vote."""
@@ -153,7 +159,7 @@ class Keys:
         The sparse points have a part in what is known of the maps.
         """
         # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
-        options = (self._options.confirm, self._options.normals, self._options.refinement)
+        options = (self._options.confirm, self._options.normals, self._options.refinement, *self._depths)
         return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)
 
     def cloud(self, maps: Mapping[str, str], partners: Mapping[str, Sequence[object]], scene: Scene) -> str:

@@ -15,11 +15,11 @@ from pathlib import Path
 from statistics import mean
 from typing import Any, Protocol
 
-from colmap_sph.errors import NoResultError, OptionError
-from colmap_sph.pipeline.context import Context, timed_stage
+from colmap_sph.errors import InputError, NoResultError, OptionError
+from colmap_sph.pipeline.context import Context, Until, timed_stage
 from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.foresight import foreseen_stages
+from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
@@ -32,7 +32,7 @@ from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
-from colmap_sph.pipeline.stages.vote import VoteStage
+from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.database import read_verified_matches
@@ -178,6 +178,9 @@ def reconstruct(
     given: GivenModel | None = None,
     overwrite: bool = False,
     verify: bool = False,
+    until: Until = "cloud",
+    pair_list: Path | None = None,
+    needs_all: bool = False,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -199,6 +202,12 @@ def reconstruct(
         refused.
     verify : bool
         See `run`.
+    until : {"photometric", "geometric", "cloud"}
+        The last results to make: maps of a kind, or the cloud.
+    pair_list : Path, optional
+        Which pairs to match, in the format of ``patch-match.cfg`` and instead of the workspace's own.
+    needs_all : bool
+        Whether an image that is missing or damaged ends the run (`InputError`) before anything is made.
 
     Returns
     -------
@@ -209,7 +218,9 @@ def reconstruct(
     make_dir(workspace.state_dir)
     with one_opencv_thread():
         is_polishing = given is not None and options.polish.is_wanted
-        scene = anchored(read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir))
+        scene = read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir)
+        # Images that this program undistorted are no larger.
+        scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         for name in sorted({*expected} - scene.index_of.keys()):
             if name not in report.skipped_images:
@@ -217,13 +228,16 @@ def reconstruct(
                 progress.leave_out("image", name, report.skipped_images[name])
         context = with_good_images(context, execute, verify=verify)
         scene = context.scene
+        if needs_all and report.skipped_images:
+            reason = next(iter(sorted(report.skipped_images.items())))[1]
+            raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
-            selection = choose_pairs(workspace, scene, options, database)
+            selection = choose_pairs(workspace, scene, options, database, pair_list)
             report.pair_source = selection.source
             progress.advance()
         context = replace(context, scene=wanted_scene(scene, selection))
-        take_places(context.places, overwrite=overwrite)
+        take_places(context.places_until(until), overwrite=overwrite)
         if verify:
             _verify(context)
         if given is not None and is_polishing:
@@ -231,12 +245,12 @@ def reconstruct(
             progress.foresee(foreseen_stages(context, selection.unique_pairs(), first))
             context = with_polished_poses(context, selection.unique_pairs(), execute, given)
         judge_reprojection(report, context.scene)
-        progress.foresee(foreseen_stages(context, selection.unique_pairs()))
-        go_through_stages(context, selection.unique_pairs(), execute)
+        progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
+        go_through_stages(context, selection.unique_pairs(), execute, until=until)
         judge_agreement(report)
     _write_report(context)
     refuse_disagreement(report)
-    if not report.points:
+    if until == "cloud" and not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
 
@@ -262,7 +276,9 @@ class Executor(Protocol):
         """Return the result of each item; those that fail are left out."""
 
 
-def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executor) -> None:
+def go_through_stages(
+    context: Context, pairs: Sequence[Pair], executor: Executor, *, until: Until = "cloud"
+) -> None:
     """Go through the stages in their order: each begins where all results of the one before are known.
 
     Parameters
@@ -272,14 +288,20 @@ def go_through_stages(context: Context, pairs: Sequence[Pair], executor: Executo
         Names of the images of each pair.
     executor : callable
         What is done with each stage, see `Executor`.
+    until : {"photometric", "geometric", "cloud"}
+        The last results to make.
     """
     check_numbers(context, pairs)
     matched = executor(MatchStage(context, pairs))
     measured = {pair: result.facts.row_residual for pair, result in matched.items()}
     judge_rows(context.report, context.scene, measured)
     votes = executor(VoteStage(context, matched))
+    if until == "photometric":
+        report_photometric(context, votes)
+        return
     maps = executor(ConfirmStage(context, matched, votes))
-    executor(fuse_stage(context, keys_of(matched), maps))
+    if until == "cloud":
+        executor(fuse_stage(context, keys_of(matched), maps))
 
 
 def with_good_images(
@@ -302,9 +324,10 @@ def with_good_images(
     """
     workspace = context.workspace
     there = [view for view in context.scene.views if view.name not in to_come]
-    sizes = {view.name: (view.width, view.height) for view in there}
+    sizes = {view.name: view.file_size for view in there}
+    worked_at = {view.name: (view.width, view.height) for view in there}
     places = ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
-    checked = executor(CheckStage(context, sizes, places, verify=verify)) if there else {}
+    checked = executor(CheckStage(context, sizes, places, worked_at, verify=verify)) if there else {}
     images = keys_of(checked)
     details = details_of(checked)
     if details:
@@ -323,7 +346,11 @@ def _report_detail(context: Context, details: Mapping[str, float]) -> None:
 
 
 def choose_pairs(
-    workspace: Workspace | None, scene: Scene, options: RunOptions, database: Path | None
+    workspace: Workspace | None,
+    scene: Scene,
+    options: RunOptions,
+    database: Path | None,
+    pair_list: Path | None = None,
 ) -> PairSelection:
     """Select the pairs of a scene, as the user's ``patch-match.cfg`` says where there is one.
 
@@ -333,15 +360,17 @@ def choose_pairs(
         None: it is not there yet, and so no such file.
     scene : Scene
     options : RunOptions
-    database : Path, optional
+    database, pair_list : Path, optional
         See `reconstruct`.
 
     Returns
     -------
     PairSelection
     """
-    path = None if workspace is None else workspace.patch_match_cfg_path
-    written = read_patch_match_cfg(path) if path is not None and path.exists() else None
+    path = pair_list
+    if path is None and workspace is not None and workspace.patch_match_cfg_path.exists():
+        path = workspace.patch_match_cfg_path
+    written = None if path is None else read_patch_match_cfg(path)
     matches = None if database is None or scene.has_tracks else read_verified_matches(database)
     return select_pairs(scene, options.pairs, explicit=written, matches=matches)
 

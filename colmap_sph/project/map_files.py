@@ -115,12 +115,7 @@ def check_map(path: Path, shape: tuple[int, ...]) -> None:
     COLMAP's fusion trusts the files: it fuses one that is cut off or of another size without a word, or raises an
     error that does not name it.
     """
-    try:
-        with open_regular(path) as file:
-            start = file.read(_MAX_HEADER)
-            size = file.seek(0, 2)
-    except OSError as error:
-        raise InputError(f"The map {path} cannot be read ({reason_of(error)}); compute it again.") from error
+    start, size = _start_of(path)
     channels = shape[2] if len(shape) == 3 else 1
     found, _ = _parse_header(path, start, size, channels)
     if found != shape[:2]:
@@ -128,6 +123,30 @@ def check_map(path: Path, shape: tuple[int, ...]) -> None:
             f"The map {path} has {found[1]} x {found[0]} pixels, but its image {shape[1]} x {shape[0]}; "
             "delete it and compute it again."
         )
+
+
+def map_size(path: Path, channels: int = 1) -> tuple[int, int]:
+    """Width and height of a map of 1 or 3 channels; `InputError` where its file is not whole."""
+    start, size = _start_of(path)
+    (height, width), _ = _parse_header(path, start, size, channels)
+    return width, height
+
+
+def has_depth(path: Path) -> bool:
+    """Whether a depth map has a depth anywhere; it is read as far as the first one."""
+    start, size = _start_of(path)
+    (height, width), header = _parse_header(path, start, size, 1)
+    values = np.memmap(path, "<f4", "r", header, (height * width,))
+    return any((values[first : first + _BAND_VALUES] > 0).any() for first in range(0, len(values), _BAND_VALUES))
+
+
+def _start_of(path: Path) -> tuple[bytes, int]:
+    """The first bytes of a map file, and its size."""
+    try:
+        with open_regular(path) as file:
+            return file.read(_MAX_HEADER), file.seek(0, 2)
+    except OSError as error:
+        raise InputError(f"The map {path} cannot be read ({reason_of(error)}); compute it again.") from error
 
 
 def _parse_header(path: Path, start: bytes, size: int, channels: int) -> tuple[tuple[int, int], int]:

@@ -18,8 +18,9 @@ from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file, make_dir, real_path
 from colmap_sph.project.images.decoding import read_pixels
 from colmap_sph.project.images.jpeg import DamagedError
-from colmap_sph.project.images.reading import image_problem
+from colmap_sph.project.images.reading import fitted, image_problem
 from colmap_sph.project.workspace import mask_path
+from colmap_sph.scene import View
 
 logger = logging.getLogger(__name__)
 
@@ -59,6 +60,14 @@ def read_mask(path: Path, width: int, height: int) -> NDArray[np.uint8] | None:
     except DamagedError as error:
         raise _unusable(path, f"is damaged or no image ({error})") from error
     return np.where((pixels != 0).any(axis=2), np.uint8(255), np.uint8(0))
+
+
+def read_view_mask(path: Path, view: View) -> NDArray[np.uint8] | None:
+    """Do what `read_mask` does for a view's image; of a reduced view a pixel counts where all of it does."""
+    mask = read_mask(path, *view.file_size)
+    if mask is None or view.full_size is None:
+        return mask
+    return np.where(fitted(mask, (view.width, view.height)) == 255, np.uint8(255), np.uint8(0))
 
 
 def _unusable(path: Path, problem: str) -> InputError:

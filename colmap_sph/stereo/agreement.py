@@ -4,13 +4,14 @@ The sparse points come from the same poses as the depth maps, but from other mea
 belong to their poses, or are turned, next to no point agrees with the maps; where all fits, nearly all do.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.depth import Depths
 
 # Sparse points of a view to look at, an even part of them.
 _MAX_POINTS = 500
@@ -42,6 +43,13 @@ class SparseSights:
     point: NDArray[np.int64]
     at_center: NDArray[np.float64]
     at_point: NDArray[np.float64]
+
+    def between(self, depths: Depths | None) -> "SparseSights":
+        """The same where only these depths are wanted: no other point is asked."""
+        if depths is None:
+            return self
+        wanted = (self.depth >= depths[0]) & (self.depth <= depths[1])
+        return replace(self, depth=np.where(wanted, self.depth, 0.0))
 
 
 class SparseTracks:

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+Depths = tuple[float, float]
+"""Least and largest depth that is wanted, model units."""
+
 
 @dataclass(frozen=True, eq=False)
 class DepthEstimate:
@@ -26,3 +29,9 @@ class DepthEstimate:
     depth: NDArray[np.float32]
     sigma: NDArray[np.float32]
     support: NDArray[np.uint8]
+
+
+def drop_other_depths(depth: NDArray[np.float32], depths: Depths | None) -> None:
+    """Set a depth map to 0, in place, where its depth is none of those wanted; None: all are."""
+    if depths is not None:
+        depth[(depth < depths[0]) | (depth > depths[1])] = 0

@@ -98,10 +98,15 @@ def parallax_range(parallaxes: Float, near_margin: float, far_margin: float) -> 
     if len(parallaxes) < _MIN_POINTS:
         least, most = np.radians(_UNKNOWN_DEGREES)
         return least, most
-    least, most = np.percentile(parallaxes, _PERCENTILES)
-    least = few_digits(max(float(least), _LEAST_PARALLAX), np.floor)
-    most = few_digits(max(float(most), _LEAST_PARALLAX), np.ceil)
+    least, most = bounded_range(np.percentile(parallaxes, _PERCENTILES))
     return least / far_margin, most * near_margin
+
+
+def bounded_range(parallaxes: Float) -> Range:
+    """Least and most of some parallaxes, a little rounded outwards; nothing is behind the cameras."""
+    least = few_digits(max(float(parallaxes.min()), _LEAST_PARALLAX), np.floor)
+    most = few_digits(max(float(parallaxes.max()), _LEAST_PARALLAX), np.ceil)
+    return least, most
 
 
 def few_digits(value: float, rounded: Callable[[float], float]) -> float:

@@ -10,7 +10,15 @@ import numpy as np
 
 from colmap_sph.errors import OptionError, RectificationError
 from colmap_sph.scene import Scene, View
-from colmap_sph.stereo.disparity_range import Range, columns_with_counterparts, few_digits, parallax_range
+from colmap_sph.stereo.disparity_range import (
+    Range,
+    bounded_range,
+    columns_with_counterparts,
+    few_digits,
+    parallax_angles,
+    parallax_range,
+    parallax_tangents,
+)
 from colmap_sph.stereo.extent import Extent, extent_on_plane, extent_on_sphere
 from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Surface
@@ -27,6 +35,8 @@ _MAX_SIDE = 32766
 # windows are of whole pixels; and as many per pixel at most.
 _OVERSAMPLING = 1.45
 _MOST_SAMPLING = 1.3
+# Rays of a view along each side, and depths along each of them, that stand for all between two depths.
+_DEPTH_SAMPLES = 17
 # Fewer rows or columns than this are not worth matching.
 _MIN_SIDE = 16
 
@@ -48,6 +58,10 @@ class RectificationOptions:
     roofs often carry no sparse point."""
     far_margin: float = 1.5
     """Surfaces are looked for up to the distance of the farthest sparse points times this."""
+    min_depth: float = -1.0
+    """Least depth to look for, model units, instead of what the sparse points tell; -1: these."""
+    max_depth: float = -1.0
+    """Largest depth to look for; goes with `min_depth`. Maps have no other depths then."""
     max_pixels_ratio: float = 8.0
     """A pair is given up when its rectified images have more pixels than this times the originals."""
 
@@ -62,10 +76,22 @@ class RectificationOptions:
         for name in ("near_margin", "far_margin"):
             if not 1 <= getattr(self, name) <= 20:
                 raise OptionError(f"{name} must lie in 1..20, not {getattr(self, name)}.", name)
+        if (self.min_depth, self.max_depth) != (-1.0, -1.0) and not 0 < self.min_depth < self.max_depth < np.inf:
+            raise OptionError(
+                f"min_depth must be above 0 and less than max_depth, or both must be -1, not {self.min_depth} "
+                f"and {self.max_depth}.",
+                "min_depth",
+                "max_depth",
+            )
         if not 1 <= self.max_pixels_ratio <= 100:
             raise OptionError(
                 f"max_pixels_ratio must lie in 1..100, not {self.max_pixels_ratio}.", "max_pixels_ratio"
             )
+
+    @property
+    def depths(self) -> tuple[float, float] | None:
+        """Least and largest depth to look for; None where the sparse points tell."""
+        return None if self.max_depth <= 0 else (self.min_depth, self.max_depth)
 
 
 def sampling_of(detail: float) -> float:
@@ -133,7 +159,10 @@ def rectify_pair(
     scales = _scale(left, points), _scale(right, points)
     scale = options.sampling * max(samplings[0] * scales[0], samplings[1] * scales[1])
     scale = few_digits(scale, np.round)
-    pair = _laid_out(options.surface, extent, baseline, scale, options)
+    searched = parallax_range(extent.parallaxes, options.near_margin, options.far_margin)
+    if options.depths is not None:
+        searched = _range_of_depths(left, right, extent.rotation, options.depths, options.surface, baseline)
+    pair = _laid_out(options.surface, extent, baseline, scale, searched)
     _check_size(pair, left, right, options.max_pixels_ratio * max(1.0, scale / max(scales)) ** 2)
     return pair
 
@@ -174,11 +203,31 @@ def _scale(view: View, points: Float) -> float:
     return float(np.sqrt(view.K[0, 0] * view.K[1, 1]) * np.mean(cosine**-1.5))
 
 
-def _laid_out(
-    surface: Surface, extent: Extent, baseline: float, scale: float, options: RectificationOptions
-) -> RectifiedPair:
+def _range_of_depths(
+    left: View, right: View, rotation: Float, depths: tuple[float, float], surface: Surface, baseline: float
+) -> Range:
+    """Parallaxes of what either view sees between two depths in it, and the other has in view."""
+    grid = np.linspace(0, 1, _DEPTH_SAMPLES)
+    x, y, depth = np.meshgrid(grid, grid, np.geomspace(*depths, _DEPTH_SAMPLES))
+    seen = []
+    for view, other in ((left, right), (right, left)):
+        pixels = np.stack([x.ravel() * view.width, y.ravel() * view.height, np.ones(x.size)], axis=1)
+        camera = depth.reshape(-1, 1) * (pixels @ np.linalg.inv(view.K).T)
+        points = (camera - view.t) @ view.R
+        seen.append(points[sees(other, points)])
+    points = np.concatenate(seen)
+    if surface == "spherical":
+        parallaxes = parallax_angles(left, right, rotation, points)
+    else:
+        parallaxes = parallax_tangents(left, rotation, points, baseline)
+    if not len(parallaxes):
+        raise RectificationError("the two images do not overlap at the depths that are asked for")
+    return bounded_range(parallaxes)
+
+
+def _laid_out(surface: Surface, extent: Extent, baseline: float, scale: float, searched: Range) -> RectifiedPair:
     """The rectified images, at `scale` pixels per radian, of what can have a counterpart."""
-    least, most = parallax_range(extent.parallaxes, options.near_margin, options.far_margin)
+    least, most = searched
     left, right = columns_with_counterparts(*extent.columns, least, most)
     low, high = extent.rows
     rows_per_radian = scale

@@ -44,11 +44,11 @@ _DETAIL_SECONDS = 0.03
 
 @dataclass(frozen=True)
 class ImageFile:
-    """An image, the size that it must have, (width, height) in pixels, and whether its detail is asked for."""
+    """An image, the size (width, height) that it must have, and the one at which its detail is asked for."""
 
     path: Path
     size: Size
-    wants_detail: bool
+    detail_size: Size | None
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def check_image(task: ImageFile) -> ImageFacts:
     problem = image_problem(task.path, *task.size)
     if problem is not None:
         raise InputError(f"{task.path} {problem}")
-    detail = image_detail(read_grey(task.path)) if task.wants_detail else None
+    detail = image_detail(read_grey(task.path, task.detail_size)) if task.detail_size else None
     return ImageFacts(sample=sample_values(task.path), detail=detail)
 
 
@@ -77,6 +77,7 @@ class Known:
     stamp: tuple[int, ...]
     sample: ValueSample | None = None
     detail: float | None = None
+    detail_size: Size | None = None
 
 
 class KnownFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -147,6 +148,8 @@ class CheckStage(Stage[str, ImageFile]):
     sizes : mapping of str to (int, int)
         Width and height of each image by its name.
     places : ImagePlaces
+    detail_sizes : mapping of str to (int, int), optional
+        Width and height at which each image's detail is measured; without it, it is not.
     verify : bool
         Whether what is known does not count.
     """
@@ -158,12 +161,13 @@ class CheckStage(Stage[str, ImageFile]):
         context: "Context",
         sizes: Mapping[str, Size],
         places: ImagePlaces,
+        detail_sizes: Mapping[str, Size] | None = None,
         *,
         verify: bool = False,
     ) -> None:
         super().__init__(context, sorted(sizes))
         self.name = f"check {places.what}"  # type: ignore[misc]
-        self._wants_detail = places.what == "images"
+        self._detail_sizes = detail_sizes or {}
         self._sizes = sizes
         self._places = places
         self._bad: dict[str, str] = {}
@@ -174,7 +178,7 @@ class CheckStage(Stage[str, ImageFile]):
 
     def job(self, item: str) -> Job[ImageFile]:
         """See `Stage.job`."""
-        image = ImageFile(self._places.path(item), self._sizes[item], self._wants_detail)
+        image = ImageFile(self._places.path(item), self._sizes[item], self._detail_sizes.get(item))
         problem = image_problem(image.path, *image.size, decode=False)
         if problem is not None:
             raise InputError(f"{image.path} {problem}")
@@ -182,9 +186,10 @@ class CheckStage(Stage[str, ImageFile]):
         known = self._known.get(item)
         is_read = known is not None and known.stamp == stamp
         digest = known.digest if known is not None and is_read else file_digest(image.path)
-        self._seen[item] = Known(image.size, digest, stamp)
+        self._seen[item] = Known(image.size, digest, stamp, detail_size=image.detail_size)
         facts = None
-        if known is not None and (known.digest, known.size) == (digest, image.size):
+        wanted = (digest, image.size, image.detail_size)
+        if known is not None and (known.digest, known.size, known.detail_size) == wanted:
             facts = ImageFacts(sample=known.sample, detail=known.detail)
         return Job(digest, facts, self._cost(image), image)
 
@@ -192,7 +197,7 @@ class CheckStage(Stage[str, ImageFile]):
         pixels = image.size[0] * image.size[1]
         seconds = _SECONDS * pixels / 1e6
         memory = (_JPEG_BYTES if is_jpeg(image.path) else _OTHER_BYTES) * pixels
-        if image.wants_detail:
+        if image.detail_size:
             seconds += _READ_SECONDS * pixels / 1e6 + _DETAIL_SECONDS
         return Cost(seconds, memory, 0.0)
 

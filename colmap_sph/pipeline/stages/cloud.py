@@ -11,7 +11,7 @@ from msgspec import Meta
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.project.files import read_small, whole_digest
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
-from colmap_sph.project.masks import read_mask
+from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.pair_lists import fusion_cfg, write_fusion_cfg
 from colmap_sph.project.sparse_model import image_names, load_model
 from colmap_sph.project.state.ownership import fusion_cfg_place
@@ -70,7 +70,7 @@ def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts, *, is_compl
         Whether nothing that belongs to it could not be read.
     """
     place = context.cloud_place
-    digests = {path: whole_digest(path) for path in place.files}
+    digests = {path: whole_digest(path) for path in place.files if path.exists()}
     vouch_when_on_disk(place.record, key, digests, facts, state="done" if is_complete else "void")
 
 
@@ -153,7 +153,7 @@ def facts_of_cloud(
         found = int((depth > 0).sum())
         if options.mask_path is not None:
             view = context.scene.view(name)
-            mask = read_mask(mask_path(options.mask_path, name), view.width, view.height)
+            mask = read_view_mask(mask_path(options.mask_path, name), view)
             if mask is not None:
                 depth[mask == 0] = 0
         with_depth += found

@@ -14,14 +14,15 @@ from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
+from colmap_sph.pipeline.stages.photo import bytes_to_reduce
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import read_whole_grey
-from colmap_sph.project.masks import read_mask
+from colmap_sph.project.masks import read_view_mask
 from colmap_sph.scene import View
 from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
-from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
@@ -69,6 +70,7 @@ class ConfirmTask:
     confirm_options: ConfirmOptions
     normal_options: NormalOptions
     refinement_options: RefinementOptions
+    depths: Depths | None
     maps: MapFiles
     key: str
 
@@ -91,8 +93,9 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
             task.refinement_options,
             _usual(task.residuals),
         )
-    mask = read_mask(task.mask, view.width, view.height)
+    mask = read_view_mask(task.mask, view)
     normals, depth = planes
+    drop_other_depths(depth, task.depths)
     agreement = Agreement(*compare_with_sparse(view, depth, task.sights, mask))
     return task.maps.write(normals, depth, task.key, agreement)
 
@@ -106,7 +109,8 @@ def _estimate(file: EstimateFile) -> DepthEstimate:
 
 
 def _image(file: EstimateFile) -> NDArray[np.uint8]:
-    return _images.get(file_stamp(file.image), lambda: read_whole_grey(file.image))
+    size = (file.view.width, file.view.height)
+    return _images.get(f"{file_stamp(file.image)} {size}", lambda: read_whole_grey(file.image, size))
 
 
 class ConfirmStage(Stage[str, ConfirmTask]):
@@ -128,7 +132,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         options = self.context.options
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
-        sights = self._tracks.sights(item)
+        sights = self._tracks.sights(item).between(options.rectification.depths)
         residuals = [self._residuals[as_pair(item, name)] for name in partners]
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights)
         maps = self.context.map_files(item, "geometric")
@@ -142,6 +146,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
             options.confirm,
             options.normals,
             options.refinement,
+            options.rectification.depths,
             maps,
             key,
         )
@@ -164,6 +169,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         memory = _CONFIRM_BYTES * pixels
         if refinement.rounds:
             memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + _IMAGE_BYTES * sum(map(self._pixels, partners))
+        memory += bytes_to_reduce(*map(self.context.scene.view, [name, *partners]))
         return Cost(seconds * pixels / 1e6, memory, MAP_BYTES * pixels)
 
     def _pixels(self, name: str) -> int:

@@ -15,11 +15,11 @@ from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
-from colmap_sph.pipeline.stages.photo import Grey, Photo
+from colmap_sph.pipeline.stages.photo import Grey, Photo, bytes_to_reduce
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import grey_bytes
-from colmap_sph.project.masks import read_mask
+from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX
 from colmap_sph.project.state.ownership import remove_array_files
 from colmap_sph.scene import View
@@ -123,7 +123,8 @@ def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32
 
 
 def _photo(file: PhotoFile) -> Photo:
-    return _photos.get(file_stamp(file.image), lambda: Photo.read(file.image))
+    size = (file.view.width, file.view.height)
+    return _photos.get(f"{file_stamp(file.image)} {size}", lambda: Photo.read(file.image, size))
 
 
 def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> RectifiedImage:
@@ -138,7 +139,7 @@ def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> Rectifie
 
 def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
     """255 where an image takes part in matching, else 0; None where all of it does."""
-    mask = read_mask(photo.mask, photo.view.width, photo.view.height)
+    mask = read_view_mask(photo.mask, photo.view)
     blank = None if keep_blank else blank_pixels(image)
     if blank is None or not blank.any():
         return mask
@@ -171,10 +172,11 @@ class MatchStage(Stage[Pair, MatchTask]):
         target = context.pair_path(*item)
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)
+        reading = max(_READ_BYTES * pixels, bytes_to_reduce(left, right))
         both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
             seconds=_SECONDS * both_pixels / 1e6 * (1 + trial**2 * (trial < 1)),
-            memory=max(_MATCH_BYTES * left_pixels, _READ_BYTES * pixels + _RECTIFIED_BYTES * left_pixels),
+            memory=max(_MATCH_BYTES * left_pixels, reading + _RECTIFIED_BYTES * left_pixels),
             disk=_FILE_BYTES * left_pixels,
             scratch=scratch_bytes(left_pixels, context.options.matching),
         )

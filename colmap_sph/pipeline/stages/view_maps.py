@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import DamageError, InputError
-from colmap_sph.project.images.reading import read_colours
+from colmap_sph.project.images.reading import fitted, read_colours
 from colmap_sph.project.map_files import check_map, find_flaw, read_depth_map, read_normal_planes
-from colmap_sph.project.masks import read_mask
+from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.records import invalidate
 from colmap_sph.scene import View
 from colmap_sph.stereo.fusion import ViewMaps
+from colmap_sph.stereo.map_sizes import reduced_maps
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,6 +23,7 @@ class MapSources:
     Attributes
     ----------
     view : View
+        With as many pixels as are fused; the image is reduced to them.
     index : int
         Its place among the images of the model: what ``fused.ply.vis`` calls it by.
     depth, normals, image : Path
@@ -32,6 +34,8 @@ class MapSources:
         Of the whole files of both maps, as they must be.
     record : Path, optional
         What vouches for the maps, and shall not any more where they are found to be damaged.
+    map_view : View, optional
+        With as many pixels as the maps have, where these are more.
     """
 
     view: View
@@ -42,6 +46,7 @@ class MapSources:
     mask: Path | None
     digests: tuple[str, ...] | None = None
     record: Path | None = None
+    map_view: View | None = None
 
 
 def read_view_maps(sources: MapSources) -> ViewMaps:
@@ -54,14 +59,16 @@ def read_view_maps(sources: MapSources) -> ViewMaps:
     """
     view = sources.view
     depth, normals = read_sound_maps(sources)
+    if sources.map_view is not None:
+        depth, normals = reduced_maps(depth, normals, sources.map_view, view)
     image = read_colours(sources.image)
-    shape = (view.height, view.width)
-    if image.shape[:2] != shape:
-        raise InputError(f"The image {sources.image} is not of its camera's {shape[1]} x {shape[0]} pixels.")
-    mask = None if sources.mask is None else read_mask(sources.mask, view.width, view.height)
+    width, height = view.file_size
+    if image.shape[:2] != (height, width):
+        raise InputError(f"The image {sources.image} is not of its camera's {width} x {height} pixels.")
+    mask = None if sources.mask is None else read_view_mask(sources.mask, view)
     if mask is not None:
         depth[mask == 0] = 0
-    return ViewMaps(view, sources.index, depth, normals, image)
+    return ViewMaps(view, sources.index, depth, normals, fitted(image, (view.width, view.height)))
 
 
 def read_sound_maps(sources: MapSources) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -70,10 +77,11 @@ def read_sound_maps(sources: MapSources) -> tuple[NDArray[np.float32], NDArray[n
     Raises
     ------
     InputError
-        A map is missing, damaged, not of the camera's size, or holds what no map may hold. Where it was damaged
+        A map is missing, damaged, not of its view's size, or holds what no map may hold. Where it was damaged
         after it was written, its record vouches for it no more, so that the next run makes it anew.
     """
-    shape = (sources.view.height, sources.view.width)
+    view = sources.map_view or sources.view
+    shape = (view.height, view.width)
     check_map(sources.depth, shape)
     check_map(sources.normals, (*shape, 3))
     try:

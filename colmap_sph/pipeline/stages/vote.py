@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import (
     disparity_bytes,
@@ -18,9 +19,11 @@ from colmap_sph.pipeline.stages.pair_files import (
 )
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.masks import read_mask
+from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.project.masks import read_view_mask
 from colmap_sph.scene import View
-from colmap_sph.stereo.depth import DepthEstimate
+from colmap_sph.stereo.agreement import compare_with_sparse
+from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
@@ -51,6 +54,7 @@ class VoteTask:
     residuals: tuple[float, ...]
     vote_options: VoteOptions
     normal_options: NormalOptions
+    depths: Depths | None
     maps: MapFiles
     vote_key: str
     maps_key: str
@@ -59,19 +63,40 @@ class VoteTask:
 def make_photometric_maps(task: VoteTask) -> Facts:
     """Vote on the depth of a view; writes it with its standard deviation and support, and the photometric maps."""
     estimate = read_estimate(task.estimate, task.view) if task.is_voted else _vote(task)
-    planes = fit_normals(task.view, estimate, task.normal_options)
-    return task.maps.write(*planes, task.maps_key)
+    normals, depth = fit_normals(task.view, estimate, task.normal_options)
+    drop_other_depths(depth, task.depths)
+    return task.maps.write(normals, depth, task.maps_key)
 
 
 def _vote(task: VoteTask) -> DepthEstimate:
     pairs = (read_pair(file) for file in task.pairs)
     estimate = vote_depth(task.view, pairs, task.vote_options, task.stations, task.residuals)
-    mask = read_mask(task.mask, task.view.width, task.view.height)
+    mask = read_view_mask(task.mask, task.view)
     if mask is not None:
         # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
         estimate.depth[mask == 0] = 0
+    drop_other_depths(estimate.depth, task.depths)
     write_estimate(task.estimate, estimate, task.vote_key)
     return estimate
+
+
+def report_photometric(context: "Context", votes: Mapping[str, Result]) -> None:
+    """Report the photometric maps of a run that ends with them as it would report the geometric ones."""
+    report = context.report
+    report.coverage = {view.name: 0.0 for view in context.scene.views}
+    for name in votes:
+        view = context.scene.view(name)
+        depth = read_depth_map(context.map_files(name, "photometric").depth)
+        mask = read_view_mask(context.workspace.mask_path(name), view)
+        sights = context.sparse_tracks.sights(name).between(context.options.rectification.depths)
+        agreement = Agreement(*compare_with_sparse(view, depth, sights, mask))
+        report.coverage[name] = float((depth > 0).mean())
+        report.agreement[name] = agreement.share
+        report.sparse_points += agreement
+    report.overall_agreement = report.sparse_points.share
+    report.images = sum(share > 0 for share in report.coverage.values())
+    if not report.images:
+        raise NoResultError("No image has a depth map: no two of its pairs agree on any depth.")
 
 
 class VoteStage(Stage[str, VoteTask]):
@@ -109,6 +134,7 @@ class VoteStage(Stage[str, VoteTask]):
             tuple(residuals),
             context.options.vote,
             context.options.normals,
+            context.options.rectification.depths,
             maps,
             key,
             maps_key,

@@ -5,6 +5,7 @@ is not of its camera's size, and turns a damaged one into a half-grey image with
 """
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -77,12 +78,24 @@ def grey_bytes(path: Path) -> int:
         return 4
 
 
-def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
+Size = tuple[int, int]
+
+
+def fitted(pixels: NDArray[Any], size: Size | None) -> NDArray[Any]:
+    """An image, reduced to a size (width, height) where it has another; None: as it is."""
+    if size is None or pixels.shape[1::-1] == size:
+        return pixels
+    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+
+
+def read_grey(path: Path, size: Size | None = None) -> NDArray[np.uint8] | NDArray[np.float32]:
     """Read the grey values (0..255) of an undistorted image as exactly as its file holds them.
 
     Parameters
     ----------
     path : Path
+    size : (int, int), optional
+        Width and height that it is reduced to.
 
     Returns
     -------
@@ -97,7 +110,7 @@ def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
     """
     try:
         if is_jpeg(path) and jpeg.jpeg_size(data := path.read_bytes()) is not None:
-            return jpeg.decode_jpeg(data, "GRAY")[..., 0]
+            return fitted(jpeg.decode_jpeg(data, "GRAY")[..., 0], size)
         pixels = read_pixels(path)
     except (OSError, DamagedError) as error:
         raise _unreadable(path, error) from error
@@ -107,18 +120,18 @@ def read_grey(path: Path) -> NDArray[np.uint8] | NDArray[np.float32]:
         rows = slice(first, first + _BAND_ROWS)
         band = stretched(pixels[rows], values) * np.float32(255)
         grey[rows] = band[..., 0] if band.shape[2] == 1 else cv2.transform(band, np.array([_LUMA], np.float32))
-    return grey
+    return fitted(grey, size)
 
 
-def read_whole_grey(path: Path) -> NDArray[np.uint8]:
+def read_whole_grey(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
     """The same as `read_grey`, in whole numbers: (H, W) uint8."""
-    grey = read_grey(path)
+    grey = read_grey(path, size)
     if grey.dtype == np.uint8:
         return np.asarray(grey, np.uint8)
     return np.rint(grey).astype(np.uint8)
 
 
-def read_colours(path: Path) -> NDArray[np.uint8]:
+def read_colours(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
     """Read the colours of an undistorted image: (H, W, 3) uint8, blue, green and red, as COLMAP sees them.
 
     Raises
@@ -132,7 +145,7 @@ def read_colours(path: Path) -> NDArray[np.uint8]:
         raise _unreadable(path, error) from error
     colours = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
     colours[:] = pixels[..., ::-1]
-    return colours
+    return fitted(colours, size)
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:

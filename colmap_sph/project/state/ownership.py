@@ -116,7 +116,7 @@ def foreign_files(places: Sequence[Place], *, overwrite: bool) -> list[Path]:
     if foreign and not overwrite:
         raise InputError(
             f"{foreign[0]}{_and_more(foreign, 1)} {_were(foreign)} not made by this program, which would write "
-            "there; move that away, or give --overwrite, which keeps it under another name (.backup)."
+            "there; move that away, or give `run` --overwrite, which keeps it under another name (.backup)."
         )
     return foreign
 

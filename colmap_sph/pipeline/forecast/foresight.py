@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from typing import Any
 
 from colmap_sph.errors import ColmapSphError
-from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.context import Context, Until
 from colmap_sph.pipeline.report import StageEstimate
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.facts import Facts
@@ -25,7 +25,11 @@ _EXPECTED = Result("", made=True, facts=Facts(coverage=1.0))
 
 
 def foreseen_stages(
-    context: Context, pairs: Sequence[Pair], before: Iterable[Stage[Any, Any]] = ()
+    context: Context,
+    pairs: Sequence[Pair],
+    before: Iterable[Stage[Any, Any]] = (),
+    *,
+    until: Until = "cloud",
 ) -> list[StageEstimate]:
     """Estimate what the stages of `go_through_stages` will take; tells nobody of what cannot be done.
 
@@ -36,6 +40,8 @@ def foreseen_stages(
         Names of the images of each pair.
     before : iterable of Stage
         Others, before these.
+    until : {"photometric", "geometric", "cloud"}
+        The last results to make.
 
     Returns
     -------
@@ -44,14 +50,19 @@ def foreseen_stages(
     """
     matched = dict.fromkeys(pairs, _EXPECTED)
     votes = {view.name: _EXPECTED for view in context.scene.views}
-    stages = (
+    stages: tuple[Stage[Any, Any], ...] = (
         *before,
         MatchStage(context, pairs),
         VoteStage(context, matched),
         ConfirmStage(context, matched, votes),
     )
-    parts, each = foreseen_fusion(context)
-    return [*map(_estimate, stages), StageEstimate(FuseStage.name, parts, parts * each, each)]
+    if until == "photometric":
+        stages = stages[:-1]
+    estimates = [_estimate(stage) for stage in stages]
+    if until == "cloud":
+        parts, each = foreseen_fusion(context)
+        estimates.append(StageEstimate(FuseStage.name, parts, parts * each, each))
+    return estimates
 
 
 def _estimate(stage: Stage[Any, Any]) -> StageEstimate:

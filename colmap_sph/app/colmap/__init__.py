@@ -1,0 +1,1 @@
+"""COLMAP's own commands, spelled as COLMAP spells them."""

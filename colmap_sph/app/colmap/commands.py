@@ -1,0 +1,99 @@
+"""COLMAP's commands on our command line: done here, or handed over to COLMAP."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from colmap_sph.app.colmap.fusion import make_cloud
+from colmap_sph.app.colmap.names import OTHERS, OWN, hand_over
+from colmap_sph.app.colmap.options import COMMANDS, ColmapCommand, ColmapOption
+from colmap_sph.app.colmap.parser import Given, parse
+from colmap_sph.app.colmap.patch_match import make_maps
+from colmap_sph.app.display import Display
+from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.run_command import PARTIAL_EXIT_CODE, header, print_summary
+from colmap_sph.app.terminal import Terminal, standard_output
+from colmap_sph.pipeline.report import RunReport
+from colmap_sph.project.workspace import Workspace
+
+
+def is_colmap_command(name: str) -> bool:
+    """Whether COLMAP has a command of this name."""
+    return name in OWN or name in OTHERS
+
+
+def answer(arguments: Sequence[str], terminal: Terminal) -> int:
+    """Do what a command of COLMAP does; returns the exit code.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        The command's name, for which `is_colmap_command` holds, and its options.
+    terminal : Terminal
+    """
+    name, *options = arguments
+    if name not in OWN:
+        hand_over(arguments)
+    command = COMMANDS[name]
+    given = parse(command, options)
+    if given is None:
+        _print_help(command)
+        return 0
+    _tell_idle(given, terminal)
+    workspace = Workspace(Path(str(given.plain["workspace_path"])))
+    with workspace_log(workspace, header(" ".join(arguments))), Display(terminal) as display:
+        make = make_maps if name == "patch_match_stereo" else make_cloud
+        report = make(given.plain, given.sectioned, progress=display)
+    _print_end(given, report, workspace, terminal)
+    return PARTIAL_EXIT_CODE if report.incomplete else 0
+
+
+def _tell_idle(given: Given, terminal: Terminal) -> None:
+    """Name the options that have no effect, in one notice."""
+    if given.idle:
+        terminal.note(", ".join(f"--{flag}" for flag in given.idle), label="without effect here:", style="yellow")
+
+
+def _print_end(given: Given, report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
+    if "output_path" not in given.plain:
+        print_summary(report, workspace, terminal)
+        return
+    seconds = sum(report.seconds.values())
+    cloud = f"{report.points:,} points of {report.images} images in {given.plain['output_path']}"
+    terminal.facts([("cloud", cloud), ("seconds", f"{seconds:.1f}")])
+    for name, reason in (*report.skipped_images.items(), *report.incomplete.items()):
+        terminal.say(f"{name}: {reason}", label="incomplete:", style="yellow")
+
+
+def _print_help(command: ColmapCommand) -> None:
+    """The options, what they do here, and those that do nothing."""
+    flags = command.flags()
+    with standard_output():
+        console = Console(highlight=False, markup=False)
+        console.print(f"usage: colmap_sph {command.name} [options]\n")
+        console.print("COLMAP's options, on the command line or in a project file:\n")
+        acting = {flag: option for flag, option in flags.items() if option.acts}
+        console.print(_help_table({"project_path": _PROJECT, **acting}))
+        console.print("\nAccepted, but without effect here:\n")
+        console.print(_help_table({flag: option for flag, option in flags.items() if not option.acts}))
+
+
+_PROJECT = ColmapOption("project_path", "", "file of options, as COLMAP writes it; the command line goes first")
+
+
+def _help_table(flags: dict[str, ColmapOption]) -> Table:
+    table = Table.grid(padding=(0, 2))
+    table.add_column(no_wrap=True)
+    table.add_column()
+    for flag, option in flags.items():
+        default = "" if option.default == "" else f" (={_word(option)})"
+        table.add_row(Text(f"  --{flag}{default}"), Text(option.text))
+    return table
+
+
+def _word(option: ColmapOption) -> str:
+    """A default as COLMAP writes it."""
+    return str(int(option.default)) if isinstance(option.default, bool) else str(option.default)

@@ -1,0 +1,45 @@
+"""`patch_match_stereo` in COLMAP's place: depth and normal maps of a dense workspace."""
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from colmap_sph.app.colmap.options import PATCH_MATCH_STEREO, Value
+from colmap_sph.app.colmap.settings import check_workspace, run_options, spelled_as_colmap
+from colmap_sph.pipeline.reconstruct import reconstruct
+from colmap_sph.pipeline.report import Progress, RunReport
+from colmap_sph.project.claim import check_links, claimed
+from colmap_sph.project.project import Project, open_workspace
+
+
+def make_maps(
+    plain: Mapping[str, Value], chosen: Mapping[str, Value], *, progress: Progress | None = None
+) -> RunReport:
+    """Make the maps of a dense workspace.
+
+    Parameters
+    ----------
+    plain : mapping of str to value
+        Options without a section, by COLMAP's names.
+    chosen : mapping of str to value
+        Those of `PatchMatchStereo` that the user chose; ours are at their own defaults otherwise.
+    progress : Progress, optional
+
+    Returns
+    -------
+    RunReport
+    """
+    check_workspace(plain)
+    options = run_options(chosen, PATCH_MATCH_STEREO, "PatchMatchStereo")
+    project = Project(workspace=Path(str(plain["workspace_path"])))
+    project.check()
+    workspace = open_workspace(project)
+    check_links(workspace, is_given=True)
+    with claimed(workspace), spelled_as_colmap(PATCH_MATCH_STEREO, "PatchMatchStereo"):
+        return reconstruct(
+            workspace,
+            options,
+            progress=progress,
+            until="geometric" if chosen.get("geom_consistency", True) else "photometric",
+            pair_list=Path(str(plain["config_path"])) if plain.get("config_path") else None,
+            needs_all=not chosen.get("allow_missing_files", False),
+        )

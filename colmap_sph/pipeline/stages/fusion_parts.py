@@ -1,0 +1,197 @@
+"""Maps of a view and of those that overlap it → its part of the cloud: what every way to make a cloud shares."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.photo import bytes_to_reduce
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
+from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
+from colmap_sph.project.cloud_files import write_part
+from colmap_sph.project.masks import warn_of_unused_masks
+from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.context import Context
+    from colmap_sph.pipeline.memory import MemoryGate
+
+Partners = Mapping[str, tuple[list[str], list[int]]]
+"""For each image to fuse those that it is looked up in, and their stations; see `partners_in_fusion`."""
+
+CLOUD_BYTES = 12.0
+"""Bytes on disk per pixel, of the cloud."""
+
+# Processor seconds per megapixel of the image, and per image that overlaps it.
+_SECONDS = 0.05
+_PARTNER_SECONDS = 0.011
+# Bytes per pixel: of the maps of a view with its image; largest in use while a view is fused.
+_MAPS_BYTES = 19.0
+_FUSE_BYTES = 60.0
+
+_maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
+
+
+@dataclass(frozen=True, eq=False)
+class FuseTask:
+    """A view to fuse, those that overlap it, what to add to its points, and the path of its part less suffixes.
+
+    Of a `box`, (2, 3) least and most coordinates in the scene's frame, only the points inside are made.
+    """
+
+    reference: MapSources
+    partners: tuple[MapSources, ...]
+    stations: tuple[int, ...]
+    options: FusionOptions
+    offset: NDArray[np.float64]
+    stem: Path
+    box: NDArray[np.float64] | None = None
+
+
+def make_cloud_part(task: FuseTask) -> Facts:
+    """Fuse a view; writes the points of the cloud which it sees better than any other."""
+    reference = _view_maps(task.reference)
+    if task.box is not None:
+        reference = replace(reference, depth=depth_in_box(reference, task.box))
+    unread: dict[str, str] = {}
+    partners = _partner_maps(task.partners, unread)
+    bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
+    return Facts(points=write_part(task.stem, bands), unread=unread)
+
+
+def depth_in_box(maps: ViewMaps, box: NDArray[np.float64]) -> NDArray[np.float32]:
+    """The (H, W) depth map of a view, 0 where its points lie outside of a (2, 3) box in the world frame."""
+    view = maps.view
+    height, width = maps.depth.shape
+    directions = view.R.T @ np.linalg.inv(view.K)
+    inside = maps.depth > 0
+    for axis in range(3):
+        across = directions[axis, 0] * np.arange(width)
+        down = directions[axis, 1] * np.arange(height) + directions[axis, 2]
+        place = maps.depth * (across + down[:, None]) + view.center[axis]
+        inside &= (place >= box[0, axis]) & (place <= box[1, axis])
+    return np.where(inside, maps.depth, np.float32(0))
+
+
+def _view_maps(sources: MapSources) -> ViewMaps:
+    files = (sources.depth, sources.normals, sources.image, sources.mask)
+    stamps = [file_stamp(file) for file in files if file is not None]
+    size = (sources.view.width, sources.view.height)
+    return _maps.get(f"{sources.index} {size} {stamps}", lambda: read_view_maps(sources))
+
+
+def _partner_maps(partners: Sequence[MapSources], unread: dict[str, str]) -> Iterator[ViewMaps | None]:
+    """Maps of the partners; None for one whose maps cannot be read, and the reason in `unread`."""
+    for sources in partners:
+        try:
+            maps = _view_maps(sources)
+        except InputError as error:
+            unread[sources.view.name] = str(error)
+            maps = None
+        yield maps
+
+
+def seconds_per_megapixel(partners: int) -> float:
+    """Processor seconds to fuse an image that so many others overlap."""
+    return _SECONDS + _PARTNER_SECONDS * partners
+
+
+class PartsStage(Stage[str, FuseTask]):
+    """Fuses the maps of every image into its part of a cloud.
+
+    Parameters
+    ----------
+    context : Context
+    items : sequence of str
+        Names of the images.
+    partners : mapping
+        See `Partners`.
+    sources : mapping of str to MapSources
+        Where what is fused of each image lies.
+    """
+
+    name = "fuse"
+    make = staticmethod(make_cloud_part)
+    box: NDArray[np.float64] | None = None
+    """Where points are wanted, see `FuseTask`."""
+
+    def __init__(
+        self, context: "Context", items: Sequence[str], partners: Partners, sources: Mapping[str, MapSources]
+    ) -> None:
+        super().__init__(context, items)
+        self._partners = partners
+        self._sources = sources
+        self._scratch = context.workspace.fusion_scratch_dir
+        self._key = ""
+
+    def _done(self) -> Facts | None:
+        """What is known of a part where it need not be made."""
+        return None
+
+    def job(self, item: str) -> Job[FuseTask]:
+        """See `Stage.job`."""
+        scene = self.context.scene
+        pixels = scene.view(item).num_pixels
+        partners, stations = self._partners[item]
+        seconds = seconds_per_megapixel(len(partners))
+        memory = _FUSE_BYTES * pixels + bytes_to_reduce(*map(scene.view, [item, *partners]))
+        cost = Cost(seconds * pixels / 1e6, memory, CLOUD_BYTES * pixels)
+        task = FuseTask(
+            self._sources[item],
+            tuple(self._sources[partner] for partner in partners),
+            tuple(stations),
+            self.context.options.fusion,
+            scene.anchor,
+            self._stem(item),
+            self.box,
+        )
+        return Job(self._key, self._done(), cost, task)
+
+    def _stem(self, name: str) -> Path:
+        return self._scratch / f"{self.context.scene.view(name).image_id}"
+
+    def _stems(self, results: Mapping[str, Result]) -> list[Path]:
+        return [self._stem(name) for name in results]
+
+    def kept_memory(self, gate: "MemoryGate") -> Kept:
+        """See `Stage.kept_memory`."""
+        pixels = [view.num_pixels for view in map(self.context.scene.view, self.items)]
+        filled = _MAPS_BYTES * sum(pixels)
+        spare = gate.spare(2 * _FUSE_BYTES * max(pixels, default=0)) / 2
+        return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
+
+    @contextmanager
+    def holding(self, kept: Kept) -> Iterator[None]:
+        """See `Stage.holding`."""
+        with _maps.holding(kept.cache):
+            yield
+
+    def _report_unread(self, results: Mapping[str, Result]) -> bool:
+        """Report images whose maps could not be read while others were fused; whether there are any."""
+        unread = {name: reason for result in results.values() for name, reason in result.facts.unread.items()}
+        for name, reason in sorted(unread.items()):
+            if name in self.context.report.skipped_images:  # reported where it was to be fused itself
+                continue
+            self.context.leave_incomplete(name, f"the cloud lacks its agreement with other images: {reason}")
+        return bool(unread)
+
+
+def index_in_model(context: "Context") -> dict[str, int]:
+    """What ``fused.ply.vis`` calls each image by: its place among the registered ones of the model."""
+    index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
+    return {view.name: index_of[view.image_id] for view in context.scene.views}
+
+
+def warn_of_masks(context: "Context") -> None:
+    """Report masks that fusion will not use."""
+    folder = context.options.fusion.mask_path
+    if folder is not None:
+        names = [view.name for view in context.scene.views]
+        warn_of_unused_masks(folder, names, context.workspace.images_dir)

@@ -1,0 +1,191 @@
+"""A cloud at any path, in each of the kinds of COLMAP's ``stereo_fusion``: PLY, or a model, binary or text."""
+
+import os
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.files import make_dir, real_path
+from colmap_sph.project.map_coordinates import move_cloud
+from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import POINT
+
+_PLY_END = b"end_header\n"
+# Of a model in map coordinates.
+_FAR_POINT = np.dtype([("xyz", "<f8", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
+
+
+@dataclass(frozen=True)
+class CloudOutput:
+    """Where a cloud goes, and as what.
+
+    Attributes
+    ----------
+    path : Path
+        Of a PLY file, beside which ``.vis`` goes; or of the folder of a model.
+    kind : {"ply", "bin", "txt"}
+    """
+
+    path: Path
+    kind: Literal["ply", "bin", "txt"]
+
+    @property
+    def files(self) -> tuple[Path, Path]:
+        """The two files of a PLY cloud."""
+        return self.path, self.path.with_name(f"{self.path.name}.vis")
+
+    def check(self, workspace: Workspace) -> None:
+        """Raise `ColmapSphError` for a path where the cloud of a workspace cannot go, before anything is done."""
+        if self.kind == "ply":
+            for path in self.files:
+                if path.is_dir():
+                    raise OutputError(f"{path} is a folder, and the cloud is a file; name a file in it.")
+            return
+        if self.path.exists() and not self.path.is_dir():
+            raise OutputError(f"{self.path} is a file, and the cloud's model a folder; name a folder.")
+        if real_path(self.path) == real_path(workspace.sparse_dir):
+            raise InputError(f"{self.path} is the workspace's own model; name another folder for the cloud's.")
+
+    def write(self, made: Workspace, sparse_dir: Path, origin: NDArray[np.float64]) -> None:
+        """Put a finished cloud there.
+
+        Parameters
+        ----------
+        made : Workspace
+            Scratch folder with ``fused.ply`` and ``fused.ply.vis``, relative to `origin`.
+        sparse_dir : Path
+            Model whose images saw the points.
+        origin : (3,) float64 ndarray
+            Added to the points.
+
+        Raises
+        ------
+        OutputError
+            It cannot be written.
+        """
+        make_dir(self.path.parent)
+        try:
+            if self.kind == "ply":
+                self._move(made, origin)
+            else:
+                make_dir(self.path)
+                model = cloud_as_model(made.cloud_paths, sparse_dir, origin)
+                write: Callable[[Path], None] = model.write_binary if self.kind == "bin" else model.write_text
+                write(self.path)
+        except (OSError, RuntimeError) as error:
+            raise OutputError(
+                f"{self.path} cannot be written ({reason_of(error)}); check space and permissions."
+            ) from error
+
+    def _move(self, made: Workspace, origin: NDArray[np.float64]) -> None:
+        cloud, visible = made.cloud_paths
+        if origin.any():
+            moved = made.root / "moved.ply"
+            move_cloud(cloud, moved, origin)
+            cloud = moved
+        # A kill in between must not leave a cloud beside the visibility of another.
+        self.files[1].unlink(missing_ok=True)
+        for source, target in zip((cloud, visible), self.files, strict=True):
+            beside = target.with_name(f".{os.getpid()}.tmp")  # a disk of its own may be there
+            shutil.move(source, beside)
+            beside.replace(target)
+
+
+def read_back(output: CloudOutput, workspace: Workspace) -> pycolmap.Reconstruction:
+    """Read a cloud that was written, with the images and cameras of its workspace."""
+    if output.kind == "ply":
+        return cloud_as_model(output.files, workspace.sparse_dir, np.zeros(3))
+    return pycolmap.Reconstruction(output.path)
+
+
+def cloud_as_model(
+    files: tuple[Path, Path], sparse_dir: Path, origin: NDArray[np.float64]
+) -> pycolmap.Reconstruction:
+    """Return the model of a workspace with the points of a cloud in place of its own.
+
+    Each point's track holds the images that agree on it, where it projects in them: COLMAP's own fusion leaves the
+    points without tracks, and the images with references to the sparse points.
+
+    Parameters
+    ----------
+    files : pair of Path
+        The cloud, as this program writes it, and its visibility.
+    sparse_dir, origin
+        See `CloudOutput.write`.
+    """
+    points = _read_points(files[0])
+    owners, images = _read_visibility(files[1], len(points))
+    source = load_model(sparse_dir)
+    model = pycolmap.Reconstruction()
+    for camera in source.cameras.values():
+        model.add_camera_with_trivial_rig(camera)
+    ids = source.reg_image_ids()
+    places = np.empty(len(images), np.int64)
+    for index, image_id in enumerate(ids):
+        mine = np.flatnonzero(images == index)
+        places[mine] = np.arange(len(mine))
+        xyz = points["xyz"][owners[mine]].astype(np.float64)
+        _add_image(model, source, image_id, xyz, origin)
+    _add_points(model, points, origin, np.array(ids)[images], places, np.bincount(owners, minlength=len(points)))
+    return model
+
+
+def _add_image(
+    model: pycolmap.Reconstruction,
+    source: pycolmap.Reconstruction,
+    image_id: int,
+    points: NDArray[np.float64],
+    origin: NDArray[np.float64],
+) -> None:
+    """Add an image with the projections of points, which are relative to `origin`, as its key points."""
+    image = source.image(image_id)
+    pose = image.cam_from_world().matrix()
+    camera = points @ pose[:, :3].T + (pose[:, 3] + pose[:, :3] @ origin)
+    pixels = camera @ source.camera(image.camera_id).calibration_matrix().T
+    copy = pycolmap.Image(image.name, pixels[:, :2] / pixels[:, 2:], image.camera_id, image.image_id)
+    model.add_image_with_trivial_frame(copy, image.cam_from_world())
+
+
+def _add_points(
+    model: pycolmap.Reconstruction,
+    points: NDArray[np.void],
+    origin: NDArray[np.float64],
+    image_ids: NDArray[np.int64],
+    places: NDArray[np.int64],
+    counts: NDArray[np.int64],
+) -> None:
+    """Add points, with the key points (images and places in them) of one after the other."""
+    elements = map(pycolmap.TrackElement, image_ids.tolist(), places.tolist())
+    xyz = points["xyz"] + origin
+    for place, colour, count in zip(xyz, points["rgb"], counts.tolist(), strict=True):
+        model.add_point3D(place, pycolmap.Track([next(elements) for _ in range(count)]), colour)
+
+
+def _read_points(path: Path) -> NDArray[np.void]:
+    """The points of a cloud as this program writes it."""
+    with path.open("rb") as file:
+        start = file.read(1000)
+    header = start[: start.find(_PLY_END) + len(_PLY_END)]
+    kind = _FAR_POINT if b"double" in header else POINT
+    return np.fromfile(path, kind, offset=len(header))
+
+
+def _read_visibility(path: Path, num_points: int) -> tuple[NDArray[np.int64], NDArray[np.uint32]]:
+    """For all that is seen, one point after the other: the number of the point, and the index of the image."""
+    words = np.fromfile(path, dtype="<u4")[2:]  # behind the number of points
+    starts = np.empty(num_points, np.int64)
+    position = 0
+    steps = words.data
+    for index in range(num_points):
+        starts[index] = position
+        position += 1 + steps[position]
+    owners = np.repeat(np.arange(num_points), words[starts])
+    return owners, np.delete(words, starts)
