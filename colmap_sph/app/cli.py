@@ -15,6 +15,7 @@ from colmap_sph.app.display import Display
 from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, in_full
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
@@ -37,7 +38,7 @@ class DemoCommand:
     """Worker threads; 0: as many as the process may use cores."""
 
 
-Command = RunCommand | DemoCommand | EvaluateCommand
+Command = RunCommand | DemoCommand | EvaluateCommand | ReportCommand | ViewCommand
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -92,7 +93,13 @@ def _parsed(arguments: Sequence[str]) -> Command:
     with standard_output():
         command: Command = tyro.extras.subcommand_cli_from_dict(
             # `run` alone has flags without a value, among its own options.
-            {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
+            {
+                "run": RunCommand,
+                "report": ReportCommand,
+                "view": ViewCommand,
+                "demo": DemoCommand,
+                "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
+            },
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU.",
             args=arguments,
@@ -110,6 +117,10 @@ def _do(command: Command, terminal: Terminal) -> int:
         return run_command(command, terminal)
     if isinstance(command, DemoCommand):
         return demo_command(command, terminal)
+    if isinstance(command, ReportCommand):
+        return report_command(command, terminal)
+    if isinstance(command, ViewCommand):
+        return view_command(command, terminal)
     return evaluate_command(command, terminal)
 
 

@@ -3,6 +3,7 @@
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from shlex import quote
 from typing import Annotated
 
 import tyro
@@ -184,6 +185,10 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
     facts.append(("seconds", f"{sum(report.seconds.values()):.1f} ({times})"))
     facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
+    if workspace.page_path.is_file():
+        facts.append(
+            ("look at", f"{workspace.page_path}, in a browser: colmap_sph view {quote(str(workspace.root))}")
+        )
     terminal.facts(facts)
     for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
         for name, reason in skipped.items():
