@@ -72,7 +72,7 @@ def _image_row(place: int, content: Content, run: RunFacts, pairs: list[PairFact
         "number": place,
         "name": image.name,
         "cells": cells,
-        "camera": camera_path(view, content.frame),
+        "camera": camera_path(view, content.frame, len(content.images)),
         "footprint": "" if image.footprint is None else outline(image.footprint, content.frame),
         "pictures": image.pictures,
         "words": _image_words(image, view, pairs, points),

@@ -19,6 +19,10 @@ from colmap_sph.scene import View
 _MAP_UNITS = 1000
 _CAMERA_UNITS = 22.0
 _LAYER_BYTES = 150_000
+# More cameras than these are drawn smaller.
+_FULL_SIZE = 60
+# Sine of the angle from straight down below which a camera has no direction on the map.
+_LOOKS_DOWN = 0.2
 # More footprints than these hide what they lie on.
 _MOST_FOOTPRINTS = 80
 
@@ -55,7 +59,8 @@ def map_values(content: Content) -> dict[str, Any]:
             if content.scene.origin.any()
             else "Up is as the rows of the images and the surface tell. "
         )
-        + "Each triangle is a camera, and points where it looks; choose one to see its pictures.",
+        + "A triangle is a camera, and points where it looks, a diamond one that looks down; "
+        + "choose one to see its pictures.",
         "reasons": [_reason(reason, content.images) for reason in Reason],
     }
 
@@ -114,18 +119,18 @@ def _reason(reason: Reason, images: list[ImageFacts]) -> dict[str, str]:
     }
 
 
-def camera_path(view: View, frame: Frame) -> str:
-    """A triangle at a view's place that points to where it looks, for the map's drawing."""
-    x, y = frame.place(view.center[None])[0] * _drawing_size(frame)
-    ahead = looks_towards(view, frame) * _CAMERA_UNITS
+def camera_path(view: View, frame: Frame, among: int) -> str:
+    """One of so many cameras: a triangle that points to where it looks, or a diamond where that is down or up."""
+    middle = frame.place(view.center[None])[0] * _drawing_size(frame)
+    ahead = looks_towards(view, frame)
     length = float(np.hypot(*ahead))
-    # One that looks straight down is as wide as it is long.
-    side = np.array([-ahead[1], ahead[0]]) / max(length, 1e-9) * _CAMERA_UNITS * 0.35 if length > 0.5 else None
-    if side is None:
-        ahead, side = np.array([0.0, -0.35 * _CAMERA_UNITS]), np.array([0.35 * _CAMERA_UNITS, 0.0])
-    back = -0.35 * ahead
-    corners = [ahead * 0.65, back + side, back - side]
-    return "M" + "L".join(f"{x + dx:.1f} {y + dy:.1f}" for dx, dy in corners) + "Z"
+    if length < _LOOKS_DOWN:
+        corners = np.array([[0.0, -0.5], [0.4, 0.0], [0.0, 0.5], [-0.4, 0.0]])
+    else:
+        x, y = ahead / length
+        corners = np.array([[0.6, 0.0], [-0.4, 0.4], [-0.4, -0.4]]) @ [[x, y], [-y, x]]
+    size = _CAMERA_UNITS * min(1.0, math.sqrt(_FULL_SIZE / among))
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in middle + size * corners) + "Z"
 
 
 def _drawing_size(frame: Frame) -> NDArray[np.float64]:

@@ -30,9 +30,10 @@ from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.partners.pairs import overlapping_views
 
-# Points of the cloud to look at; of an image's surface, to stand for it where there is no cloud.
-_CLOUD_SAMPLE = 1_200_000
+# Points of the cloud to look at; of an image's surface, to stand for it where there is no cloud; to frame the map.
+_CLOUD_SAMPLE = 800_000
 _SURFACE_SAMPLE = 300
+_FRAME_SAMPLE = 100_000
 # Partners of a view to look from, where it is not known which were its.
 _GUESSED_PARTNERS = 10
 # Images whose pictures are shown: the least covered, and as many from all over the block.
@@ -127,7 +128,8 @@ class _Block:
 
     def __post_init__(self) -> None:
         surfaces = {view.name: self._surface(view) for view in self.scene.views}
-        surface = self.cloud.points if len(self.cloud.points) else np.concatenate(list(surfaces.values()))
+        surface = self.cloud.points[:: -(-len(self.cloud.points) // _FRAME_SAMPLE) or 1]
+        surface = surface if len(surface) else np.concatenate(list(surfaces.values()))
         self.pairs = pairs_of(self.workspace, self.scene, self.facts, surfaces)
         self._partners = self._find_partners()
         self._shown = self._choose_shown()

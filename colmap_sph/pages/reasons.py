@@ -84,14 +84,15 @@ def find_reasons(
     found = np.where(samples.geometric > 0, samples.geometric, samples.photometric)
     depth = filled(found)
     seen, apart, met = _look_from(view, samples, partners, depth, min_angle)
+    unseen = ~seen & (depth > 0) if partners else ~seen
     reasons = np.full(depth.shape, Reason.NOT_FOUND, np.uint8)
     reasons[blank] = Reason.BLANK
     reasons[seen & ~apart] = Reason.NO_PARALLAX
-    reasons[~seen] = Reason.ONE_IMAGE
+    reasons[unseen] = Reason.ONE_IMAGE
     has_own = samples.photometric > 0
     reasons[has_own] = Reason.ALONE
     reasons[has_own & met] = Reason.CONTRADICTED
-    reasons[has_own & ~seen] = Reason.ONE_IMAGE
+    reasons[has_own & unseen] = Reason.ONE_IMAGE
     reasons[samples.geometric > 0] = Reason.CONFIRMED
     reasons[samples.ignored & (samples.geometric <= 0)] = Reason.MASKED
     return reasons, depth

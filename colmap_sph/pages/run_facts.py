@@ -1,5 +1,6 @@
 """``report.json`` and the records of the maps → what is known of the last run, and what of that is out of date."""
 
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 import msgspec
@@ -13,9 +14,12 @@ _MAX_BYTES = 1 << 28
 # As in COLMAP; what `--pairs.min-triangulation-angle` is where nobody asked for something else.
 _USUAL_MIN_ANGLE = 1.0
 
+# Numbers that are printed; nothing says that the file is this program's.
+_MOST = 1e12
+Positive = Annotated[float, Meta(ge=0, le=_MOST)]
 Share = Annotated[float, Meta(ge=0, le=1)]
-Count = Annotated[int, Meta(ge=0)]
-MatchedPair = tuple[str, str, float | None]
+Count = Annotated[int, Meta(ge=0, le=int(_MOST))]
+MatchedPair = tuple[str, str, Positive | None]
 
 
 class RunFacts(msgspec.Struct, frozen=True):
@@ -33,8 +37,8 @@ class RunFacts(msgspec.Struct, frozen=True):
     matched_pairs: list[MatchedPair] = []
     skipped_pairs: dict[str, str] = {}
     polishing: str = ""
-    row_residual: float | None = None
-    row_residuals: dict[str, float] = {}
+    row_residual: Positive | None = None
+    row_residuals: dict[str, Positive] = {}
     coverage: dict[str, Share] = {}
     agreement: dict[str, Share | None] = {}
     overall_agreement: Share | None = None
@@ -46,7 +50,7 @@ class RunFacts(msgspec.Struct, frozen=True):
     advice: str = ""
     made: dict[str, Count] = {}
     reused: dict[str, Count] = {}
-    seconds: dict[str, float] = {}
+    seconds: dict[str, Positive] = {}
     peak_memory: Count = 0
 
     @property
@@ -73,14 +77,15 @@ def read_run_facts(workspace: Workspace) -> RunFacts | None:
     return read_json(workspace.report_path, RunFacts, max_bytes=_MAX_BYTES)
 
 
-def changed_since(workspace: Workspace, facts: RunFacts) -> list[str]:
-    """Images whose geometric maps are not those of which ``report.json`` tells.
+def changed_since(workspace: Workspace, facts: RunFacts, names: Iterable[str]) -> list[str]:
+    """Those of the images `names` whose geometric maps are not those of which ``report.json`` tells.
 
     A run that was ended before its end has made some anew, and has not said so yet.
     """
     changed = []
-    for name, coverage in facts.coverage.items():
+    for name in names:
+        coverage = facts.coverage.get(name)
         record = read_record(map_place(workspace, name, "geometric").record)
-        if record is not None and record.facts.get("coverage", coverage) != coverage:
+        if coverage is not None and record is not None and record.facts.get("coverage", coverage) != coverage:
             changed.append(name)
     return changed

@@ -18,6 +18,8 @@ _SAMPLE_BYTES = 9
 _ROOM = 64e6
 _FEWEST = 24
 _MOST = 192
+# Depths beyond come from damage.
+_FARTHEST = 1e12
 
 
 def samples_per_side(views: int) -> int:
@@ -98,7 +100,7 @@ def _depth(
         depth = read_some_pixels(path, (view.height, view.width), rows, columns)
     except InputError:
         return None
-    depth[~(np.isfinite(depth) & (depth > 0))] = 0
+    depth[~((depth > 0) & (depth < _FARTHEST))] = 0
     return depth
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import open_regular
+from colmap_sph.project.map_coordinates import is_plausible
 
 _HEADER_BYTES = 1 << 14
 _END = re.compile(rb"\nend_header[ \t]*\r?\n")
@@ -39,7 +40,7 @@ def read_some_points(path: Path, most: int) -> tuple[NDArray[np.float64], NDArra
     Returns
     -------
     xyz : (n, 3) float64 ndarray
-        Finite points.
+        Points that are finite and not absurdly far.
     rgb : (n, 3) uint8 ndarray
         Their colours; grey where the cloud has none.
     count : int
@@ -60,8 +61,8 @@ def read_some_points(path: Path, most: int) -> tuple[NDArray[np.float64], NDArra
     rgb = np.full(xyz.shape, 128, np.uint8)
     if all(name in (kind.names or ()) and kind[name] == np.uint8 for name in _COLOURS):
         rgb = np.column_stack([points[name] for name in _COLOURS])
-    finite = np.isfinite(xyz).all(axis=1)
-    return xyz[finite], rgb[finite], count
+    likely = is_plausible(xyz)
+    return xyz[likely], rgb[likely], count
 
 
 def _layout(path: Path, file: BufferedReader) -> tuple[np.dtype[Any], int, int]:
@@ -69,7 +70,7 @@ def _layout(path: Path, file: BufferedReader) -> tuple[np.dtype[Any], int, int]:
     start = file.read(_HEADER_BYTES)
     end = _END.search(start)
     header = start[: end.start()].decode("ascii", "replace").splitlines() if end else []
-    lines = [line.split() for line in header if not line.startswith(("comment", "obj_info"))]
+    lines = [line.split() for line in header if line.strip() and not line.startswith(("comment", "obj_info"))]
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]] or end is None:
         raise InputError(f"{path} is no binary PLY file; fuse again to have this program's cloud.")
     names: list[str] = []
