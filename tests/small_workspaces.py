@@ -58,7 +58,7 @@ def _write_maps(workspace: Workspace, name: str, center: np.ndarray) -> np.ndarr
     write_depth_map(workspace.depth_map_path(name, "photometric"), depth)
     depth[:40] = 0
     write_depth_map(workspace.depth_map_path(name, "geometric"), depth)
-    normals = np.where(depth[..., None] > 0, np.float32([0, 0, -1]), np.float32(0))
+    normals = np.where(depth[..., None] > 0, np.array([0, 0, -1], np.float32), np.float32(0))
     write_normal_map(workspace.normal_map_path(name, "geometric"), normals)
     rows, columns = np.mgrid[40:HEIGHT:5, 0:WIDTH:5]
     x = center[0] + (columns - WIDTH / 2) * ALTITUDE / FOCAL

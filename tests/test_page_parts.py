@@ -38,8 +38,8 @@ def samples_of(
     rows, columns = grid_of(view, view.width // step)
     shape = (len(rows), len(columns))
     geometric = photometric if geometric is None else geometric
-    maps = [np.array(np.broadcast_to(depth, shape), np.float32) for depth in (photometric, geometric)]
-    return MapSamples(rows, columns, *maps, True, True, np.zeros(shape, bool))
+    first, second = (np.array(np.broadcast_to(depth, shape), np.float32) for depth in (photometric, geometric))
+    return MapSamples(rows, columns, first, second, True, True, np.zeros(shape, bool))
 
 
 # ---- reasons -----------------------------------------------------------------------------------------------

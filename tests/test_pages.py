@@ -25,7 +25,7 @@ from colmap_sph.pages.samples import read_samples, samples_per_side
 from colmap_sph.pipeline import reconstruct
 from colmap_sph.pipeline.command import command_of
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -115,7 +115,7 @@ def test_the_page_loads_nothing(page: Page) -> None:
 def test_links_lead_to_their_places(page: Page) -> None:
     ids = [each["id"] for _, each in page.elements if "id" in each]
     assert len(ids) == len(set(ids))
-    assert {link for each in page.all("a") if (link := (each["href"] or "")[1:])} <= set(ids)
+    assert {(each["href"] or "")[1:] for each in page.all("a") if "href" in each} <= set(ids)
 
 
 def test_only_the_pages_own_script_and_style_may_run(page: Page) -> None:
@@ -354,6 +354,38 @@ def test_pictures_of_a_thousand_images_fit_the_page(tmp_path: Path) -> None:
     few = small_pictures(workspace, view, samples, reasons, picture, 10)
     assert sum(len(each.uri) for each in few) < 1.4 * 60_000
     assert len(few[0].uri) > 2 * len(pictures[0].uri)
+
+
+def test_text_of_a_thousand_images_fits_the_page(tmp_path: Path) -> None:
+    """Beside pictures (5.5 MB), cloud (0.75 MB) and map (1 MB) there is room for 2.5 KB of each image."""
+    lengths = []
+    for number in (4, 24):
+        names = [f"flight_{k:02d}/DJI_20261127_{k:05d}_W.JPG" for k in range(number)]
+        pairs = [[one, other, 0.123] for k, one in enumerate(names) for other in names[k + 1 : k + 8]]
+        report = {
+            "matched_pairs": pairs,
+            "coverage": dict.fromkeys(names, 0.5),
+            "agreement": dict.fromkeys(names, 0.9),
+        }
+        page = made(ground_workspace(tmp_path / str(number), names, report=report))
+        cloud = len(page.data["cloud"]["text"])
+        lengths.append(len(re.sub(r"data:image/webp;base64,[\w+/=]*", "", page.source)) - cloud)
+    assert (lengths[1] - lengths[0]) / 20 < 2500
+
+
+def test_of_very_many_images_the_least_covered_and_some_others_are_shown(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("colmap_sph.pages.page._MOST_SHOWN", 4)
+    workspace = ground_workspace(tmp_path / "dense", [f"{k}.png" for k in range(9)])
+    for name in ("3.png", "7.png"):
+        write_depth_map(workspace.depth_map_path(name, "geometric"), np.zeros((120, 160), np.float32))
+    page = made(workspace)
+    shown = [text for tag, text in page.texts if tag == "h3"][:4]
+    assert {"3.png", "7.png"} < set(shown)
+    assert len(page.all("article")) == 4
+    assert "Pictures of 4 images" in page.text("p")
+    test_links_lead_to_their_places(page)
 
 
 def test_samples_of_many_images_take_bounded_memory() -> None:

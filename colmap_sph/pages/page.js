@@ -57,7 +57,7 @@ function showCloud() {
   attribute(gl, shaders, "colour", points.colours, gl.UNSIGNED_BYTE);
   gl.enable(gl.DEPTH_TEST);
   gl.clearColor(0.063, 0.078, 0.102, 1);
-  const reach = data.cloud.reach, spacing = 3 * reach / Math.sqrt(count);
+  const reach = data.cloud.reach, spacing = 2.4 * reach / Math.sqrt(count);
   const start = () => ({ turn: 0.35, rise: 0.75, distance: 2.4 * reach, target: data.cloud.middle });
   let camera = start(), waiting = false;
   const draw = () => {
