@@ -95,10 +95,10 @@ def _parsed(arguments: Sequence[str]) -> Command:
             # `run` alone has flags without a value, among its own options.
             {
                 "run": RunCommand,
-                "report": ReportCommand,
-                "view": ViewCommand,
                 "demo": DemoCommand,
                 "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
+                "report": ReportCommand,
+                "view": ViewCommand,
             },
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU.",
