@@ -20,7 +20,7 @@ _MAP_UNITS = 1000
 _CAMERA_UNITS = 22.0
 _LAYER_BYTES = 150_000
 # More cameras than these are drawn smaller.
-_FULL_SIZE = 60
+_FULL_SIZE = 150
 # Sine of the angle from straight down below which a camera has no direction on the map.
 _LOOKS_DOWN = 0.2
 # More footprints than these hide what they lie on.

@@ -89,7 +89,7 @@ def _head(content: Content, run: RunFacts) -> dict[str, Any]:
 
 def _headline(content: Content, run: RunFacts) -> str:
     with_depth = sum(image.coverage > 0 for image in content.images)
-    words = f"{with_depth} of {number(len(content.images), 'image')} with depth maps"
+    words = f"{with_depth:,} of {number(len(content.images), 'image')} with depth maps"
     if content.cloud.total:
         words += f", {content.cloud.total:,} points"
     seconds = sum(run.seconds.values())

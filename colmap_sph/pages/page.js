@@ -139,11 +139,12 @@ function valueOf(row, column) {
   return "value" in cell.dataset ? Number(cell.dataset.value) : cell.textContent;
 }
 
+const inOrder = new Intl.Collator(undefined, { numeric: true });
 // What is not known comes last, whichever way a table is sorted.
 function compared(a, b, sign) {
   if (a === "" || b === "") return (a === "") - (b === "");
   if (typeof a === "number" && typeof b === "number") return sign * (a - b);
-  return sign * String(a).localeCompare(String(b), undefined, { numeric: true });
+  return sign * inOrder.compare(a, b);
 }
 
 function sortable(table) {
