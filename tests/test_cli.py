@@ -193,6 +193,8 @@ def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for stage in ("undistort", "select pairs", "match pairs", "vote on depth", "confirm depth", "fuse"):
         assert f"{stage} {report['seconds'][stage]:.1f}" in words
     assert re.search(r"peak memory \d+\.\d\d GiB", words)
+    assert re.search(r"look at \S*dense/colmap_sph/report\.html, in a browser: colmap_sph view \S*dense", words)
+    assert (small / "dense/colmap_sph/report.html").is_file()
     # The log file.
     log = (small / "dense/colmap_sph/log.txt").read_text().splitlines()
     assert all(re.match(r"20\d\d-\d\d-\d\d \d\d:\d\d:\d\d,\d{3} INFO colmap_sph\.[\w.]+: ", line) for line in log)
@@ -201,7 +203,8 @@ def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "RunCommand(" in log[1] and "max_reproj_error=1" in log[1]
     assert any("Undistorted 3 of 3 images" in line for line in log)
     assert any("3 pairs of 3 images" in line for line in log)
-    assert "Fuse: " in log[-1]
+    assert "Fuse: " in log[-2]
+    assert "Report: " in log[-1]
     # Nothing of ours stays behind in the logging of the process.
     assert logging.getLogger("colmap_sph").handlers == []
 

@@ -301,7 +301,14 @@ def test_files_of_the_user_in_our_folders_stay(how: str, finished: Finished) -> 
         assert (finished.dense / "fused.ply").read_bytes() == b"of COLMAP"
         left = {str(path.relative_to(state)) for path in state.rglob("*") if path.is_file()}
         images = {"originals.json", "images.json", *(f"state/{name}.undistorted.json" for name in NAMES)}
-        assert left - {"log.txt"} == {*MINE, *images, "cloud.json", "report.json", "undistortion.json"}
+        assert left - {"log.txt"} == {
+            *MINE,
+            *images,
+            "cloud.json",
+            "report.json",
+            "report.html",
+            "undistortion.json",
+        }
         assert not list(finished.dense.glob("stereo/*_maps/*"))
     assert all((state / name).read_text() == "mine" for name in MINE)
 

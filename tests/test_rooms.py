@@ -15,10 +15,11 @@ MAY_IMPORT = {
     "_native": set(),
     "stereo": {*GROUND, "_native"},
     "project": GROUND,
-    "pipeline": {*GROUND, "_native", "stereo", "project"},
+    "pages": {*GROUND, "stereo", "project"},
+    "pipeline": {*GROUND, "_native", "stereo", "project", "pages"},
     "evaluation": {"errors"},
     "synthetic": {"errors"},
-    "app": {*GROUND, "stereo", "project", "pipeline", "evaluation", "synthetic"},
+    "app": {*GROUND, "stereo", "project", "pages", "pipeline", "evaluation", "synthetic"},
 }
 # Loads the rooms when they are asked for, by name.
 FRONT_DOOR = {"__init__", "__main__"}

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from colmap_sph.pipeline.report import StageEstimate
 from colmap_sph.pipeline.forecast.time_left import TimeLeft
+from colmap_sph.pipeline.report import StageEstimate
 
 STAGES = {"match": (200, 2.0), "vote": (33, 0.4), "confirm": (33, 1.5), "fuse": (33, 0.5)}
 """Items, and estimated processor seconds of each."""

@@ -20,6 +20,7 @@ from colmap_sph.app.events import Events
 from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
@@ -42,7 +43,7 @@ class DemoCommand:
     """Worker threads; 0: as many as the process may use cores."""
 
 
-Command = RunCommand | DemoCommand | EvaluateCommand
+Command = RunCommand | DemoCommand | EvaluateCommand | ReportCommand | ViewCommand
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -134,7 +135,13 @@ def _parsed(arguments: Sequence[str]) -> Command:
     with standard_output(), short_completion(arguments):
         command: Command = tyro.extras.subcommand_cli_from_dict(
             # `run` alone has flags without a value, among its own options.
-            {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
+            {
+                "run": RunCommand,
+                "demo": DemoCommand,
+                "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
+                "report": ReportCommand,
+                "view": ViewCommand,
+            },
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU.",
             args=arguments,
@@ -152,6 +159,10 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
         return run_command(command, terminal, arguments, events)
     if isinstance(command, DemoCommand):
         return demo_command(command, terminal, arguments)
+    if isinstance(command, ReportCommand):
+        return report_command(command, terminal)
+    if isinstance(command, ViewCommand):
+        return view_command(command, terminal)
     return evaluate_command(command, terminal)
 
 

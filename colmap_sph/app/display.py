@@ -7,9 +7,9 @@ import rich.progress
 from rich.text import Text
 
 from colmap_sph.app.terminal import Terminal
+from colmap_sph.pipeline.forecast.time_left import TimeLeft
 from colmap_sph.pipeline.options import num_cores
 from colmap_sph.pipeline.report import Left, Progress, Silent, StageEstimate
-from colmap_sph.pipeline.forecast.time_left import TimeLeft
 
 # Off a terminal a line is written when this share of a stage and this many seconds have passed since the last one.
 _SHARE = 0.1

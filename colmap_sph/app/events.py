@@ -16,9 +16,9 @@ from typing import Any, TextIO
 import colmap_sph
 from colmap_sph.app.standard_streams import silence
 from colmap_sph.errors import reason_of
+from colmap_sph.pipeline.forecast.time_left import TimeLeft
 from colmap_sph.pipeline.plan import Plan
 from colmap_sph.pipeline.report import Left, RunReport, StageEstimate
-from colmap_sph.pipeline.forecast.time_left import TimeLeft
 
 logger = logging.getLogger(__name__)
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import Annotated, Literal
 
 import tyro
@@ -220,6 +221,10 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
     facts.append(("seconds", f"{sum(report.seconds.values()):.1f} ({times})"))
     facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
+    if workspace.page_path.is_file():
+        facts.append(
+            ("look at", f"{workspace.page_path}, in a browser: colmap_sph view {quote(str(workspace.root))}")
+        )
     terminal.facts(facts)
     for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
         for name, reason in skipped.items():

@@ -6,6 +6,7 @@ maker, and changes the digest, too.
 """
 
 import ast
+import platform
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -15,6 +16,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import simplejpeg
 
+import colmap_sph
 from colmap_sph import _native
 from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.project.colmap_library import COLMAP_VERSION
@@ -32,8 +34,22 @@ def program_digest(module: str) -> str:
         Such as "colmap_sph.stereo.matching".
     """
     files = {name: file_digest(_source_of(name)) for name in reached_modules(module)}
-    versions = [cv2.__version__, np.__version__, COLMAP_VERSION, oiio.__version__, simplejpeg.__version__]
-    return digest(files, file_digest(Path(_native.__file__)), versions)
+    return digest(files, file_digest(Path(_native.__file__)), list(_libraries().values()))
+
+
+def versions() -> dict[str, str]:
+    """Versions of this program, of Python, and of the libraries that results depend on, by their names."""
+    return {"colmap_sph": colmap_sph.__version__, "Python": platform.python_version(), **_libraries()}
+
+
+def _libraries() -> dict[str, str]:
+    return {
+        "OpenCV": cv2.__version__,
+        "NumPy": np.__version__,
+        "COLMAP": COLMAP_VERSION,
+        "OpenImageIO": oiio.__version__,
+        "simplejpeg": simplejpeg.__version__,
+    }
 
 
 def reached_modules(module: str) -> list[str]:

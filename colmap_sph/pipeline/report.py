@@ -69,6 +69,8 @@ class RunReport:
 
     Attributes
     ----------
+    command : str
+        What to type to do the same again.
     images : int
         Images with depth maps.
     skipped_images : dict
@@ -86,6 +88,8 @@ class RunReport:
         Where the pairs come from.
     pairs : int
         Pairs matched.
+    matched_pairs : list of (str, str, float or None)
+        Names of the images of each, and how far their rows disagree, pixels; None where too few ties tell.
     skipped_pairs : dict
         "left - right" → why the pair was not matched.
     polishing : str
@@ -114,6 +118,8 @@ class RunReport:
         Where hardly any point agrees over all: why the results mean nothing.
     points : int
         Points of the fused cloud.
+    points_of : dict
+        Image name → how many of them it made; empty where COLMAP fused.
     advice : str
         Where few points survived: which gate took them.
     made, reused : dict
@@ -124,6 +130,7 @@ class RunReport:
         Largest resident set of the process, bytes.
     """
 
+    command: str = ""
     images: int = 0
     skipped_images: dict[str, str] = field(default_factory=dict)
     incomplete: dict[str, str] = field(default_factory=dict)
@@ -132,6 +139,7 @@ class RunReport:
     sampling: float | None = None
     pair_source: str = ""
     pairs: int = 0
+    matched_pairs: list[tuple[str, str, float | None]] = field(default_factory=list)
     skipped_pairs: dict[str, str] = field(default_factory=dict)
     polishing: str = ""
     pose_movement: dict[str, float] = field(default_factory=dict)
@@ -145,6 +153,7 @@ class RunReport:
     imprecision: str = ""
     refusal: str = ""
     points: int = 0
+    points_of: dict[str, int] = field(default_factory=dict)
     advice: str = ""
     made: dict[str, int] = field(default_factory=dict)
     reused: dict[str, int] = field(default_factory=dict)

@@ -91,11 +91,14 @@ def judge_rows(report: RunReport, scene: Scene, residuals: Mapping[Pair, float |
     """
     of_images: dict[str, list[float]] = {}
     of_pairs = []
+    report.matched_pairs = []
     for names, residual in residuals.items():
         if residual is None:
+            report.matched_pairs.append((*names, None))
             continue
         pixels = [residual * float(scene.view(name).K[0, 0]) for name in names]
         of_pairs.append(max(pixels))
+        report.matched_pairs.append((*names, round(of_pairs[-1], 3)))
         for name, value in zip(names, pixels, strict=True):
             of_images.setdefault(name, []).append(value)
     if not of_pairs:

@@ -99,6 +99,45 @@ def read_normal_planes(path: Path, digest: str | None = None) -> NDArray[np.floa
     return _read_planes(path, 3, digest)
 
 
+def read_some_pixels(
+    path: Path, shape: tuple[int, ...], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Read a map at the crossings of some rows and columns, and of the file only these rows.
+
+    Parameters
+    ----------
+    path : Path
+    shape : tuple of int
+        (H, W) or (H, W, 3), as it must be.
+    rows, columns : (h,) and (w,) int64 ndarray
+
+    Returns
+    -------
+    (h, w) or (3, h, w) float32 ndarray
+
+    Raises
+    ------
+    InputError
+        The file is missing, cannot be read, or is no map of this shape.
+    """
+    channels = shape[2] if len(shape) == 3 else 1
+    found = np.empty((channels, len(rows), len(columns)), np.float32)
+    try:
+        with open_regular(path) as file:
+            start = file.read(_MAX_HEADER)
+            size = file.seek(0, 2)
+            (height, width), header = _parse_header(path, start, size, channels)
+            if (height, width) != shape[:2]:
+                raise InputError(f"The map {path} is not of its image's size; compute it again.")
+            for channel in range(channels):
+                for place, row in enumerate(rows):
+                    file.seek(header + 4 * width * (channel * height + int(row)))
+                    found[channel, place] = _read_values(path, file, width)[columns]
+    except OSError as error:
+        raise InputError(f"The map {path} cannot be read ({reason_of(error)}); compute it again.") from error
+    return found if len(shape) == 3 else found[0]
+
+
 def _write_planes(path: Path, planes: Iterable[NDArray[np.floating]], shape: tuple[int, int, int]) -> str:
     """Write planes one after the other, so that only one has to be in memory; `shape` is (H, W, planes)."""
     height, width, channels = shape

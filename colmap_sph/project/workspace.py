@@ -87,6 +87,11 @@ class Workspace:
         return self.state_dir / "report.json"
 
     @property
+    def page_path(self) -> Path:
+        """The same for people: a page to open in a browser."""
+        return self.state_dir / "report.html"
+
+    @property
     def marker_path(self) -> Path:
         """What the undistorted images and their model were made from."""
         return self.state_dir / "undistortion.json"

@@ -39,10 +39,14 @@ _MAX_LIST_BYTES = 1 << 26
 
 @dataclass(frozen=True)
 class CloudFacts:
-    """The number of points of a cloud, and what to advise where they are few."""
+    """The number of points of a cloud, what to advise where they are few, and how many each image made.
+
+    The last is in the order of the images' names, and empty where that is not known.
+    """
 
     points: Annotated[int, Meta(ge=0)]
     advice: str
+    of_images: tuple[Annotated[int, Meta(ge=0)], ...] = ()
 
 
 def known_cloud(context: "Context", key: str) -> CloudFacts | None:
@@ -105,9 +109,11 @@ def _all_images(context: "Context") -> set[str]:
     return set(image_names(load_model(context.workspace.sparse_dir)))
 
 
-def report_cloud(context: "Context", facts: CloudFacts) -> None:
-    """Report the cloud's facts."""
+def report_cloud(context: "Context", facts: CloudFacts, names: Sequence[str] = ()) -> None:
+    """Report the cloud's facts, of which those of images are of images `names`."""
     context.report.points = facts.points
+    if len(facts.of_images) == len(names):
+        context.report.points_of = dict(zip(names, facts.of_images, strict=True))
     context.report.advice = facts.advice
     if facts.advice:
         logger.warning("Only %d points survived fusion. %s", facts.points, facts.advice)

@@ -6,7 +6,7 @@ Every image is fused into a part of the cloud, and the parts are joined; or COLM
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -148,10 +148,11 @@ class FuseStage(PartsStage):
                 raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
             points = sum(result.facts.points for result in results.values())
             self._put_together(self._stems(results), points)
-            self._known = facts_of_cloud(context, list(results), points, self._partners_among(results))
+            facts = facts_of_cloud(context, list(results), points, self._partners_among(results))
+            self._known = replace(facts, of_images=tuple(result.facts.points for result in results.values()))
             is_complete = not self._report_unread(results) and len(results) == len(self.items)
             vouch_for_cloud(context, self._key, self._known, is_complete=is_complete)
-        report_cloud(context, self._known)
+        report_cloud(context, self._known, list(results))
 
     def _partners_among(self, results: Mapping[str, Result]) -> dict[str, tuple[list[str], list[int]]]:
         """The partners of the images that were fused, less those that were not."""

@@ -74,6 +74,31 @@ def decode_jpeg(data: bytes, space: Literal["GRAY", "BGR", "CMYK"]) -> NDArray[n
     return np.asarray(simplejpeg.decode_jpeg(tidy, space, strict=False))
 
 
+def decode_small(data: bytes, longest: int) -> NDArray[np.uint8]:
+    """Decode a JPEG image at the least of libjpeg's scales whose longest side has `longest` pixels.
+
+    What is missing of a damaged image is grey.
+
+    Returns
+    -------
+    (H, W, 3) uint8 ndarray
+        Blue, green and red.
+
+    Raises
+    ------
+    DamagedError
+        Nothing of it can be decoded.
+    """
+    try:
+        height, width, *_ = simplejpeg.decode_jpeg_header(data, strict=False)
+        is_upright = height > width
+        side = min(longest, max(height, width))
+        sides = {"min_height": side} if is_upright else {"min_width": side}
+        return np.asarray(simplejpeg.decode_jpeg(data, "BGR", fastdct=True, strict=False, min_factor=1, **sides))
+    except ValueError as error:
+        raise DamagedError(str(error)) from None
+
+
 def header_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
     """Markers with the begin and end of their segments, up to the first scan's, whose pixels follow.
 

@@ -1,0 +1,65 @@
+"""What a page tells, gathered: the records that its parts are drawn from."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.pages.block_map import Frame, Ground
+from colmap_sph.pages.image_facts import ImageFacts
+from colmap_sph.pages.pair_facts import PairFacts
+from colmap_sph.pages.run_facts import RunFacts
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class CloudSample:
+    """Some points of the cloud.
+
+    Attributes
+    ----------
+    points : (n, 3) float64 ndarray
+        The scene's frame.
+    colours : (n, 3) uint8 ndarray
+    total : int
+        Points of the whole cloud.
+    lack : str
+        Why there are none.
+    """
+
+    points: NDArray[np.float64]
+    colours: NDArray[np.uint8]
+    total: int
+    lack: str
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """What a page tells.
+
+    Attributes
+    ----------
+    workspace : Workspace
+    scene : Scene
+    run : RunFacts or None
+        None where no run has come to its end.
+    images : list of ImageFacts
+        Of the scene's views, in their order.
+    pairs : list of PairFacts
+    cloud : CloudSample
+    frame : Frame
+    ground : Ground
+    missing : str
+        What is missing of a finished run.
+    """
+
+    workspace: Workspace
+    scene: Scene
+    run: RunFacts | None
+    images: list[ImageFacts]
+    pairs: list[PairFacts]
+    cloud: CloudSample
+    frame: Frame
+    ground: Ground
+    missing: str

@@ -1,0 +1,111 @@
+"""Images of a page: the table, and what belongs to each picture."""
+
+from typing import Any
+
+from colmap_sph.pages.content import Content
+from colmap_sph.pages.image_facts import ImageFacts
+from colmap_sph.pages.map_markup import camera_path, outline
+from colmap_sph.pages.pair_facts import PairFacts
+from colmap_sph.pages.pictures import colour_of
+from colmap_sph.pages.reasons import WORDS, Reason
+from colmap_sph.pages.run_facts import RunFacts
+from colmap_sph.pages.words import cell, number, percent, plain
+from colmap_sph.scene import View
+
+MOST_LINES = 100
+"""Lines of what was left out."""
+
+_COLUMNS = [
+    ("image", "Name of the image"),
+    ("coverage", "Share of pixels with a confirmed depth"),
+    ("matched", "Share of pixels with a depth by its own pairs, confirmed or not"),
+    ("agreement", "Sparse points that agree with its depth map"),
+    ("rows, px", "How far rows of its pairs disagree"),
+    ("GSD", "What a pixel covers, model units (median)"),
+    ("points", "Points of the cloud that this image made; where others see finer, they do"),
+    ("partners", "Images that it was matched with"),
+    ("lost most", "Why most of the other pixels have no depth"),
+]
+
+
+def image_values(content: Content, run: RunFacts) -> dict[str, Any]:
+    """Values of the template for the images, and for the cameras and footprints on the map."""
+    partners: list[list[PairFacts]] = [[] for _ in content.images]
+    for pair in content.pairs:
+        partners[pair.left].append(pair)
+        partners[pair.right].append(pair)
+    left_out = [
+        *run.skipped_images.items(),
+        *((name, f"incomplete: {why}") for name, why in run.incomplete.items()),
+    ]
+    shown = sum(bool(image.pictures) for image in content.images)
+    words = ""
+    if shown < len(content.images):
+        words = f"Pictures of {shown:,} images: the least covered, and an even choice of the others."
+    rows = [_image_row(place, content, run, partners[place]) for place in range(len(content.images))]
+    return {
+        "columns": _COLUMNS,
+        "images": rows,
+        "left_out": left_out[:MOST_LINES],
+        "left_out_more": max(len(left_out) - MOST_LINES, 0),
+        "pictures_left_out": words,
+    }
+
+
+def _image_row(place: int, content: Content, run: RunFacts, pairs: list[PairFacts]) -> dict[str, Any]:
+    image = content.images[place]
+    view = content.scene.views[place]
+    lost = max((share, reason) for reason, share in zip(Reason, image.shares, strict=True) if reason)
+    coverage = run.coverage.get(image.name, image.coverage)
+    points = run.points_of.get(image.name)
+    cells = [
+        cell(coverage, percent(coverage)),
+        cell(image.found, percent(image.found)),
+        cell(run.agreement.get(image.name), percent(run.agreement.get(image.name), "")),
+        cell(run.row_residuals.get(image.name), plain(run.row_residuals.get(image.name), ".2f")),
+        cell(image.gsd, plain(image.gsd, ".3g")),
+        cell(points, plain(points, ",")),
+        cell(len(pairs), str(len(pairs))),
+        {"value": None, "text": f"{WORDS[lost[1]][0]} {percent(lost[0])}" if lost[0] > 0 else ""},
+    ]
+    return {
+        "number": place,
+        "name": image.name,
+        "cells": cells,
+        "camera": camera_path(view, content.frame, len(content.images)),
+        "footprint": "" if image.footprint is None else outline(image.footprint, content.frame),
+        "pictures": image.pictures,
+        "words": _image_words(image, view, pairs, points),
+        **_bar(image),
+    }
+
+
+def _bar(image: ImageFacts) -> dict[str, Any]:
+    """The image's pixels by what became of them, from left to right."""
+    pieces = []
+    start = 0.0
+    for reason, share in zip(Reason, image.shares, strict=True):
+        if share > 0:
+            pieces.append({"start": f"{start:.1f}", "width": f"{100 * share:.1f}", "colour": colour_of(reason)})
+        start += 100 * share
+    named = [
+        f"{WORDS[reason][0]} {percent(share)}"
+        for reason, share in zip(Reason, image.shares, strict=True)
+        if share > 0
+    ]
+    return {"bar": pieces, "bar_words": ", ".join(named)}
+
+
+def _image_words(image: ImageFacts, view: View, pairs: list[PairFacts], points: int | None) -> str:
+    named = [
+        f"{WORDS[reason][0]} {percent(share)}"
+        for reason, share in zip(Reason, image.shares, strict=True)
+        if share >= 0.0005
+    ]
+    words = f"{view.width} × {view.height} pixels: {', '.join(named)}."
+    if points is not None:
+        words += f" {points:,} points of the cloud."
+    angles = sorted(pair.angle for pair in pairs if pair.angle is not None)
+    if angles:
+        words += f" {number(len(pairs), 'partner')}, {angles[0]:.1f}° to {angles[-1]:.1f}°."
+    return words

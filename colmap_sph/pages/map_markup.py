@@ -1,0 +1,147 @@
+"""Cloud and map of a page: their drawing, and what is said of it."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.pages.block_map import Frame, looks_towards, seen_from_above
+from colmap_sph.pages.content import Content
+from colmap_sph.pages.image_facts import ImageFacts
+from colmap_sph.pages.pictures import colour_of, picture_uri
+from colmap_sph.pages.reasons import WORDS, Reason
+from colmap_sph.pages.small_cloud import STEPS, thin_out
+from colmap_sph.pages.words import percent
+from colmap_sph.scene import View
+
+# Of the map: units of its drawing along the longer side, a camera's size, and bytes of a layer at most.
+_MAP_UNITS = 1000
+_CAMERA_UNITS = 22.0
+_LAYER_BYTES = 150_000
+# More cameras than these are drawn smaller.
+_FULL_SIZE = 150
+# Sine of the angle from straight down below which a camera has no direction on the map.
+_LOOKS_DOWN = 0.2
+# More footprints than these hide what they lie on.
+_MOST_FOOTPRINTS = 80
+
+
+def cloud_values(content: Content) -> dict[str, Any]:
+    """Values of the template for the cloud."""
+    sample = content.cloud
+    small = thin_out(sample.points @ content.frame.axes.T, sample.colours)
+    if small is None:
+        return {"cloud": None, "no_cloud": sample.lack, "data": {"cloud": None}}
+    data = {
+        "count": len(small.places),
+        "middle": (small.middle / STEPS).round(5).tolist(),
+        "reach": round(small.reach / STEPS, 5),
+        "text": small.as_text(),
+    }
+    shown = {"shown": f"{len(small.places):,}", "total": f"{sample.total:,}"}
+    return {"cloud": shown, "no_cloud": "", "data": {"cloud": data}}
+
+
+def map_values(content: Content) -> dict[str, Any]:
+    """Values of the template for the map, but for what belongs to each image."""
+    frame = content.frame
+    width, height = (max(round(side), 1) for side in _drawing_size(frame))
+    step = 10 ** math.floor(math.log10(max(frame.width / 3, 1e-300)))
+    return {
+        "map_width": width,
+        "map_height": height,
+        "layers": _layers(content),
+        "footprints_shown": len(content.images) <= _MOST_FOOTPRINTS,
+        "map_words": f"The map is {frame.width:.4g} units wide, {frame.width / step:.1f} times {step:g}. "
+        + (
+            "North is up. "
+            if content.scene.origin.any()
+            else "Up is as the rows of the images and the surface tell. "
+        )
+        + "A triangle is a camera, and points where it looks, a diamond one that looks down; "
+        + "choose one to see its pictures.",
+        "reasons": [_reason(reason, content.images) for reason in Reason],
+    }
+
+
+def _layers(content: Content) -> list[dict[str, Any]]:
+    frame, ground, cloud = content.frame, content.ground, content.cloud
+    layers = []
+    if len(cloud.points):
+        coloured, heights, ends = seen_from_above(frame, cloud.points, cloud.colours)
+        layers.append(_layer("colours", coloured, "The cloud from above."))
+        layers.append(_layer("height", heights, "Height of the cloud, units:", ends))
+    counts, ends = ground.count_layer()
+    layers.append(_layer("images", counts, "Images with a confirmed depth of each place:", ends))
+    gsds, gsd_ends = ground.gsd_layer()
+    layers.append(
+        _layer("GSD", gsds, "What a pixel of the finest image covers, units:", gsd_ends, is_reversed=True)
+    )
+    weak, shares = ground.weak_layer()
+    named = ", ".join(f"{WORDS[reason][0]} {percent(share)}" for reason, share in shares.items())
+    words = (
+        f"Places of which more pixels were lost than confirmed: {named} of what any image sees."
+        if named
+        else ("There is no place of which more pixels were lost than confirmed.")
+    )
+    layers.append(_layer("weak areas", weak, words, on_colours=True))
+    return layers
+
+
+def _layer(
+    name: str,
+    picture: NDArray[np.uint8],
+    text: str,
+    ends: tuple[float, float] | None = None,
+    *,
+    is_reversed: bool = False,
+    on_colours: bool = False,
+) -> dict[str, Any]:
+    return {
+        "name": name,
+        "uri": picture_uri(picture, _LAYER_BYTES, exact=on_colours),
+        "text": text,
+        "ends": None if ends is None else [f"{end:.4g}" for end in ends],
+        "reversed": is_reversed,
+        "on_colours": on_colours,
+    }
+
+
+def _reason(reason: Reason, images: list[ImageFacts]) -> dict[str, str]:
+    shares = [image.shares[reason] for image in images if image.has_maps]
+    name, meaning = WORDS[reason]
+    return {
+        "name": name,
+        "meaning": meaning,
+        "colour": colour_of(reason),
+        "share": percent(sum(shares) / len(shares)) if any(shares) else "",
+    }
+
+
+def camera_path(view: View, frame: Frame, among: int) -> str:
+    """One of so many cameras: a triangle that points to where it looks, or a diamond where that is down or up."""
+    middle = frame.place(view.center[None])[0] * _drawing_size(frame)
+    ahead = looks_towards(view, frame)
+    length = float(np.hypot(*ahead))
+    if length < _LOOKS_DOWN:
+        corners = np.array([[0.0, -0.5], [0.4, 0.0], [0.0, 0.5], [-0.4, 0.0]])
+    else:
+        x, y = ahead / length
+        corners = np.array([[0.6, 0.0], [-0.4, 0.4], [-0.4, -0.4]]) @ [[x, y], [-y, x]]
+    size = _CAMERA_UNITS * min(1.0, math.sqrt(_FULL_SIZE / among))
+    return "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in middle + size * corners) + "Z"
+
+
+def _drawing_size(frame: Frame) -> NDArray[np.float64]:
+    """Width and height of the map's drawing."""
+    size = np.array([frame.width, frame.height])
+    return np.asarray(size * (_MAP_UNITS / size.max()))
+
+
+def outline(corners: NDArray[np.float64], frame: Frame) -> str:
+    """Places of corners on a map, as SVG wants them; nothing of a footprint that goes to the horizon."""
+    corners = corners * _drawing_size(frame)
+    if not np.isfinite(corners).all() or np.abs(corners).max() > 10 * _MAP_UNITS:
+        return ""
+    return " ".join(f"{x:.0f},{y:.0f}" for x, y in corners)

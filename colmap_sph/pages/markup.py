@@ -1,0 +1,183 @@
+"""What is known of a workspace → the text of its page, in which every name is text and nothing else."""
+
+import base64
+import hashlib
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from markupsafe import Markup
+
+import colmap_sph
+from colmap_sph.errors import printable
+from colmap_sph.pages.content import Content
+from colmap_sph.pages.image_markup import MOST_LINES, image_values
+from colmap_sph.pages.map_markup import cloud_values, map_values
+from colmap_sph.pages.run_facts import RunFacts, changed_since
+from colmap_sph.pages.words import duration, number, percent, pixels
+from colmap_sph.project.files import real_path
+
+_FOLDER = Path(__file__).parent
+_ANGLE_BARS = 24
+
+
+def render(content: Content) -> str:
+    """Return the page's text."""
+    environment = Environment(
+        loader=FileSystemLoader(_FOLDER),
+        autoescape=True,
+        undefined=StrictUndefined,
+        # Names of files may hold characters that reorder or hide what stands beside them.
+        finalize=lambda value: value if isinstance(value, Markup) else printable_text(value),
+    )
+    style = (_FOLDER / "page.css").read_text(encoding="utf-8")
+    script = (_FOLDER / "page.js").read_text(encoding="utf-8")
+    run = content.run or RunFacts()
+    values: dict[str, Any] = {
+        "style": Markup(style),
+        "style_hash": _hash(style),
+        "script": Markup(script),
+        "script_hash": _hash(script),
+        "version": colmap_sph.__version__,
+        **_head(content, run),
+        **cloud_values(content),
+        **map_values(content),
+        **image_values(content, run),
+        **_pairs(content, run),
+        **_run(run),
+    }
+    values["data"] |= {
+        "names": [printable(image.name) for image in content.images],
+        "pairs": [[pair.left, pair.right, pair.angle, pair.rows] for pair in content.pairs],
+    }
+    return environment.get_template("page.html").render(values)
+
+
+def printable_text(value: object) -> object:
+    """A value of the template, with what cannot be seen in it written out."""
+    return "\n".join(map(printable, value.split("\n"))) if isinstance(value, str) else value
+
+
+def _hash(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")
+
+
+# ---- head --------------------------------------------------------------------------------------------------
+
+
+def _head(content: Content, run: RunFacts) -> dict[str, Any]:
+    notices = list(run.warnings)
+    changed = changed_since(content.workspace, run, content.scene.index_of)
+    if changed:
+        some = ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
+        notices.insert(0, ("out of date", f"maps were made again after the run that this tells of ended: {some}."))
+    if content.missing:
+        notices.insert(0, ("not finished", f"{content.missing[:1].upper()}{content.missing[1:]}."))
+    root = real_path(content.workspace.root)
+    return {
+        "title": "/".join(root.parts[-2:]) if len(root.parts) > 2 else str(root),
+        "headline": _headline(content, run),
+        "notices": notices,
+        "facts": _facts(content, run),
+        "how_to_look": f"The whole cloud is {content.workspace.fused_path.name}, beside the folder of this page: "
+        "CloudCompare, MeshLab and Blender open it. Depth and normal maps are in stereo, as COLMAP has them; "
+        "colmap gui and the meshers of COLMAP and OpenMVS take the whole folder as their workspace.",
+    }
+
+
+def _headline(content: Content, run: RunFacts) -> str:
+    with_depth = sum(image.coverage > 0 for image in content.images)
+    words = f"{with_depth:,} of {number(len(content.images), 'image')} with depth maps"
+    if content.cloud.total:
+        words += f", {content.cloud.total:,} points"
+    seconds = sum(run.seconds.values())
+    return f"{words}, in {duration(seconds)}." if seconds else f"{words}."
+
+
+def _facts(content: Content, run: RunFacts) -> list[tuple[str, str, str]]:
+    coverage = [image.coverage for image in content.images if image.coverage > 0]
+    gsd = [image.gsd for image in content.images if image.gsd is not None]
+    angles = [pair.angle for pair in content.pairs if pair.angle is not None]
+    facts = [
+        (
+            "coverage",
+            percent(sum(coverage) / len(coverage)) if coverage else "–",
+            "Mean share of pixels with a depth",
+        ),
+        ("points", f"{content.cloud.total:,}", "Of the fused cloud"),
+        (
+            "GSD",
+            f"{median(gsd):.3g} units" if gsd else "–",
+            "What a pixel covers of the surface, model units (median)",
+        ),
+        ("agreement", percent(run.overall_agreement), "Sparse points that agree with the depth maps"),
+        (
+            "pairs",
+            f"{run.pairs or len(content.pairs):,}",
+            f"Matched; chosen by {run.pair_source or 'unknown means'}",
+        ),
+        ("parallax", f"{median(angles):.1f}°" if angles else "–", "Median of the pairs' angles"),
+        (
+            "rows disagree",
+            pixels(run.row_residual),
+            "Rows of rectified pairs; more than 0.4: imprecise poses or lenses",
+        ),
+        ("peak memory", f"{run.peak_memory / 2**30:.2f} GiB" if run.peak_memory else "–", "Of the whole process"),
+    ]
+    if run.polishing:
+        facts.append(("poses", run.polishing, "What polishing came to"))
+    if run.stretched:
+        facts.append(("values", run.stretched, "What became black and white"))
+    return facts
+
+
+# ---- pairs and run -----------------------------------------------------------------------------------------
+
+
+def _pairs(content: Content, run: RunFacts) -> dict[str, Any]:
+    pairs = content.pairs
+    words = f"{number(len(pairs), 'pair')} matched" if pairs else "It is not known which pairs were matched"
+    angles = [pair.angle for pair in pairs if pair.angle is not None]
+    if angles:
+        words += f", with a parallax of {min(angles):.1f}° to {max(angles):.1f}° (median {median(angles):.1f}°)"
+    skipped = list(run.skipped_pairs.items())
+    return {
+        "pair_words": f"{words}.",
+        "angle_bars": _angle_bars(angles),
+        "pairs_listed": bool(pairs),
+        "skipped_pairs": skipped[:MOST_LINES],
+        "skipped_pairs_more": max(len(skipped) - MOST_LINES, 0),
+    }
+
+
+def _angle_bars(angles: list[float]) -> list[dict[str, Any]]:
+    if len(angles) < 2:
+        return []
+    counts, edges = np.histogram(angles, bins=_ANGLE_BARS, range=(0, max(max(angles), 1.0)))
+    return [
+        {
+            "height": round(58 * int(count) / max(int(counts.max()), 1), 1),
+            "words": f"{low:.1f}° to {high:.1f}°: {number(int(count), 'pair')}",
+            "from": f"{low:.0f}",
+            "to": f"{high:.0f}",
+        }
+        for count, low, high in zip(counts, edges[:-1], edges[1:], strict=True)
+    ]
+
+
+def _run(run: RunFacts) -> dict[str, Any]:
+    longest = max(run.seconds.values(), default=0.0)
+    stages = [
+        {
+            "name": name,
+            "seconds": f"{seconds:,.1f}",
+            "share": round(100 * seconds / longest, 1) if longest > 0 else 0,
+            "made": run.made.get(name, ""),
+            "reused": run.reused.get(name, ""),
+        }
+        for name, seconds in run.seconds.items()
+    ]
+    versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
+    return {"stages": stages, "command": run.command, "versions": versions}

@@ -1,0 +1,211 @@
+"""A dense workspace → its page ``colmap_sph/report.html``, one file that shows what came out and loads nothing."""
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.pages.block_map import Frame, Ground, footprint, frame_around, surface_points
+from colmap_sph.pages.content import CloudSample, Content
+from colmap_sph.pages.image_facts import (
+    ImageFacts,
+    Picture,
+    facts_of_image,
+    find_blank,
+    read_picture,
+    small_pictures,
+)
+from colmap_sph.pages.markup import render
+from colmap_sph.pages.pair_facts import PairFacts, pairs_of
+from colmap_sph.pages.reasons import Partner, find_reasons
+from colmap_sph.pages.run_facts import RunFacts, read_run_facts
+from colmap_sph.pages.samples import MapSamples, read_samples, samples_per_side
+from colmap_sph.pages.vertical import map_axes
+from colmap_sph.project.cloud_reader import read_some_points
+from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.partners.pairs import overlapping_views
+
+# Points of the cloud to look at; of an image's surface, to stand for it where there is no cloud; to frame the map.
+_CLOUD_SAMPLE = 800_000
+_SURFACE_SAMPLE = 300
+_FRAME_SAMPLE = 100_000
+# Partners of a view to look from, where it is not known which were its.
+_GUESSED_PARTNERS = 10
+# Images whose pictures are shown: the least covered, and as many from all over the block.
+_MOST_SHOWN = 1000
+
+
+class Progress(Protocol):
+    """What is told while a page is made."""
+
+    def start(self, stage: str, total: int) -> None:
+        """So many steps begin."""
+
+    def advance(self) -> None:
+        """One step is done."""
+
+
+class _Silent:
+    def start(self, stage: str, total: int) -> None:
+        pass
+
+    def advance(self) -> None:
+        pass
+
+
+def write_page(workspace: Workspace, progress: Progress | None = None) -> str:
+    """Make the page of a workspace from what is on disk: model, images, maps, cloud, and ``report.json``.
+
+    It also shows workspaces whose run was ended before its end, and what COLMAP's own programs made.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    progress : Progress, optional
+
+    Returns
+    -------
+    str
+        What is missing of a finished run, in a sentence; empty where nothing is.
+
+    Raises
+    ------
+    InputError
+        There is no readable model, or neither a depth map nor a cloud to show.
+    OutputError
+        The page cannot be written.
+    """
+    content = gather(workspace, progress or _Silent())
+    page = render(content)
+    make_dir(workspace.state_dir)
+    with atomic_file(workspace.page_path) as file:
+        file.write(page.encode("utf-8", "backslashreplace"))
+    return content.missing
+
+
+def gather(workspace: Workspace, progress: Progress) -> Content:
+    """Look at all of a workspace, one image at a time; otherwise as `write_page`."""
+    scene = read_scene(workspace.sparse_dir)
+    facts = read_run_facts(workspace)
+    progress.start("report", 2 * len(scene.views))
+    samples = {}
+    for view in scene.views:
+        samples[view.name] = read_samples(workspace, view, samples_per_side(len(scene.views)))
+        progress.advance()
+    cloud = _read_cloud(workspace, scene)
+    if not cloud.total and not any(each.has_maps for each in samples.values()):
+        raise InputError(
+            f"There is nothing to show of {workspace.root} yet: it has neither depth maps nor a cloud; "
+            "run colmap_sph run first."
+        )
+    block = _Block(workspace, scene, facts or RunFacts(), samples, cloud)
+    images = []
+    for view in scene.views:
+        images.append(block.look_at(view))
+        progress.advance()
+    return Content(
+        workspace, scene, facts, images, block.pairs, cloud, block.frame, block.ground, _missing(block, facts)
+    )
+
+
+@dataclass(eq=False)
+class _Block:
+    """All views' samples, and what is worked out of them together."""
+
+    workspace: Workspace
+    scene: Scene
+    facts: RunFacts
+    samples: dict[str, MapSamples]
+    cloud: CloudSample
+    pairs: list[PairFacts] = field(init=False)
+    frame: Frame = field(init=False)
+    ground: Ground = field(init=False)
+
+    def __post_init__(self) -> None:
+        surfaces = {view.name: self._surface(view) for view in self.scene.views}
+        surface = self.cloud.points[:: -(-len(self.cloud.points) // _FRAME_SAMPLE) or 1]
+        surface = surface if len(surface) else np.concatenate(list(surfaces.values()))
+        self.pairs = pairs_of(self.workspace, self.scene, self.facts, surfaces)
+        self._partners = self._find_partners()
+        self._shown = self._choose_shown()
+        centers = np.array([view.center for view in self.scene.views])
+        axes = map_axes(self.scene.views, surface, is_georeferenced=bool(self.scene.origin.any()))
+        self.frame = frame_around(surface, centers, axes)
+        self.ground = Ground(self.frame)
+
+    def look_at(self, view: View) -> ImageFacts:
+        """Work out what became of a view's pixels, make its pictures, and put it on the map."""
+        samples = self.samples[view.name]
+        picture = read_picture(self.workspace, view)
+        others = [self.scene.view(name) for name in self._partners[view.name]]
+        reasons, depth = find_reasons(
+            view,
+            samples,
+            [Partner(other, self.samples[other.name]) for other in others],
+            blank=find_blank(picture, samples.geometric.shape),
+            min_angle=self.facts.min_angle,
+        )
+        self.ground.add(view, samples, reasons, depth)
+        pictures: tuple[Picture, ...] = ()
+        if view.name in self._shown:
+            pictures = small_pictures(self.workspace, view, samples, reasons, picture, len(self._shown))
+        corners = footprint(view, samples, depth, self.frame) if depth.any() else None
+        return facts_of_image(view, samples, reasons, pictures, corners)
+
+    def _surface(self, view: View) -> NDArray[np.float64]:
+        """Some points that a view sees."""
+        samples = self.samples[view.name]
+        depth = np.where(samples.geometric > 0, samples.geometric, samples.photometric)
+        points = surface_points(view, samples, depth)[depth.ravel() > 0]
+        return points[:: -(-len(points) // _SURFACE_SAMPLE) or 1]
+
+    def _find_partners(self) -> dict[str, list[str]]:
+        """The images that each was matched with, or else those that share most points with it."""
+        if not self.pairs:
+            return overlapping_views(self.scene, _GUESSED_PARTNERS)
+        views = self.scene.views
+        partners: dict[str, list[str]] = {view.name: [] for view in views}
+        for pair in self.pairs:
+            partners[views[pair.left].name].append(views[pair.right].name)
+            partners[views[pair.right].name].append(views[pair.left].name)
+        return partners
+
+    def _choose_shown(self) -> set[str]:
+        """Images whose pictures the page has room for."""
+        names = [view.name for view in self.scene.views]
+        if len(names) <= _MOST_SHOWN:
+            return set(names)
+        by_coverage = sorted(names, key=lambda name: float((self.samples[name].geometric > 0).mean()))
+        worst = by_coverage[: _MOST_SHOWN // 2]
+        rest = sorted(set(names) - set(worst))
+        return {*worst, *(rest[k] for k in np.linspace(0, len(rest) - 1, _MOST_SHOWN - len(worst)).astype(int))}
+
+
+def _read_cloud(workspace: Workspace, scene: Scene) -> CloudSample:
+    """A sample of the cloud, in the scene's coordinates; without a cloud the reason in words."""
+    if not workspace.fused_path.exists():
+        return CloudSample(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), 0, "There is no cloud yet.")
+    try:
+        points, colours, total = read_some_points(workspace.fused_path, _CLOUD_SAMPLE)
+    except InputError as error:
+        return CloudSample(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), 0, str(error))
+    return CloudSample(points - scene.origin, colours, total, "" if total else "The cloud has no points.")
+
+
+def _missing(block: _Block, facts: RunFacts | None) -> str:
+    """What is missing of a finished run, in a sentence."""
+    lacks = []
+    expected = block.samples if facts is None else {name for name, share in facts.coverage.items() if share > 0}
+    without = [name for name in expected if name in block.samples and not block.samples[name].has_geometric]
+    if without:
+        lacks.append(f"{len(without)} of {len(expected)} images have no geometric depth map")
+    if not block.cloud.total:
+        lacks.append("there is no cloud")
+    if facts is None:
+        lacks.append("no run of this program has come to its end here, so that its numbers are not known")
+    return f"{', '.join(lacks[:-1])}{' and ' if len(lacks) > 1 else ''}{lacks[-1]}" if lacks else ""

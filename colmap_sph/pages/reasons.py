@@ -1,0 +1,172 @@
+"""Sampled maps of a view and its partners → at each sample a confirmed depth, or why there is none."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.pages.samples import MapSamples
+from colmap_sph.scene import View, pixel_transfer
+
+# Between two samples depth may change by more than among those around.
+_SLACK = 0.02
+
+
+class Reason(IntEnum):
+    """Why a pixel has no geometric depth, in the order of the gates; or that it has one."""
+
+    CONFIRMED = 0
+    MASKED = 1
+    ONE_IMAGE = 2
+    NO_PARALLAX = 3
+    BLANK = 4
+    NOT_FOUND = 5
+    CONTRADICTED = 6
+    ALONE = 7
+
+
+WORDS = {
+    Reason.CONFIRMED: ("confirmed", "depth confirmed by other images: what is fused"),
+    Reason.MASKED: ("masked", "ignored under the mask"),
+    Reason.ONE_IMAGE: ("one image only", "no partner of the image has the place in view"),
+    Reason.NO_PARALLAX: ("no parallax", "partners see it from nearly the same place"),
+    Reason.BLANK: ("blank", "nothing to match: sky, still water, bare or overexposed surfaces"),
+    Reason.NOT_FOUND: (
+        "not matched",
+        "in view of partners, but no depth was found: hidden, moving, repeated, fine",
+    ),
+    Reason.CONTRADICTED: ("contradicted", "a depth was found, and other images' depths disagree with it"),
+    Reason.ALONE: ("unconfirmed", "a depth was found, and no other image has a depth there"),
+}
+"""Name and meaning of each."""
+
+
+@dataclass(frozen=True, eq=False)
+class Partner:
+    """A view's partner, and its samples."""
+
+    view: View
+    samples: MapSamples
+
+
+def find_reasons(
+    view: View,
+    samples: MapSamples,
+    partners: Sequence[Partner],
+    *,
+    blank: NDArray[np.bool_],
+    min_angle: float,
+) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Say of each sample of a view what became of it.
+
+    A place without a depth of its own is taken to be as far away as the nearest sample with one.
+
+    Parameters
+    ----------
+    view : View
+    samples : MapSamples
+    partners : sequence of Partner
+    blank : (h, w) bool ndarray
+        Where the image shows nothing that could be matched.
+    min_angle : float
+        Less parallax tells no depth, degrees.
+
+    Returns
+    -------
+    reasons : (h, w) uint8 ndarray
+        `Reason` of each sample.
+    depth : (h, w) float32 ndarray
+        How far away each is, or is taken to be; 0 where the view has no depth at all.
+    """
+    found = np.where(samples.geometric > 0, samples.geometric, samples.photometric)
+    depth = filled(found)
+    seen, apart, met = _look_from(view, samples, partners, depth, min_angle)
+    unseen = ~seen & (depth > 0) if partners else ~seen
+    reasons = np.full(depth.shape, Reason.NOT_FOUND, np.uint8)
+    reasons[blank] = Reason.BLANK
+    reasons[seen & ~apart] = Reason.NO_PARALLAX
+    reasons[unseen] = Reason.ONE_IMAGE
+    has_own = samples.photometric > 0
+    reasons[has_own] = Reason.ALONE
+    reasons[has_own & met] = Reason.CONTRADICTED
+    reasons[has_own & unseen] = Reason.ONE_IMAGE
+    reasons[samples.geometric > 0] = Reason.CONFIRMED
+    reasons[samples.ignored & (samples.geometric <= 0)] = Reason.MASKED
+    return reasons, depth
+
+
+def filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Depths with the nearest one in place of none; 0 everywhere where there is not any."""
+    none = (depth <= 0).astype(np.uint8)
+    if none.all() or not none.any():
+        return depth
+    _, labels = cv2.distanceTransformWithLabels(none, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    of_label = np.zeros(int(labels.max()) + 1, np.float32)
+    of_label[labels[none == 0]] = depth[none == 0]
+    return np.asarray(of_label[labels], np.float32)
+
+
+def _look_from(
+    view: View,
+    samples: MapSamples,
+    partners: Sequence[Partner],
+    depth: NDArray[np.float32],
+    min_angle: float,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
+    """(h, w) each: does any partner have it in view; and from another place; and has it a depth there?"""
+    columns, rows = np.meshgrid(samples.columns, samples.rows)
+    pixels = np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1).astype(np.float64)
+    points = depth.reshape(1, -1) * pixels
+    rays = view.R.T @ np.linalg.inv(view.K) @ points
+    known = depth.ravel() > 0
+    seen = np.zeros(depth.size, bool)
+    apart = np.zeros(depth.size, bool)
+    met = np.zeros(depth.size, bool)
+    for partner in partners:
+        transfer = pixel_transfer(view, partner.view)
+        moved = transfer[:, :3] @ points + transfer[:, 3:]
+        in_view, places = _in_view(partner, moved, known)
+        seen |= in_view
+        apart |= in_view & (_angles(rays, partner.view.center - view.center) >= min_angle)
+        # What lies behind the surface that the partner sees is hidden from it.
+        most = _depths_around(partner.samples)[places]
+        met |= in_view & (most > 0) & (moved[2] <= (1 + _SLACK) * most)
+    shape = depth.shape
+    return seen.reshape(shape), apart.reshape(shape), met.reshape(shape)
+
+
+def _in_view(
+    partner: Partner, moved: NDArray[np.float64], known: NDArray[np.bool_]
+) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Which homogeneous pixels (3, n) lie in a partner's image; and row and column of the sample next to each."""
+    in_front = known & (moved[2] > 0)
+    scale = np.where(in_front, moved[2], 1)
+    x = np.where(in_front, moved[0] / scale, -1)
+    y = np.where(in_front, moved[1] / scale, -1)
+    view = partner.view
+    in_view = (x >= 0) & (x <= view.width - 1) & (y >= 0) & (y <= view.height - 1)
+    rows = _nearest(partner.samples.rows, np.where(in_view, y, 0))
+    columns = _nearest(partner.samples.columns, np.where(in_view, x, 0))
+    return in_view, (rows, columns)
+
+
+def _nearest(grid: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Places in an even grid next to values."""
+    step = grid[1] - grid[0] if len(grid) > 1 else 1
+    return np.asarray(np.clip(np.rint((values - grid[0]) / step), 0, len(grid) - 1), np.int64)
+
+
+def _depths_around(samples: MapSamples) -> NDArray[np.float32]:
+    """(h, w): the largest depth at each sample and those around it; 0 where there is none."""
+    found = np.where(samples.photometric > 0, samples.photometric, samples.geometric)
+    return np.asarray(cv2.dilate(found, np.ones((3, 3), np.uint8)), np.float32)
+
+
+def _angles(rays: NDArray[np.float64], baseline: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(n,) degrees at the points (3, n), relative to the view's centre, between it and one `baseline` away."""
+    others = rays - baseline[:, None]
+    sines = np.linalg.norm(np.cross(rays.T, others.T), axis=1)
+    return np.asarray(np.degrees(np.arctan2(sines, np.einsum("in,in->n", rays, others))))

@@ -1,0 +1,111 @@
+"""A view's maps and mask → what is needed of them for a page: values at a grid of pixels."""
+
+import math
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.map_files import read_some_pixels
+from colmap_sph.project.masks import read_mask
+from colmap_sph.project.workspace import MapKind, Workspace
+from colmap_sph.scene import View
+
+# Samples along the longer side of an image: as many as there is room for, of 9 bytes each, and within these.
+_SAMPLE_BYTES = 9
+_ROOM = 64e6
+_FEWEST = 24
+_MOST = 192
+# Depths beyond come from damage.
+_FARTHEST = 1e12
+
+
+def samples_per_side(views: int) -> int:
+    """Samples along the longer side of an image, for so many views."""
+    return int(np.clip(math.sqrt(_ROOM / (_SAMPLE_BYTES * max(views, 1))), _FEWEST, _MOST))
+
+
+@dataclass(frozen=True, eq=False)
+class MapSamples:
+    """A view's depth at a grid of its pixels; what is too large to keep for all views is not here.
+
+    Attributes
+    ----------
+    rows, columns : (h,) and (w,) int64 ndarray
+        Of the pixels.
+    photometric, geometric : (h, w) float32 ndarray
+        Depths, 0 = none.
+    has_photometric, has_geometric : bool
+        Whether there are such maps.
+    ignored : (h, w) bool ndarray
+        Under the mask.
+    """
+
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+    photometric: NDArray[np.float32]
+    geometric: NDArray[np.float32]
+    has_photometric: bool
+    has_geometric: bool
+    ignored: NDArray[np.bool_]
+
+    @property
+    def has_maps(self) -> bool:
+        """Whether there is any map of the view."""
+        return self.has_photometric or self.has_geometric
+
+
+def grid_of(view: View, per_side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Rows and columns of pixels, evenly spread, about `per_side` of them along the longer side."""
+    step = max(1, math.ceil(max(view.width, view.height) / per_side))
+    first = step // 2
+    # An image narrower than the step still has one.
+    rows = np.arange(min(first, view.height - 1), view.height, step)
+    columns = np.arange(min(first, view.width - 1), view.width, step)
+    return rows, columns
+
+
+def read_samples(workspace: Workspace, view: View, per_side: int) -> MapSamples:
+    """Read a view's depth maps and mask at a grid of pixels; what is missing or damaged has no depth there."""
+    rows, columns = grid_of(view, per_side)
+    photometric = _depth(workspace, view, "photometric", rows, columns)
+    geometric = _depth(workspace, view, "geometric", rows, columns)
+    none = np.zeros((len(rows), len(columns)), np.float32)
+    return MapSamples(
+        rows,
+        columns,
+        none if photometric is None else photometric,
+        none if geometric is None else geometric,
+        photometric is not None,
+        geometric is not None,
+        _ignored(workspace, view)[np.ix_(rows, columns)] if workspace.masks_dir.is_dir() else none > 0,
+    )
+
+
+def read_normals(workspace: Workspace, view: View, samples: MapSamples) -> NDArray[np.float32] | None:
+    """(3, h, w) normals of the geometric map at a view's samples; None where there are none."""
+    path = workspace.normal_map_path(view.name, "geometric")
+    with suppress(InputError):
+        return read_some_pixels(path, (view.height, view.width, 3), samples.rows, samples.columns)
+    return None
+
+
+def _depth(
+    workspace: Workspace, view: View, kind: MapKind, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float32] | None:
+    try:
+        path = workspace.depth_map_path(view.name, kind)
+        depth = read_some_pixels(path, (view.height, view.width), rows, columns)
+    except InputError:
+        return None
+    depth[~((depth > 0) & (depth < _FARTHEST))] = 0
+    return depth
+
+
+def _ignored(workspace: Workspace, view: View) -> NDArray[np.bool_]:
+    mask = None
+    with suppress(InputError):
+        mask = read_mask(workspace.mask_path(view.name), view.width, view.height)
+    return np.zeros((view.height, view.width), bool) if mask is None else mask == 0

@@ -1,0 +1,111 @@
+"""A cloud on disk → some of its points with their colours, however many it has."""
+
+import os
+import re
+from io import BufferedReader
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError, reason_of
+from colmap_sph.project.files import open_regular
+from colmap_sph.project.map_coordinates import is_plausible
+
+_HEADER_BYTES = 1 << 14
+_END = re.compile(rb"\nend_header[ \t]*\r?\n")
+_KINDS = {
+    "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",
+    "int8": "i1", "uint8": "u1", "int16": "<i2", "uint16": "<u2", "int32": "<i4", "uint32": "<u4",
+    "float": "<f4", "double": "<f8", "float32": "<f4", "float64": "<f8",
+}  # fmt: skip
+_COLOURS = ("red", "green", "blue")
+# What is read of a large cloud: so many pieces, evenly spread, of so many bytes.
+_PIECES = 4096
+_PIECE_BYTES = 1 << 18
+
+
+def read_some_points(path: Path, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint8], int]:
+    """Read points of a cloud, evenly spread over its file.
+
+    Parameters
+    ----------
+    path : Path
+        A binary little-endian PLY file whose first element is the vertices, without lists: what COLMAP's fusion
+        and ours write.
+    most : int
+        Points to read at most, about.
+
+    Returns
+    -------
+    xyz : (n, 3) float64 ndarray
+        Points that are finite and not absurdly far.
+    rgb : (n, 3) uint8 ndarray
+        Their colours; grey where the cloud has none.
+    count : int
+        Points of the whole cloud.
+
+    Raises
+    ------
+    InputError
+        The file is missing, cannot be read, or is no such cloud.
+    """
+    try:
+        with open_regular(path) as file:
+            kind, count, begin = _layout(path, file)
+            points = _read_pieces(file, kind, count, begin, most)
+    except OSError as error:
+        raise InputError(f"The cloud {path} cannot be read ({reason_of(error)}); fuse again.") from error
+    xyz = np.column_stack([points[name].astype(np.float64) for name in "xyz"])
+    rgb = np.full(xyz.shape, 128, np.uint8)
+    if all(name in (kind.names or ()) and kind[name] == np.uint8 for name in _COLOURS):
+        rgb = np.column_stack([points[name] for name in _COLOURS])
+    likely = is_plausible(xyz)
+    return xyz[likely], rgb[likely], count
+
+
+def _layout(path: Path, file: BufferedReader) -> tuple[np.dtype[Any], int, int]:
+    """Type of a point, the number of points, and where the first begins; checked against the file's size."""
+    start = file.read(_HEADER_BYTES)
+    end = _END.search(start)
+    header = start[: end.start()].decode("ascii", "replace").splitlines() if end else []
+    lines = [line.split() for line in header if line.strip() and not line.startswith(("comment", "obj_info"))]
+    if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]] or end is None:
+        raise InputError(f"{path} is no binary PLY file; fuse again to have this program's cloud.")
+    names: list[str] = []
+    kinds: list[str] = []
+    for words in lines[3:]:
+        if words[0] != "property":
+            break
+        if len(words) != 3 or words[1] not in _KINDS:
+            raise InputError(f"The points of {path} are in no known format; fuse again.")
+        names.append(words[2])
+        kinds.append(_KINDS[words[1]])
+    element = lines[2] if len(lines) > 2 else []
+    if len(element) != 3 or element[:2] != ["element", "vertex"] or not element[2].isdecimal():
+        raise InputError(f"{path} does not begin with points; fuse again.")
+    if not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise InputError(f"The points of {path} are in no known format; fuse again.")
+    kind = np.dtype(list(zip(names, kinds, strict=True)))
+    count = int(element[2][:15])
+    if os.fstat(file.fileno()).st_size < end.end() + count * kind.itemsize:
+        raise InputError(f"{path} is cut off; fuse again.")
+    return kind, count, end.end()
+
+
+def _read_pieces(file: BufferedReader, kind: np.dtype[Any], count: int, begin: int, most: int) -> NDArray[np.void]:
+    """Points of evenly spread pieces of the file, all of it where it is small."""
+    length = max(_PIECE_BYTES // kind.itemsize, 1)
+    pieces = min(-(-count // length), _PIECES)
+    is_whole = pieces * length >= count
+    starts = np.arange(pieces) * length if is_whole else np.linspace(0, count - length, pieces).astype(np.int64)
+    step = max(-(-min(count, pieces * length) // most), 1)
+    parts: list[NDArray[np.void]] = []
+    for first in starts:
+        file.seek(begin + int(first) * kind.itemsize)
+        data = file.read(min(length, count - int(first)) * kind.itemsize)
+        points = np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], kind)
+        # Where to begin differs from piece to piece: images are written row by row.
+        parts.append(points[len(parts) % step :: step])
+    return np.concatenate(parts) if parts else np.empty(0, kind)

@@ -1,0 +1,379 @@
+"""What a page is drawn from: why pixels are lost, which way is up, the map, the small cloud, small readings."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from small_workspaces import write_cloud
+
+from colmap_sph.errors import InputError
+from colmap_sph.evaluation.ply_files import read_ply
+from colmap_sph.pages.block_map import Ground, footprint, frame_around, looks_towards, seen_from_above
+from colmap_sph.pages.pictures import COLOURS, depth_picture, normal_picture, picture_uri, reason_picture
+from colmap_sph.pages.reasons import Partner, Reason, filled, find_reasons
+from colmap_sph.pages.samples import MapSamples, grid_of
+from colmap_sph.pages.small_cloud import STEPS, thin_out
+from colmap_sph.pages.vertical import map_axes
+from colmap_sph.project.cloud_reader import read_some_points
+from colmap_sph.project.images.reading import read_small_colours
+from colmap_sph.project.map_files import read_some_pixels, write_depth_map, write_normal_map
+from colmap_sph.scene import View
+
+WIDTH, HEIGHT, FOCAL = 200, 150, 100.0
+K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def view_at(*center: float, R: np.ndarray = DOWN, name: str = "a.jpg") -> View:
+    return View(1, name, WIDTH, HEIGHT, K, R, -R @ np.array(center), np.empty(0, np.int64))
+
+
+def samples_of(
+    view: View, photometric: float | np.ndarray, geometric: float | np.ndarray | None = None, *, step: int = 5
+) -> MapSamples:
+    """Depth at each fifth pixel; the same everywhere, or (h, w)."""
+    rows, columns = grid_of(view, view.width // step)
+    shape = (len(rows), len(columns))
+    geometric = photometric if geometric is None else geometric
+    first, second = (np.array(np.broadcast_to(depth, shape), np.float32) for depth in (photometric, geometric))
+    return MapSamples(rows, columns, first, second, True, True, np.zeros(shape, bool))
+
+
+# ---- reasons -----------------------------------------------------------------------------------------------
+
+ALTITUDE = 50.0
+SHAPE = (30, 40)
+
+
+def reasons_of(samples: MapSamples, *partners: Partner, blank: np.ndarray | None = None) -> np.ndarray:
+    blank = np.zeros(SHAPE, bool) if blank is None else blank
+    return find_reasons(view_at(0, 0, ALTITUDE), samples, partners, blank=blank, min_angle=1.0)[0]
+
+
+def partner_at(x: float, depth: float | np.ndarray = ALTITUDE) -> Partner:
+    view = view_at(x, 0, ALTITUDE)
+    return Partner(view, samples_of(view, depth))
+
+
+def test_what_no_partner_has_in_view_is_seen_by_one_image_only() -> None:
+    """20 units to the right at 50 units and 100 pixels of focal length: the left 40 pixels are not in common."""
+    view = view_at(0, 0, ALTITUDE)
+    samples = samples_of(view, ALTITUDE, 0)
+    reasons = reasons_of(samples, partner_at(20.0))
+    assert (reasons[:, samples.columns < 40] == Reason.ONE_IMAGE).all()
+    assert not (reasons[:, samples.columns >= 40] == Reason.ONE_IMAGE).any()
+
+
+@pytest.mark.parametrize(
+    ("partner_depth", "reason"),
+    [
+        (0.0, Reason.ALONE),
+        (ALTITUDE, Reason.CONTRADICTED),
+        (1.5 * ALTITUDE, Reason.CONTRADICTED),  # the partner sees through it
+        (0.5 * ALTITUDE, Reason.ALONE),  # something hides it from the partner
+    ],
+)
+def test_a_depth_that_is_not_confirmed_was_contradicted_or_alone(partner_depth: float, reason: Reason) -> None:
+    samples = samples_of(view_at(0, 0, ALTITUDE), ALTITUDE, 0)
+    assert (reasons_of(samples, partner_at(5.0, partner_depth))[5:-5, 10:-5] == reason).all()
+
+
+def test_partners_in_the_same_place_have_no_parallax() -> None:
+    """At 50 units 0.5 units of baseline are 0.57 degrees, 2 units are 2.3: what is missing is one of the kinds."""
+    found = np.full(SHAPE, ALTITUDE, np.float32)
+    found[10:20, 10:30] = 0
+    samples = samples_of(view_at(0, 0, ALTITUDE), found)
+    for baseline, reason in ((0.5, Reason.NO_PARALLAX), (2.0, Reason.NOT_FOUND)):
+        reasons = reasons_of(samples, partner_at(baseline))
+        assert (reasons[10:20, 10:30] == reason).all()
+        assert (reasons[found > 0] == Reason.CONFIRMED).all()
+
+
+def test_masked_and_blank_pixels_are_told_apart_from_others() -> None:
+    found = np.full(SHAPE, ALTITUDE, np.float32)
+    found[:, 10:30] = 0
+    blank = np.zeros(SHAPE, bool)
+    blank[:15] = True
+    samples = samples_of(view_at(0, 0, ALTITUDE), found)
+    samples.ignored[:, 20:] = True
+    reasons = reasons_of(samples, partner_at(5.0), blank=blank)
+    assert (reasons[:15, 10:20] == Reason.BLANK).all()
+    assert (reasons[15:, 10:20] == Reason.NOT_FOUND).all()
+    assert (reasons[:, 20:30] == Reason.MASKED).all()
+    assert (reasons[:, 30:] == Reason.CONFIRMED).all()
+
+
+def test_without_partners_one_image_sees_all_and_without_depth_nothing_is_known() -> None:
+    nothing = samples_of(view_at(0, 0, ALTITUDE), 0.0)
+    assert (reasons_of(nothing) == Reason.ONE_IMAGE).all()
+    assert (reasons_of(nothing, partner_at(5.0)) == Reason.NOT_FOUND).all()
+
+
+def test_holes_are_as_far_as_the_nearest_depth() -> None:
+    rng = np.random.default_rng(2)
+    depth = np.where(rng.random((20, 30)) < 0.05, rng.uniform(1, 9, (20, 30)), 0).astype(np.float32)
+    there = np.argwhere(depth > 0)
+    distances, _ = cKDTree(there).query(np.argwhere(np.ones_like(depth)))
+    for place, value, nearest in zip(np.ndindex(*depth.shape), filled(depth).ravel(), distances, strict=True):
+        away = np.linalg.norm(there[depth[tuple(there.T)] == value] - place, axis=1).min()
+        # The distance transform is that of a 3 x 3 mask, which is right to some percent.
+        assert away <= 1.15 * nearest + 1e-9
+
+
+# ---- up, and the map ---------------------------------------------------------------------------------------
+
+
+def looking(azimuth: float, elevation: float, roll: float = 0.0) -> np.ndarray:
+    """World to camera: z of the world is up; azimuth and elevation of the direction of view in degrees."""
+    a, e, r = np.radians([azimuth, elevation, roll])
+    ahead = np.array([np.sin(a) * np.cos(e), np.cos(a) * np.cos(e), np.sin(e)])
+    right = np.array([np.cos(a), -np.sin(a), 0])
+    down = np.cross(ahead, right)
+    return np.array([np.cos(r) * right + np.sin(r) * down, np.cos(r) * down - np.sin(r) * right, ahead])
+
+
+BLOCKS = {
+    "strip of vertical images": [view_at(x, 0, 50.0) for x in range(0, 100, 10)],
+    "vertical images, every other turned": [
+        view_at(x, y, 50.0, R=DOWN if y % 20 else np.diag([-1.0, 1.0, -1.0]))
+        for x in range(0, 90, 10)
+        for y in (0, 10)
+    ],
+    "around a house": [
+        view_at(20 * np.cos(a), 20 * np.sin(a), 2.0, R=looking(90 - np.degrees(a) + 180, -5, 1.0))
+        for a in np.linspace(0, 6, 20)
+    ],
+    "oblique in four directions": [view_at(0, 0, 50.0, R=looking(a, -45)) for a in (0, 90, 180, 270)],
+}
+
+
+@pytest.mark.parametrize("name", BLOCKS)
+def test_up_is_found(name: str) -> None:
+    rng = np.random.default_rng(3)
+    views = BLOCKS[name]
+    ground = np.column_stack([rng.uniform(-60, 120, (2000, 2)), rng.uniform(0, 4, 2000)])
+    world = Rotation.random(random_state=4).as_matrix()
+    turned = [View(1, "", WIDTH, HEIGHT, K, view.R @ world.T, view.t, view.point_indices) for view in views]
+    axes = map_axes(turned, ground @ world.T)
+    assert axes @ axes.T == pytest.approx(np.eye(3), abs=1e-9)
+    assert np.linalg.det(axes) == pytest.approx(1)
+    assert axes[2] @ world[:, 2] > np.cos(np.radians(3))
+
+
+def test_maps_of_map_coordinates_have_north_on_top() -> None:
+    assert np.array_equal(map_axes([view_at(0, 0, 50.0)], np.zeros((0, 3)), is_georeferenced=True), np.eye(3))
+
+
+def test_a_map_is_seen_from_above() -> None:
+    """A red square under a green one, seen from above; x to the right, y to the top."""
+    low, high = np.mgrid[0:40, 0:40].reshape(2, -1).T + 0.5, np.mgrid[10:20, 25:40].reshape(2, -1).T + 0.5
+    points = np.vstack([np.c_[high, np.full(len(high), 5.0)], np.c_[low, np.zeros(len(low))]])
+    colours = np.repeat(np.array([[0, 255, 0], [255, 0, 0]], np.uint8), [len(high), len(low)], axis=0)
+    frame = frame_around(points, np.array([[20.0, 20, 30]]), np.eye(3))
+    picture, _, ends = seen_from_above(frame, points, colours)
+    assert ends == pytest.approx((0.0, 5.0))
+    for x, y, colour in ((15, 30, (0, 255, 0)), (15, 10, (255, 0, 0)), (30, 30, (255, 0, 0))):
+        across, down = frame.place(np.array([[x, y, 0.0]]))[0] * picture.shape[1::-1]
+        near = picture[int(down) - 2 : int(down) + 3, int(across) - 2 : int(across) + 3].reshape(-1, 4)
+        assert {tuple(each[:3]) for each in near if each[3]} == {colour}
+
+
+def test_footprints_and_directions_are_those_of_the_camera() -> None:
+    """From 50 units above the ground, 200 x 150 pixels of 0.5 units: what samples in the corners see."""
+    view = view_at(30, 40, ALTITUDE)
+    samples = samples_of(view, ALTITUDE)
+    frame = frame_around(np.array([[0.0, 0, 0], [100, 100, 0]]), view.center[None], np.eye(3))
+    corners = footprint(view, samples, samples.geometric, frame)
+    edge = 2.0  # the first sample's column and row
+    x = 30 + (np.array([edge, WIDTH - 3, WIDTH - 3, edge]) - WIDTH / 2) * 0.5
+    y = 40 - (np.array([edge, edge, HEIGHT - 3, HEIGHT - 3]) - HEIGHT / 2) * 0.5
+    assert corners == pytest.approx(frame.place(np.c_[x, y, np.zeros(4)]), abs=1e-6)
+    assert looks_towards(view, frame) == pytest.approx([0, 0])
+    assert looks_towards(view_at(0, 0, 0, R=looking(90, 0)), frame) == pytest.approx([1, 0])
+    assert looks_towards(view_at(0, 0, 0, R=looking(0, 0)), frame) == pytest.approx([0, -1])
+
+
+def test_the_ground_counts_images_and_knows_the_finest() -> None:
+    """Two images at two heights, side by side: overlap, GSD and what was lost, by the geometry of the flight."""
+    low, high = view_at(0, 0, ALTITUDE), view_at(40, 0, 2 * ALTITUDE)
+    frame = frame_around(np.array([[-60.0, -60, 0], [160, 60, 1]]), np.zeros((1, 3)), np.eye(3))
+    ground = Ground(frame)
+    for view, depth in ((low, ALTITUDE), (high, 2 * ALTITUDE)):
+        # The lower fifth of each image is lost.
+        geometric = np.full((HEIGHT, WIDTH), depth, np.float32)
+        geometric[120:] = 0
+        samples = samples_of(view, depth, geometric, step=1)
+        reasons = np.where(geometric > 0, Reason.CONFIRMED, Reason.CONTRADICTED).astype(np.uint8)
+        ground.add(view, samples, reasons, samples.photometric)
+
+    def at(layer: np.ndarray, x: float, y: float) -> float:
+        place = frame.place(np.array([[x, y, 0.0]]))[0]
+        return float(layer[int(place[1] * layer.shape[0]), int(place[0] * layer.shape[1])])
+
+    # Along x the lower sees -50 to 50, the higher -60 to 140; along y -22.5 to 37.5 and -45 to 75.
+    assert [at(ground.images, x, 10.0) for x in (-55, 0, 100, 150)] == [1, 2, 1, 0]
+    assert [at(ground.images, 0.0, y) for y in (-30, -40, 30, 50)] == [1, 1, 2, 1]
+    assert at(ground.gsd, 0.0, 10.0) == pytest.approx(0.5)
+    assert at(ground.gsd, 100.0, 10.0) == pytest.approx(1.0)
+    weak, shares = ground.weak_layer()
+    assert list(shares) == [Reason.CONTRADICTED]
+    assert [at(weak[..., 3], 100.0, y) for y in (-55, 0)] == [255, 0]
+
+
+# ---- small cloud and pictures ------------------------------------------------------------------------------
+
+
+def test_a_small_cloud_lies_on_the_cloud_and_is_even() -> None:
+    """Two plates, one a hundred times as dense: each gets as many points as the other."""
+    rng = np.random.default_rng(5)
+    plates = [np.c_[rng.uniform(0, 10, (n, 2)), np.full(n, 2.0 * k)] for k, n in enumerate((300_000, 3_000))]
+    points = np.vstack([*plates, [[1e6, 0, 0]]])
+    colours = rng.integers(0, 256, points.shape, dtype=np.uint8)
+    small = thin_out(points, colours, 2000)
+    assert small is not None
+    assert 1000 <= len(small.places) <= 2000
+    back = small.corner + small.places * small.step
+    distance, nearest = cKDTree(points).query(back)
+    assert distance.max() <= np.sqrt(3) / 2 * small.step * (1 + 1e-6)
+    assert small.step <= 1.02 * 10 / STEPS
+    assert np.array_equal(small.colours, colours[nearest])
+    upper = (back[:, 2] > 1).mean()
+    assert 0.4 < upper < 0.6
+
+
+@pytest.mark.parametrize("number", [0, 1, 2, 50])
+def test_few_points_are_all_there(number: int) -> None:
+    points = np.random.default_rng(6).normal(size=(number, 3)) * 1e-3
+    small = thin_out(points, np.zeros((number, 3), np.uint8))
+    if number == 0:
+        assert small is None
+    else:
+        assert small is not None
+        assert number - 2 <= len(small.places) <= number
+
+
+def decoded(uri: str) -> np.ndarray:
+    import base64
+
+    data = np.frombuffer(base64.b64decode(uri.removeprefix("data:image/webp;base64,")), np.uint8)
+    found = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
+    assert found is not None
+    return cv2.cvtColor(found, cv2.COLOR_BGR2RGB)
+
+
+def test_pictures_show_what_they_should() -> None:
+    reasons = np.repeat(np.arange(8, dtype=np.uint8), 50).reshape(8, 50)
+    assert np.array_equal(
+        decoded(picture_uri(reason_picture(reasons), 5000, exact=True))[:, 0], list(COLOURS.values())
+    )
+    depth = np.array([[0, 1, 10]], np.float32)
+    shown, ends = depth_picture(depth)
+    assert ends == pytest.approx((1, 10), rel=0.1)
+    near, far = shown[0, 1].astype(int), shown[0, 2].astype(int)
+    assert near[0] + near[1] > 400 > 200 > far[0] + far[1]  # yellow, and blue
+    up = normal_picture(np.array([0, -1.0, 0], np.float32).reshape(3, 1, 1))[0, 0]
+    assert up.tolist() == [127, 255, 127]
+
+
+def test_a_picture_takes_no_more_than_it_may() -> None:
+    noise = np.random.default_rng(7).integers(0, 256, (300, 400, 3), dtype=np.uint8)
+    for most in (100_000, 20_000, 2_000):
+        uri = picture_uri(noise, most)
+        assert len(uri) < 1.34 * most + 40
+        height, width = decoded(uri).shape[:2]
+        assert width / height == pytest.approx(4 / 3, rel=0.05)
+
+
+# ---- small readings ----------------------------------------------------------------------------------------
+
+
+def test_some_pixels_of_a_map_are_those_of_the_whole(tmp_path: Path) -> None:
+    rng = np.random.default_rng(8)
+    depth = rng.random((7, 11), dtype=np.float32)
+    normals = rng.random((7, 11, 3), dtype=np.float32)
+    write_depth_map(tmp_path / "depth", depth)
+    write_normal_map(tmp_path / "normals", normals)
+    rows, columns = np.array([0, 3, 6]), np.array([10, 2])
+    assert np.array_equal(
+        read_some_pixels(tmp_path / "depth", (7, 11), rows, columns), depth[np.ix_(rows, columns)]
+    )
+    found = read_some_pixels(tmp_path / "normals", (7, 11, 3), rows, columns)
+    assert np.array_equal(found.transpose(1, 2, 0), normals[np.ix_(rows, columns)])
+    with pytest.raises(InputError, match="size"):
+        read_some_pixels(tmp_path / "depth", (11, 7), rows, columns)
+    (tmp_path / "depth").write_bytes((tmp_path / "depth").read_bytes()[:-1])
+    with pytest.raises(InputError, match="truncated"):
+        read_some_pixels(tmp_path / "depth", (7, 11), rows, columns)
+
+
+def test_some_points_are_of_the_cloud_and_evenly_spread(tmp_path: Path) -> None:
+    points = np.random.default_rng(9).uniform(-5, 5, (50_000, 3))
+    colours = (np.arange(150_000) % 251).astype(np.uint8).reshape(-1, 3)
+    write_cloud(tmp_path / "cloud.ply", points, colours)
+    whole = read_ply(tmp_path / "cloud.ply")[0]
+    xyz, rgb, count = read_some_points(tmp_path / "cloud.ply", 100_000)
+    assert count == 50_000
+    assert np.array_equal(xyz, whole)
+    assert np.array_equal(rgb, colours)
+    some, rgb, _ = read_some_points(tmp_path / "cloud.ply", 1000)
+    rows = cKDTree(whole).query(some)[1]
+    assert 900 <= len(some) <= 1100
+    assert np.array_equal(rgb, colours[rows])
+    assert np.diff(np.sort(rows)).max() < 200
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "no binary PLY"),
+        (b"", "no binary PLY"),
+        (b"ply\nformat binary_little_endian 1.0\nelement face 1\nend_header\n", "begin with points"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n",
+            "known format",
+        ),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 999999999999\nproperty float x\n"
+            b"property float y\nproperty float z\nend_header\n",
+            "cut off",
+        ),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty list uchar int x\nend_header\n",
+            "known format",
+        ),
+        (b"ply\nformat binary_little_endian 1.0\n\n\nproperty\nend_header\n", "begin with points"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(content: bytes, words: str, tmp_path: Path) -> None:
+    (tmp_path / "cloud.ply").write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        read_some_points(tmp_path / "cloud.ply", 10)
+
+
+def test_points_that_are_none_are_left_out(tmp_path: Path) -> None:
+    points = np.array([[1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0], [1e30, 0, 0], [4, 5, 6]])
+    write_cloud(tmp_path / "cloud.ply", points)
+    assert read_some_points(tmp_path / "cloud.ply", 10)[0].tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+@pytest.mark.parametrize("ending", [".jpg", ".png"])
+@pytest.mark.parametrize("shape", [(600, 900), (900, 600), (50, 40)])
+def test_a_small_picture_is_the_picture_shrunk(shape: tuple[int, int], ending: str, tmp_path: Path) -> None:
+    rng = np.random.default_rng(10)
+    picture = cv2.GaussianBlur(rng.integers(0, 256, (*shape, 3), dtype=np.uint8), (0, 0), 3)
+    path = tmp_path / f"a{ending}"
+    path.write_bytes(cv2.imencode(ending, picture, [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes())
+    small = read_small_colours(path, 128)
+    assert max(small.shape[:2]) == min(128, max(shape))
+    expected = cv2.resize(picture, small.shape[1::-1], interpolation=cv2.INTER_AREA)
+    assert np.abs(small.astype(int) - expected).mean() < 2
+
+
+def test_a_damaged_picture_is_refused(tmp_path: Path) -> None:
+    for content in (b"", b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"):
+        (tmp_path / "a.jpg").write_bytes(content)
+        with pytest.raises(InputError, match="cannot be read as an image"):
+            read_small_colours(tmp_path / "a.jpg", 128)
