@@ -111,7 +111,8 @@ def _parsed(arguments: Sequence[str]) -> Command:
             # `run` alone has flags without a value, among its own options.
             {"run": RunCommand, "demo": DemoCommand, "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand]},
             prog="colmap_sph",
-            description="Dense reconstruction for COLMAP without a GPU.",
+            description="Dense reconstruction for COLMAP without a GPU. COLMAP's own commands are taken, too: "
+            "patch_match_stereo and stereo_fusion are done here, all others by COLMAP.",
             args=arguments,
             config=(tyro.conf.AvoidSubcommands,),
         )
