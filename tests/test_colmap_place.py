@@ -12,6 +12,7 @@ from conftest import FinishedRun
 
 import colmap_sph
 from colmap_sph.app import cli
+from colmap_sph.app.colmap.options import COMMANDS
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
@@ -206,6 +207,47 @@ def test_outputs_that_cannot_be(finished, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
+OF_SCRIPTS = {
+    "in the workspace, as its own scripts": (
+        "--workspace_path . --workspace_format COLMAP --PatchMatchStereo.geom_consistency true",
+        "--workspace_path . --workspace_format COLMAP --input_type geometric --output_path ./fused.ply",
+    ),
+    "a benchmark": (
+        "--workspace_path=. --PatchMatchStereo.depth_min=20 --PatchMatchStereo.depth_max=300 "
+        "--PatchMatchStereo.window_radius=7 --PatchMatchStereo.num_iterations=7 "
+        "--PatchMatchStereo.filter_min_ncc=0.07 "
+        "--PatchMatchStereo.filter_min_num_consistent=1 --PatchMatchStereo.gpu_index=0,1 "
+        "--PatchMatchStereo.cache_size=64",
+        "--workspace_path=. --output_path=cloud.ply --StereoFusion.min_num_pixels=3 "
+        "--StereoFusion.max_reproj_error=2 "
+        "--StereoFusion.max_depth_error=0.05 --StereoFusion.max_normal_error=25 --StereoFusion.use_cache=1",
+    ),
+    "photometric, in a hurry": (
+        "--workspace_path . --PatchMatchStereo.geom_consistency 0 --PatchMatchStereo.window_step 2 "
+        "--PatchMatchStereo.num_samples 7 --PatchMatchStereo.filter 1 "
+        "--PatchMatchStereo.write_consistency_graph 0",
+        "--workspace_path . --input_type photometric --output_type PLY --output_path out/x.ply "
+        "--StereoFusion.check_num_images 20 --StereoFusion.max_traversal_depth 50 --log_to_stderr 1",
+    ),
+}
+
+
+@pytest.mark.parametrize("script", OF_SCRIPTS)
+def test_option_lists_of_scripts(finished, tmp_path, monkeypatch, capsys, script):
+    """Each option is taken, and each without effect named once."""
+    monkeypatch.chdir(undistorted(finished, tmp_path / "dense"))
+    for name, words in zip(("patch_match_stereo", "stereo_fusion"), OF_SCRIPTS[script], strict=True):
+        arguments = words.split()
+        if name == "patch_match_stereo":
+            arguments += ["--PatchMatchStereo.max_image_size", "120"]
+        assert command(name, *arguments) == 0
+        notice = "".join(line for line in capsys.readouterr().err.split("\n") if "without effect" in line)
+        flags = [word[2:].partition("=")[0] for word in arguments if word.startswith("--")]
+        idle = {flag for flag in flags if not COMMANDS[name].flags()[flag].acts}
+        assert {word.strip(" ,") for word in notice.partition(": ")[2].split("--") if word.strip()} == idle
+    assert len(points_of(next(Path.cwd().rglob("*.ply")))) > 1000
+
+
 SCRIPT = """
 set -e
 colmap() { "$PYTHON" -m colmap_sph "$@"; }
@@ -215,7 +257,8 @@ colmap patch_match_stereo --workspace_path dense --workspace_format COLMAP \\
     --PatchMatchStereo.max_image_size 200 --PatchMatchStereo.geom_consistency true
 colmap stereo_fusion --workspace_path dense --workspace_format COLMAP --input_type geometric \\
     --output_path dense/fused.ply
-colmap poisson_mesher --input_path dense/fused.ply --output_path dense/meshed-poisson.ply --PoissonMeshing.depth 7
+colmap poisson_mesher --input_path dense/fused.ply --output_path dense/meshed-poisson.ply \\
+    --PoissonMeshing.depth 7 --PoissonMeshing.trim 4
 """
 
 

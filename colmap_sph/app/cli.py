@@ -143,7 +143,8 @@ def _parsed(arguments: Sequence[str]) -> Command:
                 "view": ViewCommand,
             },
             prog="colmap_sph",
-            description="Dense reconstruction for COLMAP without a GPU.",
+            description="Dense reconstruction for COLMAP without a GPU. COLMAP's own commands are taken, too: "
+            "patch_match_stereo and stereo_fusion are done here, all others by COLMAP.",
             args=arguments,
             config=(tyro.conf.AvoidSubcommands,),
         )

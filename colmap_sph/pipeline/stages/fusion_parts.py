@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.photo import bytes_to_reduce
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.cloud_files import write_part
+from colmap_sph.project.images.reading import bytes_to_reduce
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
 

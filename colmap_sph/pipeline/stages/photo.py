@@ -7,19 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.project.images.reading import read_grey
-from colmap_sph.scene import View
 from colmap_sph.stereo.poses.ties import find_corners
 
-# Bytes per pixel while an image is read.
-_READ_BYTES = 11.0
-
 Grey = NDArray[np.uint8] | NDArray[np.float32]
-
-
-def bytes_to_reduce(*views: View) -> float:
-    """Largest bytes in use while one of the views' images is read, of those that are reduced then."""
-    sizes = [view.file_size for view in views if view.full_size is not None]
-    return max((_READ_BYTES * width * height for width, height in sizes), default=0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,10 @@ from colmap_sph.project.images import jpeg
 from colmap_sph.project.images.decoding import is_jpeg, read_header, read_pixels
 from colmap_sph.project.images.depth import narrow_range, stretched
 from colmap_sph.project.images.jpeg import DamagedError
+from colmap_sph.scene import View
 
+# Bytes per pixel while an image is read.
+_READ_BYTES = 11.0
 # Rows that are floating-point numbers at a time.
 _BAND_ROWS = 256
 # The luma of ITU-R BT.601, which JPEG stores.
@@ -86,6 +89,12 @@ def fitted(pixels: NDArray[Any], size: Size | None) -> NDArray[Any]:
     if size is None or pixels.shape[1::-1] == size:
         return pixels
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+
+
+def bytes_to_reduce(*views: View) -> float:
+    """Largest bytes in use while one of the views' images is read, of those that are reduced then."""
+    sizes = [view.file_size for view in views if view.full_size is not None]
+    return max((_READ_BYTES * width * height for width, height in sizes), default=0.0)
 
 
 def read_grey(path: Path, size: Size | None = None) -> NDArray[np.uint8] | NDArray[np.float32]:
