@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import os
 import re
 import shlex
 import shutil
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import FinishedRun
-from small_workspaces import HOSTILE_NAMES, ground_workspace
+from small_workspaces import HOSTILE_NAMES, ground_workspace, write_cloud
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -246,8 +247,11 @@ def test_nothing_to_show_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_what_is_no_workspace_is_refused(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "dense").mkdir()
+    for part in ("dense", "images", "sparse/0"):
+        (tmp_path / "project" / part).mkdir(parents=True)
     for folder, words in (
         (tmp_path, "did you mean .*dense"),
+        (tmp_path / "project", r"did you mean .*project/dense\?"),
         (tmp_path / "no", "not exist"),
         (tmp_path / "file", "is a file"),
     ):
@@ -450,3 +454,20 @@ def test_view_opens_the_page(
     assert code == 0
     assert opened == [workspace.page_path.as_uri()]
     assert opened[0].endswith("a%20b%23c/colmap_sph/report.html")
+
+
+def test_view_makes_a_page_anew_that_is_older_than_the_cloud(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace = ground_workspace(tmp_path / "dense", NAMES)
+    monkeypatch.setattr("webbrowser.open", lambda _: True)
+    monkeypatch.setenv("DISPLAY", ":0")
+    write_page(workspace)
+    made = workspace.page_path.stat().st_mtime_ns
+    run_cli("view", str(workspace.root), capsys=capsys)
+    assert workspace.page_path.stat().st_mtime_ns == made
+    write_cloud(workspace.fused_path, np.zeros((7, 3)))
+    os.utime(workspace.fused_path, ns=(made + 10**9, made + 10**9))
+    code, _, _ = run_cli("view", str(workspace.root), capsys=capsys)
+    assert code == 0
+    assert "7 points" in workspace.page_path.read_text()
