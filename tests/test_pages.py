@@ -22,11 +22,11 @@ from colmap_sph.app.run_command import RunCommand
 from colmap_sph.errors import OutputError, printable
 from colmap_sph.pages import write_page
 from colmap_sph.pages.image_facts import small_pictures
-from colmap_sph.pages.samples import read_samples, samples_per_side
+from colmap_sph.pages.samples import read_normals, read_samples, samples_per_side
 from colmap_sph.pipeline import reconstruct
 from colmap_sph.pipeline.command import command_of
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.project.map_files import read_depth_map, write_depth_map
+from colmap_sph.project.map_files import read_depth_map, write_depth_map, write_normal_map
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -406,6 +406,23 @@ def test_samples_are_pixels_of_the_maps(tmp_path: Path) -> None:
         whole = read_depth_map(workspace.depth_map_path("a.png", kind))  # type: ignore[arg-type]
         assert np.array_equal(found, whole[np.ix_(samples.rows, samples.columns)])
     assert 40 <= found.shape[1] <= 50
+
+
+def test_reduced_maps_are_shown(tmp_path: Path) -> None:
+    """Maps of half as many rows and columns, as `max_image_size` of dense stereo makes them."""
+    workspace = ground_workspace(tmp_path / "dense", NAMES[:1])
+    (view,) = read_scene(workspace.sparse_dir).views
+    half = 1 + np.arange(view.height * view.width / 4, dtype=np.float32).reshape(view.height // 2, -1)
+    write_depth_map(workspace.depth_map_path("a.png", "geometric"), half)
+    normals = np.dstack([half, -half, half])
+    write_normal_map(workspace.normal_map_path("a.png", "geometric"), normals)
+    samples = read_samples(workspace, view, 50)
+    assert np.array_equal(samples.geometric, half[samples.rows // 2][:, samples.columns // 2])
+    shown = read_normals(workspace, view, samples)
+    assert shown is not None and np.array_equal(shown[1], -samples.geometric)
+    assert "no geometric depth map" not in write_page(workspace)
+    write_depth_map(workspace.depth_map_path("a.png", "geometric"), half[:, :-5])  # of another shape
+    assert not read_samples(workspace, view, 50).has_geometric
 
 
 # ---- the command, and the browser --------------------------------------------------------------------------
