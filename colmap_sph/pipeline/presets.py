@@ -13,9 +13,8 @@ Quality = Literal["preview", "normal", "best"]
 PRESETS: Mapping[Quality, Mapping[str, Any]] = {
     "preview": {
         "pairs.num_pairs": 4,
-        "rectification.sampling": 0.5,
+        "rectification.sampling": 0.45,
         "refinement.rounds": 0,
-        "fusion.check_num_images": 16,
     },
     "normal": {},
     "best": {"pairs.num_pairs": 15, "rectification.sampling": 1.3},
@@ -29,7 +28,7 @@ def preset(quality: Quality) -> RunOptions:
     Examples
     --------
     >>> preset("preview").rectification.sampling
-    0.5
+    0.45
     """
     options = RunOptions()
     for place, value in PRESETS[quality].items():
