@@ -12,8 +12,8 @@ Quality = Literal["preview", "normal", "best"]
 # one quality to another.
 PRESETS: Mapping[Quality, Mapping[str, Any]] = {
     "preview": {
-        "pairs.num_pairs": 4,
-        "rectification.sampling": 0.45,
+        "pairs.num_pairs": 3,
+        "rectification.sampling": 0.5,
         "refinement.rounds": 0,
     },
     "normal": {},
@@ -28,7 +28,7 @@ def preset(quality: Quality) -> RunOptions:
     Examples
     --------
     >>> preset("preview").rectification.sampling
-    0.45
+    0.5
     """
     options = RunOptions()
     for place, value in PRESETS[quality].items():
