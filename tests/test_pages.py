@@ -23,9 +23,9 @@ from colmap_sph.errors import OutputError, printable
 from colmap_sph.pages import write_page
 from colmap_sph.pages.image_facts import small_pictures
 from colmap_sph.pages.samples import read_normals, read_samples, samples_per_side
-from colmap_sph.pipeline import reconstruct
-from colmap_sph.pipeline.command import command_of
+from colmap_sph.pipeline import report_files
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.report_files import command_of
 from colmap_sph.project.map_files import read_depth_map, write_depth_map, write_normal_map
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
@@ -187,7 +187,7 @@ def test_a_page_that_fails_does_not_fail_the_run(
     def fail(*_: object) -> str:
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr(reconstruct, "write_page", fail)
+    monkeypatch.setattr(report_files, "write_page", fail)
     report = colmap_sph.run(workspace=dense)
     assert report.points == finished.report.points
     (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]

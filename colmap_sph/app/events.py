@@ -58,7 +58,7 @@ class Events:
             version=colmap_sph.__version__,
             time=datetime.now(UTC).isoformat(timespec="seconds"),
             arguments=list(arguments),
-            workspace=None if workspace is None else str(workspace),
+            workspace=None if workspace is None else str(workspace.absolute()),
         )
 
     def plan(self, plan: Plan) -> None:

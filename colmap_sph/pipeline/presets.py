@@ -12,10 +12,9 @@ Quality = Literal["preview", "normal", "best"]
 # one quality to another.
 PRESETS: Mapping[Quality, Mapping[str, Any]] = {
     "preview": {
-        "pairs.num_pairs": 4,
+        "pairs.num_pairs": 3,
         "rectification.sampling": 0.5,
         "refinement.rounds": 0,
-        "fusion.check_num_images": 16,
     },
     "normal": {},
     "best": {"pairs.num_pairs": 15, "rectification.sampling": 1.3},

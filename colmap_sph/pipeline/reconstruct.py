@@ -5,21 +5,14 @@ deviations, geometric maps, the cloud. What an earlier run finished with the sam
 """
 
 import itertools
-import json
 import logging
-import resource
-import sys
-import time
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from statistics import mean
 from typing import Any, Protocol
 
-from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError, reason_of
-from colmap_sph.pages import write_page
-from colmap_sph.pipeline.command import command_of
+from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, Until, timed_stage
 from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
@@ -28,8 +21,8 @@ from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
-from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.report_files import command_of, make_page, write_report
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
@@ -41,7 +34,7 @@ from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.database import read_verified_matches
-from colmap_sph.project.files import atomic_file, make_dir, remove
+from colmap_sph.project.files import make_dir
 from colmap_sph.project.pair_lists import read_patch_match_cfg
 from colmap_sph.project.polishing.polished import restore_given, starting_model
 from colmap_sph.project.project import Project, open_workspace
@@ -253,8 +246,8 @@ def reconstruct(
         progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
         go_through_stages(context, selection.unique_pairs(), execute, until=until)
         judge_agreement(report)
-    _write_report(context)
-    _make_page(context)
+    write_report(context)
+    make_page(context)
     refuse_disagreement(report)
     if until == "cloud" and not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
@@ -384,32 +377,3 @@ def choose_pairs(
 def wanted_scene(scene: Scene, selection: PairSelection) -> Scene:
     """Return the scene without the views that are not asked for."""
     return scene.only({*selection.partners, *itertools.chain(*selection.unique_pairs())})
-
-
-def _write_report(context: Context) -> None:
-    report = context.report
-    unit = 1 if sys.platform == "darwin" else 1024
-    report.peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-    content = {"versions": versions(), "options": asdict(context.options), **asdict(report)}
-    with atomic_file(context.workspace.report_path) as file:
-        file.write(json.dumps(content, indent=1, default=str).encode())
-
-
-def _make_page(context: Context) -> None:
-    """Make the page of a run that is done; where that fails, the run has not."""
-    workspace = context.workspace
-    start = time.perf_counter()
-    try:
-        write_page(workspace, context.progress)
-    except Exception as error:
-        with suppress(OutputError):
-            remove(workspace.page_path)  # one of an earlier run says what is not so any more
-        logger.warning(
-            "%s could not be made (%s); everything else is there, colmap_sph report %s tries it again.",
-            workspace.page_path,
-            reason_of(error),
-            workspace.root,
-        )
-        logger.info("Why there is no page", exc_info=True)
-    else:
-        logger.info("Report: %.1f s", time.perf_counter() - start)

@@ -44,7 +44,7 @@ logger = logging.getLogger(__name__)
 _PRECISE_POSES = 0.35
 _TRIAL_SAMPLING = 0.4
 # Processor seconds per megapixel of both rectified images.
-_SECONDS = 0.1
+_SECONDS = 0.2
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …

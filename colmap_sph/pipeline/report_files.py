@@ -1,0 +1,84 @@
+"""What a run tells of itself when it is done: `report.json`, with the command to repeat it, and the page."""
+
+import json
+import logging
+import resource
+import shlex
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict, fields
+from pathlib import Path
+from typing import Any
+
+from colmap_sph.errors import OutputError, reason_of
+from colmap_sph.pages import write_page
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.program import versions
+from colmap_sph.project.files import atomic_file, remove
+from colmap_sph.project.project import Project
+
+logger = logging.getLogger(__name__)
+
+
+def command_of(project: Project, options: RunOptions) -> str:
+    """Return the command line of a run: its paths, and the options that are not at their defaults.
+
+    Paths are absolute, so that it can be typed anywhere.
+
+    Examples
+    --------
+    >>> options = RunOptions(threads=2)
+    >>> command_of(Project(model=Path("/block 7/sparse/0")), options)
+    "colmap_sph run --model '/block 7/sparse/0' --threads 2"
+    """
+    words = ["colmap_sph", "run"]
+    for each in fields(project):
+        path = getattr(project, each.name)
+        if path is not None:
+            words += [f"--{each.name}", str(Path(path).absolute())]
+    words += _changed(asdict(options), asdict(RunOptions()), "--")
+    return shlex.join(words)
+
+
+def write_report(context: Context) -> None:
+    """Write `report.json`: versions, options, and what the run tells of itself."""
+    report = context.report
+    unit = 1 if sys.platform == "darwin" else 1024
+    report.peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    content = {"versions": versions(), "options": asdict(context.options), **asdict(report)}
+    with atomic_file(context.workspace.report_path) as file:
+        file.write(json.dumps(content, indent=1, default=str).encode())
+
+
+def make_page(context: Context) -> None:
+    """Make the page of a run that is done; where that fails, the run has not."""
+    workspace = context.workspace
+    start = time.perf_counter()
+    try:
+        write_page(workspace, context.progress)
+    except Exception as error:
+        with suppress(OutputError):
+            remove(workspace.page_path)  # one of an earlier run says what is not so any more
+        logger.warning(
+            "%s could not be made (%s); everything else is there, colmap_sph report %s tries it again.",
+            workspace.page_path,
+            reason_of(error),
+            workspace.root,
+        )
+        logger.info("Why there is no page", exc_info=True)
+    else:
+        logger.info("Report: %.1f s", time.perf_counter() - start)
+
+
+def _changed(chosen: Mapping[str, Any], usual: Mapping[str, Any], prefix: str) -> Iterator[str]:
+    """Words for the options that differ, those of a stage behind its name."""
+    for name, value in chosen.items():
+        flag = f"{prefix}{name.replace('_', '-')}"
+        if isinstance(value, dict):
+            yield from _changed(value, usual[name], f"{flag}.")
+        elif value != usual[name] and value is not None:
+            values = value if isinstance(value, tuple | list) else [value]
+            yield from [flag, *(str(each.absolute()) if isinstance(each, Path) else str(each) for each in values)]
