@@ -215,6 +215,7 @@ def test_outputs_that_cannot_be(finished, tmp_path, capsys):
 def test_no_file_but_a_cloud_is_replaced(finished, tmp_path, capsys):
     dense = with_maps_of_others(finished, tmp_path / "dense")
     name = next(path.name for path in (dense / "images").iterdir())
+    (dense / "fused.ply.vis").write_bytes(bytes(8))
     pipe = tmp_path / "pipe.ply"
     os.mkfifo(pipe)
     model = tmp_path / "model"
@@ -225,6 +226,7 @@ def test_no_file_but_a_cloud_is_replaced(finished, tmp_path, capsys):
         (dense / "sparse/images.bin", "PLY", "is no cloud"),
         (dense / f"stereo/depth_maps/{name}.geometric.bin", "PLY", "is no cloud"),
         (pipe, "PLY", "a device or a pipe"),
+        (dense / "fused.ply.vis/x/cloud.ply", "PLY", f"Nothing can be written in {dense / 'fused.ply.vis'}"),
         (model, "TXT", "holds a binary model"),
     ):
         before = output.read_bytes() if output.is_file() else None

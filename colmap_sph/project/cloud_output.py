@@ -45,6 +45,7 @@ class CloudOutput:
 
     def check(self, workspace: Workspace) -> None:
         """Raise `ColmapSphError` for a path where the cloud of a workspace cannot go, before anything is done."""
+        _check_room(self.path.parent)
         if self.kind == "ply":
             for path in self.files:
                 _check_file(path)
@@ -103,6 +104,13 @@ class CloudOutput:
             beside = target.with_name(f".{os.getpid()}.tmp")  # a disk of its own may be there
             shutil.move(source, beside)
             beside.replace(target)
+
+
+def _check_room(folder: Path) -> None:
+    """Raise `OutputError` where a file cannot be made in a folder that need not exist: fusion may take hours."""
+    there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise OutputError(f"Nothing can be written in {there}; choose another --output_path.")
 
 
 def _check_file(path: Path) -> None:
