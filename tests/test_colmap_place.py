@@ -212,6 +212,12 @@ def test_outputs_that_cannot_be(finished, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
+def test_a_list_of_pairs_that_is_missing(finished, tmp_path, capsys):
+    dense = undistorted(finished, tmp_path / "dense")
+    assert command("patch_match_stereo", "--workspace_path", dense, "--config_path", tmp_path / "no.cfg") == 1
+    assert "--config_path: " in (said := capsys.readouterr().err) and "no.cfg is no file" in said
+
+
 def test_no_file_but_a_cloud_is_replaced(finished, tmp_path, capsys):
     dense = with_maps_of_others(finished, tmp_path / "dense")
     name = next(path.name for path in (dense / "images").iterdir())
