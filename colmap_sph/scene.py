@@ -120,6 +120,12 @@ class View:
             return self
         return self.resized(max(round(self.width * factor), 1), max(round(self.height * factor), 1))
 
+    def may_be_reduced_to(self, width: int, height: int) -> bool:
+        """Whether so many pixels are as many as its own, or fewer with its proportions, but for rounding."""
+        factor = max(width / self.width, height / self.height)
+        fits = abs(self.width * factor - width) <= 1 and abs(self.height * factor - height) <= 1
+        return min(width, height) >= 1 and factor <= 1 and fits
+
     def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project points into the image, wherever its borders are.
 

@@ -1,5 +1,6 @@
 """`patch_match_stereo` and `stereo_fusion` in COLMAP's place, on a small rendered block."""
 
+import os
 import shutil
 import subprocess
 import sys
@@ -57,6 +58,10 @@ def test_both_commands_make_the_cloud_of_a_run(finished, tmp_path, capsys):
     assert not (dense / "fused.ply").exists() and (dense / "stereo/fusion.cfg").read_bytes() == cfg
     told = capsys.readouterr().err
     assert told.count("without effect") == 1 and "--PatchMatchStereo.gpu_index" in told
+    first = (dense / "colmap_sph/log.txt").read_text().splitlines()[0]
+    assert first.endswith(
+        f"&& colmap_sph patch_match_stereo --workspace_path {dense} --PatchMatchStereo.gpu_index 0"
+    )
     cloud = tmp_path / "elsewhere/cloud.ply"
     assert command("stereo_fusion", "--workspace_path", dense, "--output_path", cloud) == 0
     for kind in ("depth_maps", "normal_maps"):
@@ -205,6 +210,46 @@ def test_outputs_that_cannot_be(finished, tmp_path, capsys):
         arguments = ["--workspace_path", dense, "--output_path", output, "--output_type", kind]
         assert command("stereo_fusion", *arguments) > 0
         assert words in capsys.readouterr().err
+
+
+def test_a_list_of_pairs_that_is_missing(finished, tmp_path, capsys):
+    dense = undistorted(finished, tmp_path / "dense")
+    assert command("patch_match_stereo", "--workspace_path", dense, "--config_path", tmp_path / "no.cfg") == 1
+    assert "--config_path: " in (said := capsys.readouterr().err) and "no.cfg is no file" in said
+
+
+def test_no_file_but_a_cloud_is_replaced(finished, tmp_path, capsys):
+    dense = with_maps_of_others(finished, tmp_path / "dense")
+    name = next(path.name for path in (dense / "images").iterdir())
+    (dense / "fused.ply.vis").write_bytes(bytes(8))
+    pipe = tmp_path / "pipe.ply"
+    os.mkfifo(pipe)
+    model = tmp_path / "model"
+    model.mkdir()
+    (model / "points3D.bin").write_bytes(bytes(8))
+    for output, kind, words in (
+        (dense / "images" / name, "PLY", "is no cloud"),
+        (dense / "sparse/images.bin", "PLY", "is no cloud"),
+        (dense / f"stereo/depth_maps/{name}.geometric.bin", "PLY", "is no cloud"),
+        (pipe, "PLY", "a device or a pipe"),
+        (dense / "fused.ply.vis/x/cloud.ply", "PLY", f"Nothing can be written in {dense / 'fused.ply.vis'}"),
+        (model, "TXT", "holds a binary model"),
+    ):
+        before = output.read_bytes() if output.is_file() else None
+        arguments = ["--workspace_path", dense, "--output_path", output, "--output_type", kind]
+        assert command("stereo_fusion", *arguments) == 3
+        assert words in capsys.readouterr().err
+        assert before is None or output.read_bytes() == before
+    assert pipe.is_fifo() and len(list(model.iterdir())) == 1
+
+
+def test_a_cloud_goes_where_a_link_leads(finished, tmp_path):
+    dense = with_maps_of_others(finished, tmp_path / "dense")
+    (tmp_path / "disk").mkdir()
+    link = tmp_path / "link.ply"
+    link.symlink_to(tmp_path / "disk/cloud.ply")
+    assert command("stereo_fusion", "--workspace_path", dense, "--output_path", link) == 0
+    assert link.is_symlink() and len(points_of(tmp_path / "disk/cloud.ply")) == finished.report.points
 
 
 OF_SCRIPTS = {

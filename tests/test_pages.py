@@ -3,6 +3,7 @@
 import base64
 import hashlib
 import json
+import os
 import re
 import shlex
 import shutil
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import FinishedRun
-from small_workspaces import HOSTILE_NAMES, ground_workspace
+from small_workspaces import HOSTILE_NAMES, ground_workspace, write_cloud
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -21,11 +22,11 @@ from colmap_sph.app.run_command import RunCommand
 from colmap_sph.errors import OutputError, printable
 from colmap_sph.pages import write_page
 from colmap_sph.pages.image_facts import small_pictures
-from colmap_sph.pages.samples import read_samples, samples_per_side
+from colmap_sph.pages.samples import read_normals, read_samples, samples_per_side
 from colmap_sph.pipeline import report_files
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report_files import command_of
-from colmap_sph.project.map_files import read_depth_map, write_depth_map
+from colmap_sph.project.map_files import read_depth_map, write_depth_map, write_normal_map
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -246,8 +247,11 @@ def test_nothing_to_show_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_what_is_no_workspace_is_refused(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "file").write_text("")
     (tmp_path / "dense").mkdir()
+    for part in ("dense", "images", "sparse/0"):
+        (tmp_path / "project" / part).mkdir(parents=True)
     for folder, words in (
         (tmp_path, "did you mean .*dense"),
+        (tmp_path / "project", r"did you mean .*project/dense\?"),
         (tmp_path / "no", "not exist"),
         (tmp_path / "file", "is a file"),
     ):
@@ -404,6 +408,23 @@ def test_samples_are_pixels_of_the_maps(tmp_path: Path) -> None:
     assert 40 <= found.shape[1] <= 50
 
 
+def test_reduced_maps_are_shown(tmp_path: Path) -> None:
+    """Maps of half as many rows and columns, as `max_image_size` of dense stereo makes them."""
+    workspace = ground_workspace(tmp_path / "dense", NAMES[:1])
+    (view,) = read_scene(workspace.sparse_dir).views
+    half = 1 + np.arange(view.height * view.width / 4, dtype=np.float32).reshape(view.height // 2, -1)
+    write_depth_map(workspace.depth_map_path("a.png", "geometric"), half)
+    normals = np.dstack([half, -half, half])
+    write_normal_map(workspace.normal_map_path("a.png", "geometric"), normals)
+    samples = read_samples(workspace, view, 50)
+    assert np.array_equal(samples.geometric, half[samples.rows // 2][:, samples.columns // 2])
+    shown = read_normals(workspace, view, samples)
+    assert shown is not None and np.array_equal(shown[1], -samples.geometric)
+    assert "no geometric depth map" not in write_page(workspace)
+    write_depth_map(workspace.depth_map_path("a.png", "geometric"), half[:, :-5])  # of another shape
+    assert not read_samples(workspace, view, 50).has_geometric
+
+
 # ---- the command, and the browser --------------------------------------------------------------------------
 
 
@@ -450,3 +471,20 @@ def test_view_opens_the_page(
     assert code == 0
     assert opened == [workspace.page_path.as_uri()]
     assert opened[0].endswith("a%20b%23c/colmap_sph/report.html")
+
+
+def test_view_makes_a_page_anew_that_is_older_than_the_cloud(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    workspace = ground_workspace(tmp_path / "dense", NAMES)
+    monkeypatch.setattr("webbrowser.open", lambda _: True)
+    monkeypatch.setenv("DISPLAY", ":0")
+    write_page(workspace)
+    made = workspace.page_path.stat().st_mtime_ns
+    run_cli("view", str(workspace.root), capsys=capsys)
+    assert workspace.page_path.stat().st_mtime_ns == made
+    write_cloud(workspace.fused_path, np.zeros((7, 3)))
+    os.utime(workspace.fused_path, ns=(made + 10**9, made + 10**9))
+    code, _, _ = run_cli("view", str(workspace.root), capsys=capsys)
+    assert code == 0
+    assert "7 points" in workspace.page_path.read_text()

@@ -154,3 +154,20 @@ def test_batch_and_summary_of_real_projects(
     assert again[:2] == [header, good]
     assert again[2][1] == "not run"
     assert '<a href="./p/dense/colmap_sph/report' in (root / "list.html").read_text()
+
+
+@pytest.mark.parametrize(
+    "damaged", ["[1]", '{"coverage": ["x"]}', '{"seconds": {"fuse": "x"}}', '{"incomplete": 3}']
+)
+def test_one_damaged_report_does_not_cost_the_summary(tmp_path: Path, damaged: str) -> None:
+    for name, text in (("a", damaged), ("b", '{"images": 7, "points": 70}')):
+        state = tmp_path / name / "dense/colmap_sph"
+        state.mkdir(parents=True)
+        (state / "report.json").write_text(text)
+        (state / "log.txt").write_text("Done\n")
+    (tmp_path / "models.txt").write_text("a/sparse/0\nb/sparse/0\n")
+    done = called(sys.executable, WORKFLOWS / "batch_summary.py", "models.txt", "--output", "list", cwd=tmp_path)
+    assert done.returncode == 1 and "Traceback" not in done.stderr
+    rows = [line.split("\t") for line in (tmp_path / "list.tsv").read_text().splitlines()]
+    assert rows[1][:2] == ["a/sparse/0", "FAILED (?)"]
+    assert rows[2][:4] == ["b/sparse/0", "done", "7", "70"]

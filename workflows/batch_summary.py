@@ -37,7 +37,7 @@ class Project:
         result = DONE.get(code, f"FAILED ({code})" if code else "not run")
         if code not in DONE or report is None:
             return (self.model, result, "", "", "", "", message)
-        coverage = report.get("coverage") or {}
+        coverage = report.get("coverage", {})
         missing = {**report.get("skipped_images", {}), **report.get("incomplete", {})}
         return (
             self.model,
@@ -59,7 +59,12 @@ class Project:
             report = json.loads((self.dense / "colmap_sph" / "report.json").read_bytes())
         except (OSError, ValueError, RecursionError):
             return None
-        return report if isinstance(report, dict) else None
+        kinds = {"coverage": dict, "seconds": dict, "skipped_images": dict, "incomplete": dict}
+        is_sound = isinstance(report, dict) and all(
+            isinstance(report.get(name, kind()), kind) for name, kind in kinds.items()
+        )
+        numbers = [*report.get("coverage", {}).values(), *report.get("seconds", {}).values()] if is_sound else []
+        return report if is_sound and all(isinstance(each, int | float) for each in numbers) else None
 
     def _found(self, report: dict | None) -> tuple[str, str]:
         """Exit code and message as far as the workspace tells them."""

@@ -30,7 +30,7 @@ program=$(command -v colmap_sph) || program=${SLURM_SUBMIT_DIR:-.}/.venv/bin/col
 code=0
 "$program" run --model "$model" "$@" || code=$?
 case $code in
-    5) echo "$model: WARNING: finished without some images, see dense/colmap_sph/report.json" ;;
+    5) echo "$model: WARNING: finished without some images, see its colmap_sph/report.json" ;;
     0) echo "$model: complete" ;;
     *) exit "$code" ;;
 esac

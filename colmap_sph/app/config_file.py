@@ -45,12 +45,16 @@ def arguments_of_file(path: Path, known: Mapping[str, Option]) -> list[str]:
         The file cannot be read, or holds what is no option or not a value of one.
     """
     arguments = []
+    places: dict[str, str] = {}
     for key, value in _flat(_content(path)):
         option = known.get(full_flag("--" + key.replace("_", "-")))
         if option is None or option.place == "config":
             raise InputError(
                 f"{path}: there is no option {key}{_nearest(key, known)}; see colmap_sph run --help-all."
             )
+        other = places.setdefault(option.place, key)
+        if other != key:
+            raise InputError(f"{path}: {other} and {key} are the same option; leave out one of them.")
         if value is not None:
             arguments += _argument(path, key, option, value)
     return arguments
@@ -88,7 +92,8 @@ def _flat(content: Mapping[str, Any], stage: str = "") -> Iterator[tuple[str, An
 
 
 def _nearest(key: str, known: Mapping[str, Option]) -> str:
-    names = {name: name for option in known.values() for name in (option.place, option.flag[2:].replace("-", "_"))}
+    options = [option for option in known.values() if option.place != "config"]
+    names = {name: name for option in options for name in (option.place, option.flag[2:].replace("-", "_"))}
     found = get_close_matches(key.replace("-", "_"), names, 1)
     return f" (did you mean {found[0]}?)" if found else ""
 

@@ -11,9 +11,10 @@ import tyro
 
 from colmap_sph.app.display import Display
 from colmap_sph.app.terminal import Terminal, print_result
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, OutputError
 from colmap_sph.pages import write_page
 from colmap_sph.project.claim import check_links
+from colmap_sph.project.sparse_model import has_model
 from colmap_sph.project.workspace import Workspace
 
 # Without one of these, Linux has no window to show a page in; a browser for the terminal cannot draw it.
@@ -34,7 +35,7 @@ class ReportCommand:
 
 @dataclass(frozen=True)
 class ViewCommand:
-    """Show the page of a dense workspace in the browser; it is made where there is none."""
+    """Show the page of a dense workspace in the browser; it is made where there is none, or an old one."""
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Dense workspace, such as dense."""
@@ -51,8 +52,7 @@ def report_command(command: ReportCommand, terminal: Terminal) -> int:
 def view_command(command: ViewCommand, terminal: Terminal) -> int:
     """`colmap_sph view`: the page's path on the standard output, the page in the browser."""
     workspace = opened(command.workspace)
-    if not workspace.page_path.is_file():
-        _make(workspace, terminal)
+    _bring_up_to_date(workspace, terminal)
     print_result(str(workspace.page_path))
     page = workspace.page_path.absolute()
     has_windows = sys.platform == "darwin" or any(os.environ.get(name) for name in _WINDOWS)
@@ -70,14 +70,34 @@ def opened(folder: Path) -> Workspace:
     if not folder.is_dir():
         wrong = "is a file" if folder.is_file() else "does not exist"
         raise InputError(f"The workspace {folder} {wrong}; give a dense workspace, such as dense.")
-    if not workspace.sparse_dir.is_dir() or not workspace.images_dir.is_dir():
-        inside = folder / "dense"
+    inside = folder / "dense"
+    is_project = inside.is_dir() and not has_model(workspace.sparse_dir)
+    if is_project or not workspace.sparse_dir.is_dir() or not workspace.images_dir.is_dir():
         hint = (
             f"did you mean {inside}?" if inside.is_dir() else "give a folder that a run has made, such as dense."
         )
-        raise InputError(f"{folder} is not a dense workspace, it has no images or no sparse folder; {hint}")
+        raise InputError(f"{folder} is not a dense workspace, it has no images or no model in sparse; {hint}")
     check_links(workspace, is_given=True)
     return workspace
+
+
+def _bring_up_to_date(workspace: Workspace, terminal: Terminal) -> None:
+    """Make the page where there is none, or where a run or a fusion has changed something since."""
+    if not workspace.page_path.is_file():
+        _make(workspace, terminal)
+    elif _is_old(workspace):
+        try:
+            _make(workspace, terminal)
+        except OutputError as error:
+            terminal.say(f"the page is older than what it shows. {error}", label="out of date:", style="yellow")
+
+
+def _is_old(workspace: Workspace) -> bool:
+    """Whether report, cloud or maps were written after the page, as far as times of files tell."""
+    maps = workspace.depth_map_path("any", "geometric").parent
+    shown = (workspace.report_path, workspace.fused_path, maps)
+    made = workspace.page_path.stat().st_mtime_ns
+    return any(path.stat().st_mtime_ns > made for path in shown if path.exists())
 
 
 def _make(workspace: Workspace, terminal: Terminal) -> None:

@@ -70,7 +70,7 @@ def depth_picture(depth: NDArray[np.float32]) -> tuple[Bytes, tuple[float, float
 
 def shaded(values: NDArray[np.floating], there: NDArray[np.bool_], *, clear: bool = False) -> Bytes:
     """Values from 0, dark blue, to 1, yellow; dark grey, or nothing if `clear`, where there are none."""
-    steps = np.where(there, np.clip(255 * np.nan_to_num(values), 0, 255), 0).astype(np.uint8)
+    steps = np.where(there, 255 * np.clip(np.nan_to_num(values), 0, 1), 0).astype(np.uint8)
     coloured = cv2.cvtColor(cv2.applyColorMap(steps, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
     coloured[~there] = _NOTHING
     return (

@@ -3,12 +3,13 @@
 import math
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
-from colmap_sph.project.map_files import read_some_pixels
+from colmap_sph.project.map_files import map_size, read_some_pixels
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import View
@@ -86,10 +87,21 @@ def read_samples(workspace: Workspace, view: View, per_side: int) -> MapSamples:
 
 def read_normals(workspace: Workspace, view: View, samples: MapSamples) -> NDArray[np.float32] | None:
     """(3, h, w) normals of the geometric map at a view's samples; None where there are none."""
-    path = workspace.normal_map_path(view.name, "geometric")
     with suppress(InputError):
-        return read_some_pixels(path, (view.height, view.width, 3), samples.rows, samples.columns)
+        path = workspace.normal_map_path(view.name, "geometric")
+        return _read(path, view, 3, samples.rows, samples.columns)
     return None
+
+
+def _read(
+    path: Path, view: View, channels: int, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Read a map at pixels of its view's image, than which it may have fewer; see `read_some_pixels`."""
+    width, height = map_size(path, channels)
+    if not view.may_be_reduced_to(width, height):
+        raise InputError(f"The map {path} is not of its image's size; compute it again.")
+    shape = (height, width) if channels == 1 else (height, width, channels)
+    return read_some_pixels(path, shape, rows * height // view.height, columns * width // view.width)
 
 
 def _depth(
@@ -97,7 +109,7 @@ def _depth(
 ) -> NDArray[np.float32] | None:
     try:
         path = workspace.depth_map_path(view.name, kind)
-        depth = read_some_pixels(path, (view.height, view.width), rows, columns)
+        depth = _read(path, view, 1, rows, columns)
     except InputError:
         return None
     depth[~((depth > 0) & (depth < _FARTHEST))] = 0

@@ -135,10 +135,7 @@ def _map_view(view: View, depth: Path, normals: Path) -> View:
     width, height = map_size(depth)
     if map_size(normals, 3) != (width, height):
         raise InputError(f"The maps {depth} and {normals} are not of one size; compute them again.")
-    # As large as the image, or reduced with its proportions, which rounding changes a little.
-    factor = max(width / view.width, height / view.height)
-    fits = abs(view.width * factor - width) <= 1 and abs(view.height * factor - height) <= 1
-    if min(width, height) < 1 or factor > 1 or not fits:
+    if not view.may_be_reduced_to(width, height):
         raise InputError(
             f"The map {depth} has {width} x {height} pixels, but its image {view.width} x {view.height}; "
             "delete it and compute it again."

@@ -18,6 +18,7 @@ from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
 
+_PLY_START = b"ply"
 _PLY_END = b"end_header\n"
 # Of a model in map coordinates.
 _FAR_POINT = np.dtype([("xyz", "<f8", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
@@ -44,15 +45,20 @@ class CloudOutput:
 
     def check(self, workspace: Workspace) -> None:
         """Raise `ColmapSphError` for a path where the cloud of a workspace cannot go, before anything is done."""
+        _check_room(self.path.parent)
         if self.kind == "ply":
             for path in self.files:
-                if path.is_dir():
-                    raise OutputError(f"{path} is a folder, and the cloud is a file; name a file in it.")
+                _check_file(path)
+            _check_is_cloud(self.path)
             return
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path} is a file, and the cloud's model a folder; name a folder.")
         if real_path(self.path) == real_path(workspace.sparse_dir):
             raise InputError(f"{self.path} is the workspace's own model; name another folder for the cloud's.")
+        if self.kind == "txt" and (self.path / "points3D.bin").exists():
+            raise OutputError(
+                f"{self.path} holds a binary model, which is read before a text one; name another folder."
+            )
 
     def write(self, made: Workspace, sparse_dir: Path, origin: NDArray[np.float64]) -> None:
         """Put a finished cloud there.
@@ -93,10 +99,39 @@ class CloudOutput:
             cloud = moved
         # A kill in between must not leave a cloud beside the visibility of another.
         self.files[1].unlink(missing_ok=True)
-        for source, target in zip((cloud, visible), self.files, strict=True):
+        for source, file in zip((cloud, visible), self.files, strict=True):
+            target = real_path(file)
             beside = target.with_name(f".{os.getpid()}.tmp")  # a disk of its own may be there
             shutil.move(source, beside)
             beside.replace(target)
+
+
+def _check_room(folder: Path) -> None:
+    """Raise `OutputError` where a file cannot be made in a folder that need not exist: fusion may take hours."""
+    there = next(each for each in (folder, *folder.absolute().parents) if each.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise OutputError(f"Nothing can be written in {there}; choose another --output_path.")
+
+
+def _check_file(path: Path) -> None:
+    """Raise `OutputError` for a path at which there is something else than an ordinary file."""
+    if path.is_dir():
+        raise OutputError(f"{path} is a folder, and the cloud is a file; name a file in it.")
+    if path.exists() and not path.is_file():
+        raise OutputError(f"{path} is a device or a pipe, and the cloud is a file; name a file.")
+
+
+def _check_is_cloud(path: Path) -> None:
+    """Raise `OutputError` for a file that is no cloud: a slip must not cost an image or a map."""
+    if not path.is_file():
+        return
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_PLY_START))
+    except OSError as error:
+        raise OutputError(f"{path} cannot be replaced ({reason_of(error)}); name another file.") from error
+    if start not in (b"", _PLY_START):
+        raise OutputError(f"{path} is there already, and is no cloud; name another file, or remove this one.")
 
 
 def read_back(output: CloudOutput, workspace: Workspace) -> pycolmap.Reconstruction:

@@ -44,7 +44,7 @@ def answer(arguments: Sequence[str], terminal: Terminal) -> int:
         return 0
     _tell_idle(given, terminal)
     workspace = Workspace(Path(str(given.plain["workspace_path"])))
-    with workspace_log(workspace, header(" ".join(arguments))), Display(terminal) as display:
+    with workspace_log(workspace, header(arguments)), Display(terminal) as display:
         make = make_maps if name == "patch_match_stereo" else make_cloud
         report = make(given.plain, given.sectioned, progress=display)
     _print_end(given, report, workspace, terminal)

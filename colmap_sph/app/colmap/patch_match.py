@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from colmap_sph.app.colmap.options import PATCH_MATCH_STEREO, Value
-from colmap_sph.app.colmap.settings import check_workspace, run_options, spelled_as_colmap
+from colmap_sph.app.colmap.settings import WrongOptionError, check_workspace, run_options, spelled_as_colmap
 from colmap_sph.pipeline.reconstruct import reconstruct
 from colmap_sph.pipeline.report import Progress, RunReport
 from colmap_sph.project.claim import check_links, claimed
@@ -29,6 +29,9 @@ def make_maps(
     RunReport
     """
     check_workspace(plain)
+    pair_list = Path(str(plain["config_path"])) if plain.get("config_path") else None
+    if pair_list is not None and not pair_list.is_file():
+        raise WrongOptionError(f"--config_path: {pair_list} is no file; name a list of pairs.")
     options = run_options(chosen, PATCH_MATCH_STEREO, "PatchMatchStereo")
     project = Project(workspace=Path(str(plain["workspace_path"])))
     project.check()
@@ -40,6 +43,6 @@ def make_maps(
             options,
             progress=progress,
             until="geometric" if chosen.get("geom_consistency", True) else "photometric",
-            pair_list=Path(str(plain["config_path"])) if plain.get("config_path") else None,
+            pair_list=pair_list,
             needs_all=not chosen.get("allow_missing_files", False),
         )
