@@ -83,7 +83,6 @@ EVERYDAY = [
     "quality",
     "max-image-size",
     "num-pairs",
-    "region",
     "threads",
     "memory",
     "dry-run",

@@ -20,7 +20,6 @@ EVERYDAY = (
     "--quality",
     "--max-image-size",
     "--num-pairs",
-    "--region",
     "--threads",
     "--memory",
     "--dry-run",
