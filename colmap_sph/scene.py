@@ -22,6 +22,30 @@ SourceImages = list[str] | int | Literal["__all__"]
 POINT = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
 """A point of a cloud: world frame, model units; unit normal; red, green, blue."""
 
+Polygons = tuple[tuple[NDArray[np.float64], ...], ...]
+"""Of each polygon its outline and its holes: (n, 2) corners each, of which the last is joined to the first."""
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """What of a scene is asked for: a box, or vertical prisms in one.
+
+    Attributes
+    ----------
+    box : (2, 3) float64 ndarray
+        Least and largest x, y and z, model units; may be infinite.
+    polygons : tuple of tuple of (n, 2) float64 ndarray
+        In x and y. A point lies inside where it lies in one of them; all of the box counts where there are none.
+    """
+
+    box: NDArray[np.float64]
+    polygons: Polygons = ()
+
+    def moved(self, shift: NDArray[np.float64]) -> "Region":
+        """The region elsewhere."""
+        polygons = tuple(tuple(ring + shift[:2] for ring in rings) for rings in self.polygons)
+        return Region(self.box + shift, polygons)
+
 
 @dataclass(frozen=True, eq=False)
 class View:
@@ -125,6 +149,12 @@ class View:
         factor = max(width / self.width, height / self.height)
         fits = abs(self.width * factor - width) <= 1 and abs(self.height * factor - height) <= 1
         return min(width, height) >= 1 and factor <= 1 and fits
+
+    def cropped(self, left: int, top: int, right: int, bottom: int) -> "View":
+        """The same camera with columns `left` to `right` and rows `top` to `bottom` alone, these excluded."""
+        K = self.K.copy()
+        K[:2, 2] -= left, top
+        return replace(self, K=K, width=right - left, height=bottom - top, full_size=None)
 
     def project(self, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Project points into the image, wherever its borders are.

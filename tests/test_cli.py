@@ -116,7 +116,7 @@ def test_help_of_run_explains_every_option(capsys: pytest.CaptureFixture[str]) -
         assert re.search(rf" {re.escape(name)} \S+ {words_of_option}{default}", words), name
 
 
-STAGES = {field.name: fields(getattr(RunOptions(), field.name)) for field in fields(RunOptions)[2:]}
+STAGES = {field.name: fields(getattr(RunOptions(), field.name)) for field in fields(RunOptions)[3:]}
 
 
 def test_every_text_of_the_help_is_a_sentence() -> None:

@@ -1,5 +1,6 @@
 """How options are spelled on the command line: everyday ones short, all others behind the name of their stage."""
 
+import re
 from collections.abc import Sequence
 
 SHORT = {
@@ -52,6 +53,9 @@ _RENAMED = {
     "--fusion-input": "--fusion.input",
 }
 
+# A box whose first number is negative.
+_NEGATIVE = re.compile(r"-(inf|[\d.])")
+
 _FULL = {flag: f"--{place.replace('_', '-')}" for place, flag in SHORT.items()} | _RENAMED
 
 
@@ -78,7 +82,10 @@ def in_full(arguments: Sequence[str]) -> list[str]:
         flag, equals, value = argument.partition("=")
         if flag.startswith("--"):
             argument = full_flag(flag) + equals + value
-        spelled.append(argument)
+        if spelled and spelled[-1] == "--region" and _NEGATIVE.match(argument):
+            spelled[-1] += f"={argument}"  # no option, though it begins with a dash
+        else:
+            spelled.append(argument)
     spelled.pop()
     is_named = any(argument.partition("=")[0] == "--model" for argument in spelled)
     return ["--model", *spelled] if spelled and not spelled[0].startswith("-") and not is_named else spelled

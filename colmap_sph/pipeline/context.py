@@ -4,21 +4,28 @@ import logging
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.maps import MapFiles
+from colmap_sph.project.region_file import read_region
 from colmap_sph.project.state.array_file import SUFFIX
 from colmap_sph.project.state.ownership import Place, cloud_place, map_place
 from colmap_sph.project.workspace import MapKind, Workspace
-from colmap_sph.scene import Scene
+from colmap_sph.scene import Region, Scene
 from colmap_sph.stereo.agreement import SparseTracks
+from colmap_sph.stereo.extent import outline_of
 from colmap_sph.stereo.partners.stations import Stations
+from colmap_sph.stereo.region.focus import Focus, focused
+from colmap_sph.stereo.region.window import Window
 
 logger = logging.getLogger(__name__)
 
@@ -41,6 +48,8 @@ class Context:
     report : RunReport
     details : mapping of str to float
         Of each image that is there, see `image_detail`.
+    focus : Focus or None
+        The region that is asked for; None: all.
     """
 
     workspace: Workspace
@@ -50,16 +59,52 @@ class Context:
     progress: Progress = field(default_factory=Silent)
     report: RunReport = field(default_factory=RunReport)
     details: Mapping[str, float] = field(default_factory=dict)
+    focus: Focus | None = None
 
     @cached_property
     def stations(self) -> Stations:
         """Which images stand side by side: what is too near to be matched."""
         return Stations(self.scene, self.options.pairs.min_triangulation_angle)
 
+    def in_region(self) -> "Context":
+        """The same with what of the scene shows the region that the options ask for, if they do.
+
+        Raises `InputError` where nothing does.
+        """
+        given = self.options.region
+        if not given:
+            return self
+        least = self.options.pairs.min_shared_points
+        scene, focus = focused(self.scene, read_region(given), least, f"--region {given}")
+        logger.info("%d of %d images show the region", len(scene.views), len(self.scene.views))
+        return replace(self, scene=scene, focus=focus)
+
+    @property
+    def region(self) -> Region | None:
+        """What results are cut to; None: nothing."""
+        return None if self.focus is None else self.focus.region
+
+    @cached_property
+    def _outlines(self) -> dict[str, NDArray[np.float64]]:
+        show = outline_of if self.focus is None else self.focus.outline
+        return {view.name: show(view) for view in self.scene.views}
+
+    def outline(self, name: str) -> NDArray[np.float64]:
+        """Of the part of an image that is matched: what shows the region, or all; (n, 2) corners."""
+        return self._outlines[name]
+
+    def window(self, name: str) -> Window:
+        """The part of an image that is worked on: the pixels around its outline."""
+        return Window.around(self._outlines[name])
+
+    def cut(self, name: str) -> tuple[Region, Window] | tuple[()]:
+        """Where the results of an image are cut off, as a part of their keys: nothing, where they are not."""
+        return () if self.region is None else (self.region, self.window(name))
+
     @cached_property
     def sparse_tracks(self) -> SparseTracks:
         """Which images observe each sparse point."""
-        return SparseTracks(self.scene)
+        return SparseTracks(self.scene, self.region)
 
     def pair_path(self, a: str, b: str) -> Path:
         """Disparity map of a pair: named by COLMAP's image ids, since names may hold anything."""

@@ -5,9 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.contradictions import check_fusion
@@ -30,7 +27,7 @@ from colmap_sph.project.state.array_file import SUFFIX
 from colmap_sph.project.state.ownership import map_place, named
 from colmap_sph.project.state.records import altered_files, read_record, whole_digests
 from colmap_sph.project.workspace import MapKind, Workspace, mask_path
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair, as_pair
 
@@ -42,7 +39,7 @@ def fuse_maps(
     output: CloudOutput,
     options: RunOptions,
     *,
-    box: NDArray[np.float64] | None = None,
+    region: Region | None = None,
     progress: Progress | None = None,
 ) -> RunReport:
     """Fuse the maps of a dense workspace.
@@ -56,8 +53,8 @@ def fuse_maps(
     options : RunOptions
         Those of fusion, the threads and the memory count; maps with more pixels on a side than `max_image_size` of
         the undistortion are reduced.
-    box : (2, 3) float64 ndarray, optional
-        Least and most coordinates of the points that are wanted, in the model's frame.
+    region : Region, optional
+        Where points are wanted, in the model's frame.
     progress : Progress, optional
 
     Returns
@@ -85,8 +82,8 @@ def fuse_maps(
             progress.advance()
         names = sorted(mapped)
         partners = partners_in_fusion(context, dict.fromkeys(pairs, ""), names)
-        own_box = None if box is None else box - scene.origin - scene.anchor
-        execute(FuseToStage(context, partners, _sources(context, mapped), output, own_box))
+        own_region = None if region is None else region.moved(-scene.origin - scene.anchor)
+        execute(FuseToStage(context, partners, _sources(context, mapped), output, own_region))
     report.images = len(names)
     if not report.points:
         raise NoResultError(

@@ -135,11 +135,19 @@ class Keys:
         )
 
     def vote(
-        self, view: View, pair_keys: Sequence[str], stations: Sequence[int], residuals: Sequence[float]
+        self,
+        view: View,
+        pair_keys: Sequence[str],
+        stations: Sequence[int],
+        residuals: Sequence[float],
+        cut: Sequence[object] = (),
     ) -> str:
-        """Of a photometric estimate, from the keys of its pairs as they vote, their stations and residuals."""
+        """Of a photometric estimate, from the keys of its pairs as they vote, their stations and residuals.
+
+        `cut` says where it is cut off, see `Context.cut`.
+        """
         mask = self._mask(view.name)
-        options = (self._options.vote, *self._depths)
+        options = (self._options.vote, *self._depths, *cut)
         return self._key("vote", _camera(view), mask, pair_keys, stations, residuals, *options)
 
     def photometric(self, vote: str) -> str:
@@ -153,13 +161,15 @@ class Keys:
         stations: Sequence[int],
         residuals: Sequence[float],
         sights: SparseSights,
+        cut: Sequence[object] = (),
     ) -> str:
         """Of the geometric maps of a view, from its own vote and its partners' votes, stations and row residuals.
 
-        The sparse points have a part in what is known of the maps.
+        `cut` says where they are cut off. The sparse points have a part in what is known of the maps.
         """
         # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
         options = (self._options.confirm, self._options.normals, self._options.refinement, *self._depths)
+        options += tuple(cut)
         return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)
 
     def cloud(self, maps: Mapping[str, str], partners: Mapping[str, Sequence[object]], scene: Scene) -> str:

@@ -139,7 +139,7 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     scene = anchored(read_scene(folder) if foreseen is None else foreseen)
     keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
     to_come = scene.index_of if foreseen is not None else to_make
-    context = with_good_images(Context(dense, scene, options, keys), survey, to_come=to_come)
+    context = with_good_images(Context(dense, scene, options, keys).in_region(), survey, to_come=to_come)
     selection = choose_pairs(dense if foreseen is None else None, context.scene, options, project.database())
     context = replace(context, scene=wanted_scene(context.scene, selection))
     foreign = foreign_files(context.places, overwrite=overwrite)

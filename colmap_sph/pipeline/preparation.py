@@ -57,6 +57,7 @@ from colmap_sph.project.undistortion.originals import read_originals
 from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import NO_SCENE, Scene
+from colmap_sph.stereo.anchor import anchored
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.reconstruct import Executor
@@ -85,7 +86,8 @@ class Preparation:
     ----------
     workspace : Workspace
     names : tuple of str
-        Sorted names of all registered images of the original model.
+        Sorted names of the registered images of the original model, where a region is asked for of those that show
+        it.
 
     Raises
     ------
@@ -113,7 +115,7 @@ class Preparation:
         self._verify = verify
         self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
-        self.names = tuple(image_names(self._originals.model))
+        self.names = self._names()
         originals = self._originals
         if originals.mask_dir is not None:
             check_masks(originals.mask_dir, cameras_of_images(originals.model), originals.image_dir)
@@ -125,6 +127,14 @@ class Preparation:
             progress or Silent(),
             report or RunReport(),
         )
+
+    def _names(self) -> tuple[str, ...]:
+        names = tuple(image_names(self._originals.model))
+        if not self._options.region:
+            return names
+        scene = anchored(foreseen_scene(self._originals, names, self._options.undistortion))
+        whole = Context(self.workspace, scene, self._options, Keys(self.workspace, self._options))
+        return tuple(view.name for view in whole.in_region().scene.views)
 
     def run(self, executor: "Executor") -> None:
         """Make the workspace.
@@ -142,7 +152,7 @@ class Preparation:
         """Go through the first stage: check the original images; return the results of the good ones."""
         originals = self._originals
         cameras = cameras_of_images(originals.model)
-        sizes = {name: (camera.width, camera.height) for name, camera in cameras.items()}
+        sizes = {name: (cameras[name].width, cameras[name].height) for name in self.names if name in cameras}
         places = ImagePlaces("originals", originals.model_dir, originals.image_dir)
         return executor(CheckStage(self._context, sizes, places, verify=self._verify or self._overwrite))
 

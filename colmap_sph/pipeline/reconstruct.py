@@ -219,7 +219,7 @@ def reconstruct(
         scene = read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir)
         # Images that this program undistorted are no larger.
         scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
-        context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
+        context = Context(workspace, scene, options, Keys(workspace, options), progress, report).in_region()
         for name in sorted({*expected} - scene.index_of.keys()):
             if name not in report.skipped_images:
                 report.skipped_images[name] = "the model has no possible pose or calibration of it"
@@ -369,7 +369,8 @@ def choose_pairs(
     path = pair_list
     if path is None and workspace is not None and workspace.patch_match_cfg_path.exists():
         path = workspace.patch_match_cfg_path
-    written = None if path is None else read_patch_match_cfg(path)
+    among = scene.index_of if options.region else None  # images elsewhere are named in vain
+    written = None if path is None else read_patch_match_cfg(path, among)
     matches = None if database is None or scene.has_tracks else read_verified_matches(database)
     return select_pairs(scene, options.pairs, explicit=written, matches=matches)
 

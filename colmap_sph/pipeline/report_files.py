@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +39,8 @@ def command_of(project: Project, options: RunOptions) -> str:
         path = getattr(project, each.name)
         if path is not None:
             words += [f"--{each.name}", str(Path(path).absolute())]
+    if options.region and Path(options.region).exists():
+        options = replace(options, region=str(Path(options.region).absolute()))
     words += _changed(asdict(options), asdict(RunOptions()), "--")
     return shlex.join(words)
 

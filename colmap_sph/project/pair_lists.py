@@ -1,7 +1,7 @@
 """COLMAP's lists of images and pairs in a dense workspace: ``fusion.cfg`` and ``patch-match.cfg``."""
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping
 from pathlib import Path
 
 from colmap_sph.errors import InputError, reason_of
@@ -67,8 +67,14 @@ def read_lines(path: Path, remedy: str) -> list[str]:
     return [line.strip(WHITE) for line in text.removeprefix(_BYTE_ORDER_MARK).split("\n")]
 
 
-def read_patch_match_cfg(path: Path) -> dict[str, SourceImages]:
+def read_patch_match_cfg(path: Path, among: Container[str] | None = None) -> dict[str, SourceImages]:
     """Read ``patch-match.cfg``: pairs of lines, a reference image and its sources.
+
+    Parameters
+    ----------
+    path : Path
+    among : container of str, optional
+        Names of the images that count; what is written of others is left out.
 
     Returns
     -------
@@ -92,7 +98,13 @@ def read_patch_match_cfg(path: Path) -> dict[str, SourceImages]:
         if reference in KEYWORDS:
             raise InputError(f"{path}, line {number}: {reference!r} stands where an image name is expected.")
         sources[reference] = _parse_sources(line, reference, f"{path}, line {source_number}")
-    return sources
+    if among is None:
+        return sources
+    return {name: _only(partners, among) for name, partners in sources.items() if name in among}
+
+
+def _only(sources: SourceImages, among: Container[str]) -> SourceImages:
+    return [name for name in sources if name in among] if isinstance(sources, list) else sources
 
 
 def _parse_sources(line: str, reference: str, where: str) -> SourceImages:

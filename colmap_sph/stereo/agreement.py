@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.depth import Depths
+from colmap_sph.stereo.region.inside import is_inside
 
 # Sparse points of a view to look at, an even part of them.
 _MAX_POINTS = 500
@@ -58,10 +59,13 @@ class SparseTracks:
     Parameters
     ----------
     scene : Scene
+    region : Region, optional
+        No point outside of it is asked.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, region: Region | None = None) -> None:
         self._scene = scene
+        self._is_wanted = np.ones(len(scene.points), bool) if region is None else is_inside(region, scene.points)
         observed = [view.point_indices for view in scene.views]
         indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in observed])])
         indices = np.concatenate([*observed, np.empty(0, np.int64)])
@@ -87,6 +91,7 @@ class SparseTracks:
         cameras = self._cameras[others]
         at_center = cameras[:, :, :3] @ view.center + cameras[:, :, 3]
         at_point = np.einsum("mij,mj->mi", cameras[:, :, :3], points[point]) + cameras[:, :, 3]
+        depth = np.where(self._is_wanted[rows], depth, 0.0)
         return SparseSights(pixels, depth, point, at_center, at_point)
 
 

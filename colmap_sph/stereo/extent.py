@@ -6,6 +6,7 @@ On the sphere rows and columns are angles λ and θ, on the plane they are tange
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_sph.errors import RectificationError
 from colmap_sph.scene import View
@@ -52,7 +53,19 @@ class Extent:
     seam: int
 
 
-def extent_on_sphere(rotation: Float, left: View, right: View, points: Float, min_cosine: float) -> Extent:
+def outline_of(view: View) -> Float:
+    """(4, 2) corners of a view's image, in the order in which outlines have them."""
+    return np.array([[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]], dtype=np.float64)
+
+
+def extent_on_sphere(
+    rotation: Float,
+    left: View,
+    right: View,
+    points: Float,
+    min_cosine: float,
+    outlines: tuple[Float, Float] | None = None,
+) -> Extent:
     """What two images cover of the sphere around their baseline.
 
     Parameters
@@ -64,6 +77,8 @@ def extent_on_sphere(rotation: Float, left: View, right: View, points: Float, mi
         Sparse points that both see, world frame.
     min_cosine : float
         Rays whose angle with the baseline has a sine (that is cos θ) below this are left out.
+    outlines : pair of (n, 2) float64 ndarray, optional
+        Of what of the images counts: the corners of a convex polygon in each, in the order of `outline_of`.
 
     Returns
     -------
@@ -74,21 +89,29 @@ def extent_on_sphere(rotation: Float, left: View, right: View, points: Float, mi
     RectificationError
         No plane through the baseline is in both images.
     """
-    centre, half = _common_arc(_row_arc(left, rotation), _row_arc(right, rotation))
+    outlines = (outline_of(left), outline_of(right)) if outlines is None else outlines
+    centre, half = _common_arc(_row_arc(left, rotation, outlines[0]), _row_arc(right, rotation, outlines[1]))
     if half <= 0:
         raise RectificationError("the two images share no epipolar plane")
     rotation = _rolled(rotation, centre)
     limit = float(np.arccos(min_cosine))
     columns: list[Range] = []
-    for view in (left, right):
-        low, high = _column_extent(view, rotation, -half, half)
+    for view, outline in zip((left, right), outlines, strict=True):
+        low, high = _column_extent(view, rotation, outline, -half, half)
         columns.append((max(low, -limit), min(high, limit)))
     parallaxes = parallax_angles(left, right, rotation, points)
     seam = _SEAM_ROWS if half >= np.pi else 0
     return Extent(rotation, (-half, half), (columns[0], columns[1]), parallaxes, seam)
 
 
-def extent_on_plane(rotation: Float, left: View, right: View, points: Float, baseline: float) -> Extent:
+def extent_on_plane(
+    rotation: Float,
+    left: View,
+    right: View,
+    points: Float,
+    baseline: float,
+    outlines: tuple[Float, Float] | None = None,
+) -> Extent:
     """What two images cover of the plane parallel to their baseline, at the distance 1 from it.
 
     Parameters
@@ -100,6 +123,8 @@ def extent_on_plane(rotation: Float, left: View, right: View, points: Float, bas
         Sparse points that both see, world frame.
     baseline : float
         Distance of the projection centres, model units.
+    outlines : pair of (n, 2) float64 ndarray, optional
+        See `extent_on_sphere`.
 
     Returns
     -------
@@ -110,9 +135,10 @@ def extent_on_plane(rotation: Float, left: View, right: View, points: Float, bas
     RectificationError
         A viewing ray runs along the plane, or no plane through the baseline is in both images.
     """
+    outlines = (outline_of(left), outline_of(right)) if outlines is None else outlines
     tangents = []
-    for view in (left, right):
-        rays = _border_rays(view, rotation)
+    for view, outline in zip((left, right), outlines, strict=True):
+        rays = _border_rays(view, rotation, outline)
         if (rays[:, 2] <= _LEAST_STEEPNESS * np.linalg.norm(rays, axis=1)).any():
             raise RectificationError(
                 "no plane parallel to the baseline can hold both images (a viewing ray runs along it)"
@@ -133,31 +159,40 @@ def _rolled(rotation: Float, angle: float) -> Float:
     return np.asarray(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ rotation)
 
 
-def _border_rays(view: View, rotation: Float) -> Float:
-    """(4 n, 3) rays along the image border, in the rectified frame, in order around the image."""
-    t = np.linspace(0, 1, _SIDE_SAMPLES)
-    zero = np.zeros_like(t)
-    one = np.ones_like(t)
-    x = np.concatenate([t, one, 1 - t, zero]) * view.width
-    y = np.concatenate([zero, t, one, 1 - t]) * view.height
-    rays = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(view.K).T
+def _border_rays(view: View, rotation: Float, outline: Float) -> Float:
+    """(k n, 3) rays along an outline in the image, in the rectified frame, in order around it."""
+    t = np.linspace(0, 1, _SIDE_SAMPLES)[:, None]
+    pixels = outline[:, None] + t * (np.roll(outline, -1, axis=0) - outline)[:, None]
+    return _rays(view, rotation, pixels.reshape(-1, 2))
+
+
+def _rays(view: View, rotation: Float, pixels: Float) -> Float:
+    """(n, 3) rays of pixels in the rectified frame."""
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(view.K).T
     return np.asarray(rays @ view.R @ rotation.T)
 
 
-def _epipole_sign(view: View, rotation: Float) -> int:
-    """+1 or -1 when the baseline's positive or negative direction lies inside the image, else 0."""
+def _is_within(outline: Float, pixels: Float) -> NDArray[np.bool_]:
+    """Which of (n, 3) homogeneous pixels before the camera an outline surrounds."""
+    edges = np.roll(outline, -1, axis=0) - outline
+    x, y = (pixels[:, axis, None] - pixels[:, 2:] * outline[:, axis] for axis in (0, 1))
+    return np.asarray((pixels[:, 2] > 0) & (edges[:, 0] * y - edges[:, 1] * x >= 0).all(axis=1))
+
+
+def _epipole_sign(view: View, rotation: Float, outline: Float) -> int:
+    """+1 or -1 when the baseline's positive or negative direction lies inside the outline, else 0."""
     for sign in (1, -1):
         pixel = view.K @ view.R @ (sign * rotation[0])
-        if pixel[2] > 0 and 0 <= pixel[0] <= pixel[2] * view.width and 0 <= pixel[1] <= pixel[2] * view.height:
+        if _is_within(outline, pixel[None])[0]:
             return sign
     return 0
 
 
-def _row_arc(view: View, rotation: Float) -> _Arc:
+def _row_arc(view: View, rotation: Float, outline: Float) -> _Arc:
     """Centre and half width of the image's row angles; the half width is π when it holds an epipole."""
-    if _epipole_sign(view, rotation):
+    if _epipole_sign(view, rotation, outline):
         return 0.0, np.pi
-    row_angles, _ = ray_angles(_border_rays(view, rotation))
+    row_angles, _ = ray_angles(_border_rays(view, rotation, outline))
     # Without an epipole the image is a convex cone beside the axis: its arc is shorter than π.
     first = row_angles[0]
     turned = np.unwrap(np.angle(np.exp(1j * (row_angles - first))))
@@ -175,17 +210,20 @@ def _common_arc(left: _Arc, right: _Arc) -> _Arc:
     return (low + high) / 2, (high - low) / 2
 
 
-def _column_extent(view: View, rotation: Float, low: float, high: float) -> Range:
-    """Range of θ of the part of the image whose row angles lie in [low, high]."""
+def _column_extent(view: View, rotation: Float, outline: Float, low: float, high: float) -> Range:
+    """Range of θ of the part inside an outline whose row angles lie in [low, high]."""
     n = _SIDE_SAMPLES
-    x, y = np.meshgrid(np.linspace(0, view.width, n), np.linspace(0, view.height, n))
-    rays = np.stack([x.ravel(), y.ravel(), np.ones(n * n)], axis=1) @ np.linalg.inv(view.K).T
-    row_angles, column_angles = ray_angles(rays @ view.R @ rotation.T)
-    step_pixels = _MARGIN_STEPS * np.hypot(view.width, view.height) / n
+    first = outline.min(axis=0)
+    last = outline.max(axis=0)
+    x, y = np.meshgrid(np.linspace(first[0], last[0], n), np.linspace(first[1], last[1], n))
+    pixels = np.stack([x.ravel(), y.ravel(), np.ones(n * n)], axis=1)
+    inner_rays = _rays(view, rotation, pixels[_is_within(outline, pixels), :2])
+    row_angles, column_angles = ray_angles(np.concatenate([inner_rays, _border_rays(view, rotation, outline)]))
+    step_pixels = _MARGIN_STEPS * np.hypot(*(last - first)) / n
     margin = (high - low) * _ROW_MARGIN + step_pixels / view.K[0, 0]
     kept = column_angles[(row_angles > low - margin) & (row_angles < high + margin)]
     if not len(kept):
         return 0.0, 0.0
-    sign = _epipole_sign(view, rotation)
+    sign = _epipole_sign(view, rotation, outline)
     least, most = float(kept.min()), float(kept.max())
     return (-np.pi / 2 if sign < 0 else least), (np.pi / 2 if sign > 0 else most)

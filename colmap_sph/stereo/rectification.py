@@ -105,6 +105,7 @@ def rectify_pair(
     right: View,
     options: RectificationOptions,
     details: tuple[float, float] | None = None,
+    outlines: tuple[Float, Float] | None = None,
 ) -> RectifiedPair:
     """Lay out the rectified images of a pair.
 
@@ -118,6 +119,8 @@ def rectify_pair(
     details : (float, float), optional
         What `image_detail` finds in the left and in the right image. Without it there is a rectified pixel, times
         `sampling`, to a pixel.
+    outlines : pair of (n, 2) float64 ndarray, optional
+        Of what is wanted of the left and the right image, see `extent_on_sphere`.
 
     Returns
     -------
@@ -152,9 +155,9 @@ def rectify_pair(
     rotation = _rectifying_rotation(left, right)
     points = _points_in_both(scene, left, right)
     if options.surface == "spherical":
-        extent = extent_on_sphere(rotation, left, right, points, options.min_cosine)
+        extent = extent_on_sphere(rotation, left, right, points, options.min_cosine, outlines)
     else:
-        extent = extent_on_plane(rotation, left, right, points, baseline)
+        extent = extent_on_plane(rotation, left, right, points, baseline, outlines)
     samplings = (1.0, 1.0) if details is None else (sampling_of(details[0]), sampling_of(details[1]))
     scales = _scale(left, points), _scale(right, points)
     scale = options.sampling * max(samplings[0] * scales[0], samplings[1] * scales[1])

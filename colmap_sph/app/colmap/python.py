@@ -6,11 +6,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from colmap_sph.app.colmap.fusion import Box, make_cloud, output_of
+from colmap_sph.app.colmap.fusion import make_cloud, output_of
 from colmap_sph.app.colmap.options import PATCH_MATCH_STEREO, STEREO_FUSION, Value, differing
 from colmap_sph.app.colmap.patch_match import make_maps
 from colmap_sph.project.cloud_output import read_back
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Region
 
 if TYPE_CHECKING:
     from os import PathLike
@@ -89,7 +90,7 @@ def stereo_fusion(
         "input_type": input_type,
     }
     chosen: dict[str, Value] = {} if options is None else differing(options, STEREO_FUSION)
-    make_cloud(plain, chosen, box=_box(options))
+    make_cloud(plain, chosen, region=_region(options))
     return read_back(output_of(plain), Workspace(Path(str(plain["workspace_path"]))))
 
 
@@ -97,11 +98,11 @@ def _plain(workspace_path: "AnyPath", workspace_format: str) -> dict[str, Value]
     return {"workspace_path": os.fsdecode(workspace_path), "workspace_format": workspace_format}
 
 
-def _box(options: Any) -> Box | None:
+def _region(options: Any) -> Region | None:
     """The bounding box of fusion options; None where it holds everything, as it does by default."""
     corners = getattr(options, "bounding_box", None)
     if corners is None:
         return None
     box = np.array(corners, dtype=np.float64)
     everything = float(np.finfo(np.float32).max)
-    return None if (np.abs(box) >= everything).all() else box
+    return None if (np.abs(box) >= everything).all() else Region(box)

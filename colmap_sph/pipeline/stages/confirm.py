@@ -18,13 +18,15 @@ from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, key
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import bytes_to_reduce, read_whole_grey
 from colmap_sph.project.masks import read_view_mask
-from colmap_sph.scene import View
+from colmap_sph.scene import Region, View
 from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
+from colmap_sph.stereo.region.inside import drop_outside, is_inside
+from colmap_sph.stereo.region.window import Window
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -49,11 +51,17 @@ _estimates: LoadCache[DepthEstimate] = LoadCache(lambda estimate: _ESTIMATE_BYTE
 
 @dataclass(frozen=True, eq=False)
 class EstimateFile:
-    """A view without its sparse points, its image, and its photometric depth."""
+    """A view without its sparse points, its image, and its photometric depth; and what of it is worked on."""
 
-    view: View
+    whole: View
+    window: Window
     image: Path
     estimate: Path
+
+    @property
+    def view(self) -> View:
+        """What of the view is worked on."""
+        return self.window.view(self.whole)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +78,7 @@ class ConfirmTask:
     normal_options: NormalOptions
     refinement_options: RefinementOptions
     depths: Depths | None
+    region: Region | None
     maps: MapFiles
     key: str
 
@@ -92,10 +101,12 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
             task.refinement_options,
             _usual(task.residuals),
         )
-    mask = read_view_mask(task.mask, view)
-    normals, depth = planes
-    drop_other_depths(depth, task.depths)
-    agreement = Agreement(*compare_with_sparse(view, depth, task.sights, mask))
+    drop_other_depths(planes[1], task.depths)
+    drop_outside(view, planes[1], task.region)
+    whole = task.reference.whole
+    normals, depth = (task.reference.window.padded(pixels, whole) for pixels in planes)
+    mask = read_view_mask(task.mask, whole)
+    agreement = Agreement(*compare_with_sparse(whole, depth, task.sights, mask))
     return task.maps.write(normals, depth, task.key, agreement)
 
 
@@ -108,8 +119,9 @@ def _estimate(file: EstimateFile) -> DepthEstimate:
 
 
 def _image(file: EstimateFile) -> NDArray[np.uint8]:
-    size = (file.view.width, file.view.height)
-    return _images.get(f"{file_stamp(file.image)} {size}", lambda: read_whole_grey(file.image, size))
+    size = (file.whole.width, file.whole.height)
+    key = f"{file_stamp(file.image)} {size} {file.window}"
+    return _images.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
 
 
 class ConfirmStage(Stage[str, ConfirmTask]):
@@ -133,7 +145,8 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         votes = [self._vote_keys[name] for name in partners]
         sights = self._tracks.sights(item).between(options.rectification.depths)
         residuals = [self._residuals[as_pair(item, name)] for name in partners]
-        key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights)
+        cut = self.context.cut(item)
+        key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights, cut)
         maps = self.context.map_files(item, "geometric")
         task = ConfirmTask(
             self._estimate_file(item),
@@ -146,6 +159,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
             options.normals,
             options.refinement,
             options.rectification.depths,
+            self.context.region,
             maps,
             key,
         )
@@ -157,7 +171,9 @@ class ConfirmStage(Stage[str, ConfirmTask]):
     def _estimate_file(self, name: str) -> EstimateFile:
         context = self.context
         view = context.scene.view(name).without_points()
-        return EstimateFile(view, context.workspace.image_path(name), context.estimate_path(name))
+        return EstimateFile(
+            view, context.window(name), context.workspace.image_path(name), context.estimate_path(name)
+        )
 
     def _cost(self, name: str) -> Cost:
         pixels = self._pixels(name)
@@ -169,10 +185,11 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         if refinement.rounds:
             memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + _IMAGE_BYTES * sum(map(self._pixels, partners))
         memory += bytes_to_reduce(*map(self.context.scene.view, [name, *partners]))
-        return Cost(seconds * pixels / 1e6, memory, MAP_BYTES * pixels)
+        maps = MAP_BYTES * self.context.scene.view(name).num_pixels
+        return Cost(seconds * pixels / 1e6, memory + maps - MAP_BYTES * pixels, maps)
 
     def _pixels(self, name: str) -> int:
-        return self.context.scene.view(name).num_pixels
+        return self.context.window(name).num_pixels
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """See `Stage.kept_memory`."""
@@ -200,11 +217,20 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         if failures and not report.images:
             raise NoResultError(f"No image has a depth map ({failures[0]})")
         for name in (name for name, share in report.coverage.items() if share == 0):
-            if name not in report.skipped_images:
+            if name not in report.skipped_images and self._shows_enough(name):
                 report.skipped_images[name] = self._why_empty(name)
                 self.context.progress.leave_out("image", name, report.skipped_images[name])
         if not report.images:
             raise NoResultError(self._why_nothing())
+
+    def _shows_enough(self, name: str) -> bool:
+        """Whether an image shows so much of the region, where there is one, that it ought to have some depth."""
+        context = self.context
+        if context.region is None or not context.scene.has_tracks:
+            return True
+        observed = context.scene.points[context.scene.view(name).point_indices]
+        inside = np.count_nonzero(is_inside(context.region, observed))
+        return int(inside) >= context.options.pairs.min_shared_points
 
     def _why_empty(self, name: str) -> str:
         """Why an image has no depth, as far as it is known."""

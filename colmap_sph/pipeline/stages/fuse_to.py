@@ -5,9 +5,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-from numpy.typing import NDArray
-
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.stages.cloud import CloudFacts, vouch_for_cloud
 from colmap_sph.pipeline.stages.fusion_parts import Partners, PartsStage, warn_of_masks
@@ -18,6 +15,7 @@ from colmap_sph.project.cloud_output import CloudOutput
 from colmap_sph.project.files import real_path, scratch_folder
 from colmap_sph.project.state.records import begin
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Region
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -32,7 +30,7 @@ class FuseToStage(PartsStage):
     partners, sources
         See `PartsStage`; of the images to fuse.
     output : CloudOutput
-    box : (2, 3) float64 ndarray, optional
+    region : Region, optional
         See `FuseTask`.
     """
 
@@ -42,10 +40,10 @@ class FuseToStage(PartsStage):
         partners: Partners,
         sources: Mapping[str, MapSources],
         output: CloudOutput,
-        box: NDArray[np.float64] | None = None,
+        region: Region | None = None,
     ) -> None:
         super().__init__(context, list(sources), partners, sources)
-        self.box = box
+        self.region = region
         self._output = output
 
     @contextmanager

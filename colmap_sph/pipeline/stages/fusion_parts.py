@@ -17,7 +17,9 @@ from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.cloud_files import write_part
 from colmap_sph.project.images.reading import bytes_to_reduce
 from colmap_sph.project.masks import warn_of_unused_masks
+from colmap_sph.scene import Region
 from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.region.inside import pixels_inside
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -43,7 +45,7 @@ _maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 class FuseTask:
     """A view to fuse, those that overlap it, what to add to its points, and the path of its part less suffixes.
 
-    Of a `box`, (2, 3) least and most coordinates in the scene's frame, only the points inside are made.
+    Of a `region`, in the scene's frame, only the points inside are made.
     """
 
     reference: MapSources
@@ -52,32 +54,19 @@ class FuseTask:
     options: FusionOptions
     offset: NDArray[np.float64]
     stem: Path
-    box: NDArray[np.float64] | None = None
+    region: Region | None = None
 
 
 def make_cloud_part(task: FuseTask) -> Facts:
     """Fuse a view; writes the points of the cloud which it sees better than any other."""
     reference = _view_maps(task.reference)
-    if task.box is not None:
-        reference = replace(reference, depth=depth_in_box(reference, task.box))
+    if task.region is not None:
+        inside = pixels_inside(reference.view, reference.depth, task.region)
+        reference = replace(reference, depth=np.where(inside, reference.depth, np.float32(0)))
     unread: dict[str, str] = {}
     partners = _partner_maps(task.partners, unread)
     bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
     return Facts(points=write_part(task.stem, bands), unread=unread)
-
-
-def depth_in_box(maps: ViewMaps, box: NDArray[np.float64]) -> NDArray[np.float32]:
-    """The (H, W) depth map of a view, 0 where its points lie outside of a (2, 3) box in the world frame."""
-    view = maps.view
-    height, width = maps.depth.shape
-    directions = view.R.T @ np.linalg.inv(view.K)
-    inside = maps.depth > 0
-    for axis in range(3):
-        across = directions[axis, 0] * np.arange(width)
-        down = directions[axis, 1] * np.arange(height) + directions[axis, 2]
-        place = maps.depth * (across + down[:, None]) + view.center[axis]
-        inside &= (place >= box[0, axis]) & (place <= box[1, axis])
-    return np.where(inside, maps.depth, np.float32(0))
 
 
 def _view_maps(sources: MapSources) -> ViewMaps:
@@ -119,7 +108,7 @@ class PartsStage(Stage[str, FuseTask]):
 
     name = "fuse"
     make = staticmethod(make_cloud_part)
-    box: NDArray[np.float64] | None = None
+    region: Region | None = None
     """Where points are wanted, see `FuseTask`."""
 
     def __init__(
@@ -150,7 +139,7 @@ class PartsStage(Stage[str, FuseTask]):
             self.context.options.fusion,
             scene.anchor,
             self._stem(item),
-            self.box,
+            self.region,
         )
         return Job(self._key, self._done(), cost, task)
 

@@ -196,7 +196,9 @@ class MatchStage(Stage[Pair, MatchTask]):
     def _geometry(self, left: View, right: View) -> RectifiedPair:
         try:
             details = (self._detail(left), self._detail(right))
-            return rectify_pair(self.context.scene, left, right, self.context.options.rectification, details)
+            outlines = (self.context.outline(left.name), self.context.outline(right.name))
+            options = self.context.options.rectification
+            return rectify_pair(self.context.scene, left, right, options, details, outlines)
         except RectificationError:
             self._unfit.add(as_pair(left.name, right.name))
             raise

@@ -21,11 +21,13 @@ from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.masks import read_view_mask
-from colmap_sph.scene import View
+from colmap_sph.scene import Region, View
 from colmap_sph.stereo.agreement import compare_with_sparse
 from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
+from colmap_sph.stereo.region.inside import drop_outside
+from colmap_sph.stereo.region.window import Window
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
 if TYPE_CHECKING:
@@ -34,6 +36,8 @@ if TYPE_CHECKING:
 # Processor seconds per megapixel of the image: per pair that votes, and of the normals of one kind of maps.
 _SECONDS = 0.052
 NORMALS_SECONDS = 0.16
+# Estimates reach so many pixels beyond the region that maps are cut to: what windows at its border look at.
+REGION_MARGIN = 24
 # Bytes on disk per pixel: of the estimate.
 _ESTIMATE_BYTES = 9.0
 # Largest bytes in use at a time, per pixel: beside the pairs' disparity maps, and of one that is not made yet.
@@ -55,6 +59,8 @@ class VoteTask:
     vote_options: VoteOptions
     normal_options: NormalOptions
     depths: Depths | None
+    window: Window
+    region: Region | None
     maps: MapFiles
     vote_key: str
     maps_key: str
@@ -62,20 +68,24 @@ class VoteTask:
 
 def make_photometric_maps(task: VoteTask) -> Facts:
     """Vote on the depth of a view; writes it with its standard deviation and support, and the photometric maps."""
-    estimate = read_estimate(task.estimate, task.view) if task.is_voted else _vote(task)
-    normals, depth = fit_normals(task.view, estimate, task.normal_options)
+    view = task.window.view(task.view)
+    estimate = read_estimate(task.estimate, view) if task.is_voted else _vote(task, view)
+    normals, depth = fit_normals(view, estimate, task.normal_options)
     drop_other_depths(depth, task.depths)
+    drop_outside(view, depth, task.region)
+    normals, depth = (task.window.padded(pixels, task.view) for pixels in (normals, depth))
     return task.maps.write(normals, depth, task.maps_key)
 
 
-def _vote(task: VoteTask) -> DepthEstimate:
+def _vote(task: VoteTask, view: View) -> DepthEstimate:
     pairs = (read_pair(file) for file in task.pairs)
-    estimate = vote_depth(task.view, pairs, task.vote_options, task.stations, task.residuals)
+    estimate = vote_depth(view, pairs, task.vote_options, task.stations, task.residuals)
     mask = read_view_mask(task.mask, task.view)
     if mask is not None:
         # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
-        estimate.depth[mask == 0] = 0
+        estimate.depth[task.window.part(mask) == 0] = 0
     drop_other_depths(estimate.depth, task.depths)
+    drop_outside(view, estimate.depth, task.region, REGION_MARGIN)
     write_estimate(task.estimate, estimate, task.vote_key)
     return estimate
 
@@ -119,11 +129,13 @@ class VoteStage(Stage[str, VoteTask]):
         files = tuple(context.pair_path(item, partner) for partner in partners)
         pairs = [as_pair(item, partner) for partner in partners]
         residuals = [self._residuals[pair] for pair in pairs]
-        key = context.keys.vote(view, [self._pair_keys[pair] for pair in pairs], stations, residuals)
+        keys = [self._pair_keys[pair] for pair in pairs]
+        key = context.keys.vote(view, keys, stations, residuals, context.cut(item))
         maps_key = context.keys.photometric(key)
         estimate = context.estimate_path(item)
+        window = context.window(item)
         maps = context.map_files(item, "photometric")
-        is_voted = is_estimate_there(estimate, key, view)
+        is_voted = is_estimate_there(estimate, key, window.view(view))
         task = VoteTask(
             view.without_points(),
             files,
@@ -135,18 +147,25 @@ class VoteStage(Stage[str, VoteTask]):
             context.options.vote,
             context.options.normals,
             context.options.rectification.depths,
+            window,
+            context.region,
             maps,
             key,
             maps_key,
         )
-        return Job(key, maps.facts(maps_key) if is_voted else None, self._cost(view, files, is_voted), task)
+        return Job(
+            key,
+            maps.facts(maps_key) if is_voted else None,
+            self._cost(view, window.num_pixels, files, is_voted),
+            task,
+        )
 
-    def _cost(self, view: View, files: tuple[Path, ...], is_voted: bool) -> Cost:
-        pixels = view.num_pixels
+    def _cost(self, view: View, pixels: int, files: tuple[Path, ...], is_voted: bool) -> Cost:
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
         seconds = NORMALS_SECONDS + (0 if is_voted else _SECONDS * len(files))
-        disk = MAP_BYTES + (0 if is_voted else _ESTIMATE_BYTES)
-        return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities, disk * pixels)
+        disk = MAP_BYTES * view.num_pixels + (0 if is_voted else _ESTIMATE_BYTES * pixels)
+        maps = MAP_BYTES * (view.num_pixels - pixels)
+        return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities + maps, disk)
 
     @contextmanager
     def opened(self) -> Iterator[None]:

@@ -1,0 +1,158 @@
+"""Scene and region → the part of the scene that shows the region, and what of each image does.
+
+The sparse points in the region and near it tell which images see it, and where it has surfaces. With these alone
+pairs are chosen, and parallaxes are searched.
+"""
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.scene import Polygons, Region, Scene, View
+from colmap_sph.stereo.partners.frusta import sees
+from colmap_sph.stereo.region.window import outline_on
+
+# The scene reaches from the one to the other percentile of its points, and beyond by this share of it: beyond are
+# outliers.
+_PERCENTILES = (0.5, 99.5)
+_BEYOND = 0.5
+# Points near the region are at most so far from it, in units of its size; farther, where so many are not nearer.
+_NEAR = 0.1
+_ENOUGH_POINTS = 256
+# Roofs and trees, which often carry no points, may rise above these by so much of their range, and by so much of
+# the region's size.
+_ABOVE = 0.5
+_ABOVE_FLAT = 0.02
+# Cells of the map of distances from polygons, along its longer side.
+_CELLS = 1024
+
+
+@dataclass(frozen=True, eq=False)
+class Focus:
+    """A region in the frame of a scene.
+
+    Attributes
+    ----------
+    region : Region
+        What results are cut to.
+    box : (2, 3) float64 ndarray
+        Where its surfaces are, with some room around: what images need to show.
+    """
+
+    region: Region
+    box: NDArray[np.float64]
+
+    def outline(self, view: View) -> NDArray[np.float64]:
+        """Of what of a view of the reduced scene may show the region, see `outline_on`."""
+        outline = outline_on(view, self.box)
+        assert outline is not None
+        return outline
+
+
+def focused(scene: Scene, region: Region, least_points: int, called: str) -> tuple[Scene, Focus]:
+    """Reduce a scene to what shows a region.
+
+    Parameters
+    ----------
+    scene : Scene
+    region : Region
+        In the model's frame.
+    least_points : int
+        Images that observe fewer points in the region and near it are left out.
+    called : str
+        The region's name in messages.
+
+    Returns
+    -------
+    scene : Scene
+        With the points in the region and near it, and the images that see them.
+    focus : Focus
+
+    Raises
+    ------
+    InputError
+        The scene is not there, or without any point.
+    """
+    origin = scene.origin + scene.anchor
+    region = region.moved(-origin)
+    points = scene.points[np.isfinite(scene.points).all(axis=1)]
+    if not len(points):
+        raise InputError(
+            f"{called} needs sparse points, by which the images of a region are found, and the model has none; "
+            "triangulate some (colmap point_triangulator), or leave out --region."
+        )
+    low, high = np.percentile(points, _PERCENTILES, axis=0)
+    beyond = _BEYOND * (high - low)
+    inside_scene = np.stack([np.maximum(region.box[0], low - beyond), np.minimum(region.box[1], high + beyond)])
+    near = np.zeros(len(scene.points), bool)
+    size = 0.0
+    if (inside_scene[0] <= inside_scene[1]).all():
+        size = float(np.linalg.norm(inside_scene[1] - inside_scene[0]))
+        near = _near(region, scene.points, size)
+    if not near.any():
+        corners = (f"{x:.6g} {y:.6g} {z:.6g}" for x, y, z in (low + origin, high + origin))
+        raise InputError(
+            f"{called} misses the scene, whose sparse points reach from {' to '.join(corners)}; give a region in "
+            "the model's coordinates that holds some of them."
+        )
+    low, high = np.percentile(scene.points[near], _PERCENTILES, axis=0)
+    above = _ABOVE * (high - low) + _ABOVE_FLAT * size
+    box = np.stack([np.maximum(inside_scene[0], low - above), np.minimum(inside_scene[1], high + above)])
+    return _with_points(scene, near, box, least_points), Focus(region, box)
+
+
+def _near(region: Region, points: NDArray[np.float64], size: float) -> NDArray[np.bool_]:
+    """Which points lie in a region of some size or near it."""
+    distances = _distances(region, points, size)
+    enough = size
+    if len(points) > _ENOUGH_POINTS:
+        enough = float(np.partition(distances, _ENOUGH_POINTS)[_ENOUGH_POINTS])
+    return np.asarray(distances <= max(_NEAR * size, min(enough, size)))
+
+
+def _distances(region: Region, points: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+    """(n,) distances of points from a region; infinite where they are not finite, or larger than `most`."""
+    with np.errstate(invalid="ignore"):
+        beside = np.maximum(np.maximum(region.box[0] - points, points - region.box[1]), 0)
+    distances: NDArray[np.float64] = np.linalg.norm(beside, axis=1)
+    distances[~(distances <= most)] = np.inf
+    if region.polygons:
+        rows = np.flatnonzero(np.isfinite(distances))
+        from_polygons = _distances_from(region.polygons, points[rows, :2], most)
+        distances[rows] = np.maximum(distances[rows], from_polygons)
+    return distances
+
+
+def _distances_from(polygons: Polygons, places: NDArray[np.float64], most: float) -> NDArray[np.float64]:
+    """(n,) distances of places from polygons, to the size of a cell of a map, and rather too small."""
+    corners = np.concatenate([ring for rings in polygons for ring in rings])
+    low = corners.min(axis=0) - most
+    extent = corners.max(axis=0) + most - low
+    cell = float(extent.max()) / _CELLS
+    width, height = np.ceil(extent / cell).astype(int) + 1
+    outside = np.ones((height, width), np.uint8)
+    for rings in polygons:
+        one = np.zeros_like(outside)
+        cells = [np.floor((ring - low) / cell).astype(np.int32) for ring in rings]
+        cv2.fillPoly(one, cells, 1)
+        cv2.polylines(one, cells, isClosed=True, color=1)
+        outside[one > 0] = 0
+    distances = cv2.distanceTransform(outside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * cell
+    columns, rows = np.clip((places - low) // cell, 0, [width - 1, height - 1]).astype(int).T
+    return np.asarray(distances[rows, columns], dtype=np.float64)
+
+
+def _with_points(scene: Scene, kept: NDArray[np.bool_], box: NDArray[np.float64], least_points: int) -> Scene:
+    """The scene with some of its points alone, and the views that show enough of them."""
+    points = scene.points[kept]
+    new_rows = np.cumsum(kept) - 1
+    views = []
+    for view in scene.views:
+        observed = view.point_indices[kept[view.point_indices]]
+        number = len(observed) if scene.has_tracks else np.count_nonzero(sees(view, points))
+        if number >= least_points and outline_on(view, box) is not None:
+            views.append(replace(view, point_indices=new_rows[observed]))
+    return replace(scene, views=tuple(views), points=points)
