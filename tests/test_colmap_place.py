@@ -1,5 +1,6 @@
 """`patch_match_stereo` and `stereo_fusion` in COLMAP's place, on a small rendered block."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -128,6 +129,16 @@ def test_photometric_maps_only_and_given_depths(finished, tmp_path):
     assert command("stereo_fusion", "--workspace_path", dense, "--output_path", tmp_path / "c.ply") == 2
     arguments = ["--workspace_path", dense, "--output_path", tmp_path / "c.ply", "--input_type", "photometric"]
     assert command("stereo_fusion", *arguments) == 0
+
+
+def test_depths_without_limit_are_those_of_sparse_points(finished, tmp_path):
+    """COLMAP's users give a very wide range to say so."""
+    dense = undistorted(finished, tmp_path / "dense")
+    words = {"max_image_size": 200, "geom_consistency": 0, "depth_min": 1e-3, "depth_max": 1e9}
+    arguments = [word for name, value in words.items() for word in (f"--PatchMatchStereo.{name}", value)]
+    assert command("patch_match_stereo", "--workspace_path", dense, *arguments) == 0
+    agreement = json.loads((dense / "colmap_sph/report.json").read_text())["agreement"]
+    assert len(agreement) == 10 and min(agreement.values()) > 0.95
 
 
 def test_maps_of_another_program_are_fused_as_our_own(finished, tmp_path, capsys):

@@ -23,6 +23,8 @@ _UNKNOWN_DEGREES = (0.3, 60.0)
 _PERCENTILES = (1, 99)
 # Zero is infinitely far away, and what is below it behind the cameras.
 _LEAST_PARALLAX = 1e-4
+# Ranges that are given reach at most so many times as far as those of sparse points.
+_MOST_TIMES = 4
 # What follows from sparse points is rounded to so many binary digits, so that the last of theirs does not count.
 _DIGITS = 11
 
@@ -107,6 +109,24 @@ def bounded_range(parallaxes: Float) -> Range:
     least = few_digits(max(float(parallaxes.min()), _LEAST_PARALLAX), np.floor)
     most = few_digits(max(float(parallaxes.max()), _LEAST_PARALLAX), np.ceil)
     return least, most
+
+
+def limited_range(given: Range, usual: Range) -> Range:
+    """A range of parallaxes that was given, less what is far beyond the one that sparse points tell.
+
+    Users give very wide ranges to say "no limit", and matching finds less in those. A range that lies elsewhere is
+    meant as it is.
+
+    Examples
+    --------
+    >>> limited_range((0.001, 9.0), (0.1, 0.2)), limited_range((0.001, 0.15), (0.1, 0.2))
+    ((0.025, 0.8), (0.025, 0.15))
+    >>> limited_range((5.0, 9.0), (0.1, 0.2))
+    (5.0, 9.0)
+    """
+    least = max(given[0], usual[0] / _MOST_TIMES)
+    most = min(given[1], usual[1] * _MOST_TIMES)
+    return (least, most) if least < most else given
 
 
 def few_digits(value: float, rounded: Callable[[float], float]) -> float:

@@ -15,6 +15,7 @@ from colmap_sph.stereo.disparity_range import (
     bounded_range,
     columns_with_counterparts,
     few_digits,
+    limited_range,
     parallax_angles,
     parallax_range,
     parallax_tangents,
@@ -35,8 +36,11 @@ _MAX_SIDE = 32766
 # windows are of whole pixels; and as many per pixel at most.
 _OVERSAMPLING = 1.45
 _MOST_SAMPLING = 1.3
-# Rays of a view along each side, and depths along each of them, that stand for all between two depths.
+# Rays of a view along each side, and depths along each of them, that stand for all between two depths: as many at
+# least, and so many that each is at most so many times the one before, but for ranges that mean no limit.
 _DEPTH_SAMPLES = 17
+_DEPTH_STEP = 1.1
+_MOST_DEPTHS = 400
 # Fewer rows or columns than this are not worth matching.
 _MIN_SIDE = 16
 
@@ -59,7 +63,8 @@ class RectificationOptions:
     far_margin: float = 1.5
     """Surfaces are looked for up to the distance of the farthest sparse points times this."""
     min_depth: float = -1.0
-    """Least depth to look for, model units, instead of what the sparse points tell; -1: these."""
+    """Least depth to look for, model units, instead of what the sparse points tell; -1: these. Where limits are
+    far beyond what these tell, four times as far as they tell is searched."""
     max_depth: float = -1.0
     """Largest depth to look for; goes with `min_depth`. Maps have no other depths then."""
     max_pixels_ratio: float = 8.0
@@ -164,7 +169,8 @@ def rectify_pair(
     scale = few_digits(scale, np.round)
     searched = parallax_range(extent.parallaxes, options.near_margin, options.far_margin)
     if options.depths is not None:
-        searched = _range_of_depths(left, right, extent.rotation, options.depths, options.surface, baseline)
+        given = _range_of_depths(left, right, extent.rotation, options.depths, options.surface, baseline)
+        searched = limited_range(given, searched)
     pair = _laid_out(options.surface, extent, baseline, scale, searched)
     _check_size(pair, left, right, options.max_pixels_ratio * max(1.0, scale / max(scales)) ** 2)
     return pair
@@ -211,7 +217,9 @@ def _range_of_depths(
 ) -> Range:
     """Parallaxes of what either view sees between two depths in it, and the other has in view."""
     grid = np.linspace(0, 1, _DEPTH_SAMPLES)
-    x, y, depth = np.meshgrid(grid, grid, np.geomspace(*depths, _DEPTH_SAMPLES))
+    steps = np.log(depths[1] / depths[0]) / np.log(_DEPTH_STEP)
+    number = int(np.clip(np.ceil(steps) + 1, _DEPTH_SAMPLES, _MOST_DEPTHS))
+    x, y, depth = np.meshgrid(grid, grid, np.geomspace(*depths, number))
     seen = []
     for view, other in ((left, right), (right, left)):
         pixels = np.stack([x.ravel() * view.width, y.ravel() * view.height, np.ones(x.size)], axis=1)
