@@ -1,20 +1,18 @@
 """Which images were matched with which, and under what parallax."""
 
-import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.pages.run_facts import RunFacts
-from colmap_sph.project.state.array_file import SUFFIX
+from colmap_sph.project.pair_lists import pairs_on_disk
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles
 
 # As `pipeline.context.Context.pair_path` names them.
-_PAIR_FILE = re.compile(rf"(\d+)-(\d+){re.escape(SUFFIX)}")
 # Points that tell a pair's angle, and which of their angles it is, as where pairs are chosen.
 _MOST_POINTS = 512
 _PERCENTILE = 75
@@ -57,7 +55,7 @@ def pairs_of(
     -------
     list of PairFacts
     """
-    told = facts.matched_pairs or [(left, right, None) for left, right in _pairs_on_disk(workspace, scene)]
+    told = facts.matched_pairs or [(left, right, None) for left, right in pairs_on_disk(workspace, scene)]
     known = [pair for pair in told if pair[0] in scene.index_of and pair[1] in scene.index_of]
     return [
         PairFacts(
@@ -68,17 +66,6 @@ def pairs_of(
         )
         for left, right, rows in known
     ]
-
-
-def _pairs_on_disk(workspace: Workspace, scene: Scene) -> Sequence[tuple[str, str]]:
-    name_of = {view.image_id: view.name for view in scene.views}
-    pairs = []
-    for path in sorted(workspace.pairs_dir.glob(f"*{SUFFIX}")):
-        found = _PAIR_FILE.fullmatch(path.name)
-        ids = [int(digits[:18]) for digits in found.groups()] if found else []
-        if ids and all(each in name_of for each in ids):
-            pairs.append((name_of[ids[0]], name_of[ids[1]]))
-    return pairs
 
 
 def _angle(scene: Scene, left: str, right: str, surface: NDArray[np.float64] | None) -> float | None:

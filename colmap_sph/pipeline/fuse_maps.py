@@ -21,15 +21,14 @@ from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.cloud_output import CloudOutput
 from colmap_sph.project.map_files import has_depth, map_size
-from colmap_sph.project.pair_lists import read_lines
+from colmap_sph.project.pair_lists import pairs_on_disk, read_lines
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.state.array_file import SUFFIX
 from colmap_sph.project.state.ownership import map_place, named
 from colmap_sph.project.state.records import altered_files, read_record, whole_digests
 from colmap_sph.project.workspace import MapKind, Workspace, mask_path
 from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.anchor import anchored
-from colmap_sph.stereo.partners.pairing import Pair, as_pair
+from colmap_sph.stereo.partners.pairing import as_pair
 
 logger = logging.getLogger(__name__)
 
@@ -78,7 +77,8 @@ def fuse_maps(
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         check_fusion(context)
         with timed_stage("select pairs", 1, progress, report):
-            pairs = _matched_pairs(context) or choose_pairs(workspace, scene, options, None).unique_pairs()
+            matched = [as_pair(*names) for names in pairs_on_disk(workspace, scene)]
+            pairs = matched or choose_pairs(workspace, scene, options, None).unique_pairs()
             progress.advance()
         names = sorted(mapped)
         partners = partners_in_fusion(context, dict.fromkeys(pairs, ""), names)
@@ -144,19 +144,6 @@ def _at_map_sizes(scene: Scene, mapped: dict[str, View], max_image_size: int) ->
     """The scene as it was worked on: views with the pixels of their maps, or with at most so many on a side."""
     views = tuple(mapped.get(view.name, view).no_larger_than(max_image_size) for view in scene.views)
     return anchored(replace(scene, views=views)).only(mapped)
-
-
-def _matched_pairs(context: Context) -> list[Pair]:
-    """Pairs that this program has matched in the workspace."""
-    if not context.workspace.pairs_dir.is_dir():
-        return []
-    name_of = {view.image_id: view.name for view in context.scene.views}
-    pairs = []
-    for path in sorted(context.workspace.pairs_dir.glob(f"*{SUFFIX}")):
-        ids = [int(word) for word in path.stem.split("-") if word.isdecimal()]
-        if len(ids) == 2 and ids[0] in name_of and ids[1] in name_of:
-            pairs.append(as_pair(name_of[ids[0]], name_of[ids[1]]))
-    return pairs
 
 
 def _sources(context: Context, mapped: dict[str, View]) -> dict[str, MapSources]:

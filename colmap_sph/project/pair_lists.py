@@ -1,4 +1,4 @@
-"""COLMAP's lists of images and pairs in a dense workspace: ``fusion.cfg`` and ``patch-match.cfg``."""
+"""Lists of a dense workspace: COLMAP's ``fusion.cfg`` and ``patch-match.cfg``, and the pairs matched in it."""
 
 import re
 from collections.abc import Container, Iterable, Mapping
@@ -7,10 +7,13 @@ from pathlib import Path
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file, open_regular
 from colmap_sph.project.given.image_names import KEYWORDS, WHITE
-from colmap_sph.scene import SourceImages
+from colmap_sph.project.state.array_file import SUFFIX
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene, SourceImages
 
 _BYTE_ORDER_MARK = "\ufeff"
 _LIKE_KEYWORD = re.compile("__[a-z]+__")
+_PAIR_FILE = re.compile(rf"(\d+)-(\d+){re.escape(SUFFIX)}")
 
 
 def fusion_cfg(names: Iterable[str]) -> bytes:
@@ -121,3 +124,15 @@ def _parse_sources(line: str, reference: str, where: str) -> SourceImages:
     if reference in names:
         raise InputError(f"{where}: {reference!r} is listed as its own source image; remove it.")
     return list(dict.fromkeys(names))
+
+
+def pairs_on_disk(workspace: Workspace, scene: Scene) -> list[tuple[str, str]]:
+    """Names of the images of each pair that this program has matched in a workspace."""
+    name_of = {view.image_id: view.name for view in scene.views}
+    pairs = []
+    for path in sorted(workspace.pairs_dir.glob(f"*{SUFFIX}")):
+        found = _PAIR_FILE.fullmatch(path.name)
+        ids = [int(digits[:18]) for digits in found.groups()] if found else []
+        if ids and all(each in name_of for each in ids):
+            pairs.append((name_of[ids[0]], name_of[ids[1]]))
+    return pairs
