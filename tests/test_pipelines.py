@@ -64,10 +64,11 @@ def test_events_of_a_run(small: Path, capsys: pytest.CaptureFixture[str]) -> Non
         assert steps[-1]["done"] == steps[-1]["total"]
         (end,) = (each for each in told if each["event"] == "stage_end" and each["stage"] == stage)
         if stage in report["seconds"]:
-            assert end["seconds_taken"] == pytest.approx(report["seconds"][stage], abs=0.3)
-    # The time left is known from the first pair on, and has run out at the end.
-    matching = next(each for each in told if each["event"] == "stage" and each["stage"] == "match pairs")
-    assert matching["seconds_left"] > 0
+            assert end["seconds_taken"] >= report["seconds"][stage] - 0.002
+    # The time left is unknown until the pairs are known, and has run out at the end. (How much it is: see
+    # test_time_left. Here it may be less than the tenth of a second to which it is told.)
+    begun = {each["stage"]: each["seconds_left"] for each in told if each["event"] == "stage"}
+    assert [stage for stage, left in begun.items() if left is None] == stages[: stages.index("match pairs")]
     assert [each for each in told if each["event"] == "progress"][-1]["seconds_left"] == 0
     # People get the summary, and no bars or stages.
     assert "cloud" in said and "match pairs (" not in said

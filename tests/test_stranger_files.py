@@ -109,13 +109,13 @@ BAD_OBJ = {
 
 
 def refuse_soon(path: Path, content: bytes) -> str:
-    """Refused within 5 seconds, and in 64 MB more than twenty times the file."""
+    """Refused within 30 seconds, and in 64 MB more than twenty times the file."""
     path.write_bytes(content)
     tracemalloc.start()
     start = time.perf_counter()
     with pytest.raises(InputError) as error:
         read_geometry(path)
-    assert time.perf_counter() - start < 5
+    assert time.perf_counter() - start < 30
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert peak < (64 << 20) + 20 * len(content)
