@@ -193,6 +193,7 @@ def unwarp_offsets(
     """
 
 def mean_offsets(
+    backend: str,
     offset: NDArray[np.int32],
     radius: int,
     max_step: int,
@@ -201,10 +202,58 @@ def mean_offsets(
 ) -> None:
     """Of every offset the mean of those near it that differ from it by no more than `max_step`.
 
+    backend : str
     offset : (H, W) int32
     radius : int
     max_step : int
     mean : (H, W) int32, written
+    """
+
+def upsample_offsets(
+    offset: NDArray[np.int32],
+    max_step: int,
+    fine: NDArray[np.int32],
+    /,
+) -> None:
+    """A level's offsets at the pixels of the next finer one, interpolated on surfaces, repeated at steps.
+
+    offset : (H, W) int32
+    max_step : int
+    fine : (FINE_H, FINE_W) int32, written
+    """
+
+def search_windows(
+    least: NDArray[np.float32],
+    most: NDArray[np.float32],
+    predicted: NDArray[np.int32],
+    depth: int,
+    clearance: int,
+    own_clearance: int,
+    base: NDArray[np.int32],
+    /,
+) -> None:
+    """First residuals to search about predicted offsets, by the least and most of the level above around them.
+
+    least : (H, W) float32
+    most : (H, W) float32
+    predicted : (FINE_H, FINE_W) int32
+    depth : int
+    clearance : int
+    own_clearance : int
+    base : (FINE_H, FINE_W) int32, written
+    """
+
+def to_disparity(
+    offset: NDArray[np.int32],
+    shifts: NDArray[np.float32],
+    disparity: NDArray[np.float32],
+    /,
+) -> None:
+    """Disparities, pixels, of offsets, less the shift of their fraction; NaN where there is no offset.
+
+    offset : (H, W) int32
+    shifts : (256) float32
+    disparity : (H, W) float32, written
     """
 
 def transfer_disparity(

@@ -264,14 +264,26 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     def unwarp_offsets(_: str) -> None:
         _native.unwarp_offsets(offset, offset, 0, unwarped)
 
-    def mean_offsets(_: str) -> None:
-        _native.mean_offsets(offset, 3, 768, mean)
+    def mean_offsets(backend: str) -> None:
+        _native.mean_offsets(backend, offset, 3, 768, mean)
+
+    # As if the pixels were those of the finer level.
+    half_offset = np.ascontiguousarray(offset[::2, ::2])
+    near = np.asarray(half_offset / 512, dtype=np.float32)
+
+    def upsample_offsets(_: str) -> None:
+        _native.upsample_offsets(half_offset, 1024, unwarped)
+
+    def search_windows(_: str) -> None:
+        _native.search_windows(near, near, offset, 32, 4, 6, unwarped)
 
     pixels = width * height
     return [
         Kernel("warp", warp, [warped, warped_valid, columns], pixels),
         Kernel("unwarp_offsets", unwarp_offsets, [unwarped], pixels),
         Kernel("mean_offsets", mean_offsets, [mean], pixels),
+        Kernel("upsample_offsets", upsample_offsets, [unwarped], pixels),
+        Kernel("search_windows", search_windows, [unwarped], pixels),
         Kernel("census", lambda backend: _native.census(backend, padded, valid, census), [census], pixels),
         Kernel(
             "fit_offsets",

@@ -147,7 +147,35 @@ def unwarp_offsets(rng: Random) -> Arguments:
 def mean_offsets(rng: Random) -> Arguments:
     shape = size(rng)
     limits = [int(rng.integers(0, 11)), int(rng.choice([0, 1, 768, 1 << 20]))]
-    return [filled(rng, shape, np.int32), *limits, np.zeros(shape, np.int32)]
+    return [backend(rng), filled(rng, shape, np.int32), *limits, np.zeros(shape, np.int32)]
+
+
+def finer(rng: Random, shape: tuple[int, int]) -> tuple[int, int]:
+    """Size of the next finer level, seldom a wrong one."""
+    height, width = (max(2 * length - int(rng.integers(2)), 0) for length in shape)
+    return (height, width) if rng.random() < 0.9 else (height + 1, width + 1)
+
+
+def upsample_offsets(rng: Random) -> Arguments:
+    shape = size(rng)
+    return [
+        filled(rng, shape, np.int32),
+        int(rng.choice([0, 1024, 2**31 - 1])),
+        np.zeros(finer(rng, shape), np.int32),
+    ]
+
+
+def search_windows(rng: Random) -> Arguments:
+    shape = size(rng)
+    fine = finer(rng, shape)
+    limits = [int(32 * rng.integers(1, 4)), *rng.integers(0, 17, 2).tolist()]
+    bounds = [filled(rng, shape, np.float32) for _ in range(2)]
+    return [*bounds, filled(rng, fine, np.int32), *limits, np.zeros(fine, np.int32)]
+
+
+def to_disparity(rng: Random) -> Arguments:
+    shape = size(rng)
+    return [filled(rng, shape, np.int32), filled(rng, (256,), np.float32), np.zeros(shape, np.float32)]
 
 
 def transfer_disparity(rng: Random) -> Arguments:
@@ -307,6 +335,9 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         warp,
         unwarp_offsets,
         mean_offsets,
+        upsample_offsets,
+        search_windows,
+        to_disparity,
         transfer_disparity,
         depth_candidates,
         vote_depth,

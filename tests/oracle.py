@@ -190,6 +190,45 @@ def mean_offsets(offset, radius, max_step):
     return mean
 
 
+def upsample_offsets(offset, max_step, shape):
+    """Offsets (H, W) int32 at the pixels of the next finer level: interpolated where nine differ by little."""
+    fine = np.empty(shape, dtype=np.int32)
+    for y, x in np.ndindex(shape):
+        row, column = y // 2, x // 2
+        around = offset[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].astype(np.int64)
+        fine[y, x] = offset[row, column]
+        if around.max() - around.min() <= max_step:
+            # A quarter of a coarser pixel from its middle: three quarters of it, one of the next on this side.
+            rows, columns = (
+                (own, min(max(own + 2 * (place % 2) - 1, 0), size - 1))
+                for own, place, size in zip((row, column), (y, x), offset.shape, strict=True)
+            )
+            weights = [[9, 3], [3, 1]]
+            total = sum(
+                weights[j][i] * int(offset[r, c]) for j, r in enumerate(rows) for i, c in enumerate(columns)
+            )
+            fine[y, x] = (total + 8) // 16
+    return fine
+
+
+def search_windows(least, most, predicted, depth, clearance, own_clearance):
+    """First residuals (H, W) int32 to search; the window is moved by what sticks out of it, in 1/256 pixel."""
+    base = np.empty_like(predicted)
+    for y, x in np.ndindex(predicted.shape):
+        lowest, highest = (
+            min(max(float(values[y // 2, x // 2]) * 512, -(2**30)), 2**30) for values in (least, most)
+        )
+        room = 256 * (depth // 2 - clearance)
+        above = max(int(highest) - int(predicted[y, x]) - room, 0)
+        below = max(int(predicted[y, x]) - int(lowest) - room, 0)
+        shift = above - below
+        if above and below:
+            shift = abs(shift) // 2 * (1 if shift > 0 else -1)
+        limit = 256 * (depth // 2 - own_clearance)
+        base[y, x] = _nearest_256(min(max(shift, -limit), limit)) - depth // 2
+    return base
+
+
 def _nearest_256(value):
     return (value + 128) // 256
 

@@ -585,9 +585,9 @@ def test_unwarping_leads_to_the_column_that_was_warped(kind, margin, seed):
 # ---- means of offsets --------------------------------------------------------------------------------------
 
 
-def run_mean(offset, radius, max_step):
+def run_mean(backend, offset, radius, max_step):
     mean = np.full(offset.shape, 5, dtype=np.int32)
-    _native.mean_offsets(offset, radius, max_step, mean)
+    _native.mean_offsets(backend, offset, radius, max_step, mean)
     return mean
 
 
@@ -601,14 +601,14 @@ def run_mean(offset, radius, max_step):
 )
 def test_means_are_the_oracles(size, kind, radius, max_step, seed):
     offset = PREDICTIONS[kind](np.random.default_rng(seed), size).astype(np.int32)
-    np.testing.assert_array_equal(
-        run_mean(offset, radius, max_step), oracle.mean_offsets(offset, radius, max_step)
-    )
+    expected = oracle.mean_offsets(offset, radius, max_step)
+    for backend in BACKENDS:
+        np.testing.assert_array_equal(run_mean(backend, offset, radius, max_step), expected)
 
 
 def test_the_mean_of_a_plane_is_the_plane():
     offset = (70 * np.arange(40) - 50 * np.arange(30)[:, None] - 1000).astype(np.int32)
-    mean = run_mean(offset, 3, 360)
+    mean = run_mean("scalar", offset, 3, 360)
     np.testing.assert_array_equal(mean[3:-3, 3:-3], offset[3:-3, 3:-3])
     assert (mean[0] != offset[0]).any()
 
@@ -620,10 +620,93 @@ def test_means_leave_out_what_is_of_another_surface():
     far = np.tile(np.arange(40) >= 20, (40, 1))
     for step in (1400, -3000, INT32.max - 300):
         offset = np.where(far, step, 0) + noise
-        mean = run_mean(offset.astype(np.int32), 3, 768)
+        mean = run_mean("scalar", offset.astype(np.int32), 3, 768)
         assert np.abs(mean - np.where(far, step, 0)).max() < 150
     ends = np.where(far, INT32.max, INT32.min).astype(np.int32)
-    np.testing.assert_array_equal(run_mean(ends, 3, 768), ends)
+    np.testing.assert_array_equal(run_mean("scalar", ends, 3, 768), ends)
+
+
+# ---- from level to level -----------------------------------------------------------------------------------
+
+fine_sizes = st.tuples(st.integers(0, 9), st.integers(0, 33))
+
+
+def coarse(fine):
+    return tuple((size + 1) // 2 for size in fine)
+
+
+def run_upsample(offset, max_step, shape):
+    fine = np.full(shape, 5, dtype=np.int32)
+    _native.upsample_offsets(offset, max_step, fine)
+    return fine
+
+
+def run_windows(least, most, predicted, *limits):
+    base = np.full(predicted.shape, 5, dtype=np.int32)
+    _native.search_windows(least, most, predicted, *limits, base)
+    return base
+
+
+@property_test
+@given(
+    shape=fine_sizes,
+    kind=st.sampled_from(list(PREDICTIONS)),
+    max_step=st.sampled_from([0, 300, 1024, INT32.max]),
+    seed=seeds,
+)
+def test_offsets_of_the_finer_level_are_the_oracles(shape, kind, max_step, seed):
+    offset = PREDICTIONS[kind](np.random.default_rng(seed), coarse(shape)).astype(np.int32)
+    np.testing.assert_array_equal(
+        run_upsample(offset, max_step, shape), oracle.upsample_offsets(offset, max_step, shape)
+    )
+
+
+@pytest.mark.parametrize("shape", [(19, 39), (20, 40)])
+def test_a_plane_is_a_plane_at_the_finer_level(shape):
+    """Pixel x of the coarser level has its middle between 2 x and 2 x + 1 of the finer one."""
+    rows, columns = (np.arange(size) for size in coarse(shape))
+    offset = (32 * columns - 64 * rows[:, None] + 1000).astype(np.int32)
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    plane = 32 * (x - 0.5) / 2 - 64 * (y - 0.5) / 2 + 1000
+    fine = run_upsample(offset, 300, shape)
+    np.testing.assert_array_equal(fine[1:-1, 1:-1], plane[1:-1, 1:-1])
+    np.testing.assert_array_equal(run_upsample(offset, 50, shape)[2:-2, 2:-2], offset[y // 2, x // 2][2:-2, 2:-2])
+
+
+@property_test
+@given(
+    shape=fine_sizes,
+    reach=st.sampled_from([0, 3, 30, 1e9]),
+    limits=st.sampled_from([(32, 0, 0), (32, 4, 6), (32, 16, 16), (64, 4, 6), (1024, 500, 0)]),
+    seed=seeds,
+)
+def test_search_windows_are_the_oracles(shape, reach, limits, seed):
+    rng = np.random.default_rng(seed)
+    predicted = rng.integers(-20000, 20000, shape)
+    middle = rng.integers(-20000, 20000, coarse(shape)) / 512
+    least, most = (np.float32(middle + reach * sign * rng.random(middle.shape)) for sign in (-1, 1))
+    given_ = least, most, predicted.astype(np.int32), *limits
+    np.testing.assert_array_equal(run_windows(*given_), oracle.search_windows(*given_))
+
+
+def test_windows_hold_what_fits():
+    """By as much as the clearance, in the middle of the window where there is nothing else."""
+    least, most = np.float32([[-3, -3, -20]]), np.float32([[2, 5, 20]])
+    base = run_windows(least, most, np.zeros((2, 6), np.int32), 32, 4, 6)
+    # -6 to 4, -6 to 10 and -40 to 40 pixels; at most 12 fit on either side of the middle.
+    np.testing.assert_array_equal(base, np.repeat([[-16, -16, -16]], 2, axis=1).repeat(2, axis=0))
+    base = run_windows(least, most, np.full((2, 6), 10 * 256, np.int32), 32, 4, 6)
+    # 10 pixels further, the former two lie from -16 on; the window moves by 4. The last has 18 more before it.
+    np.testing.assert_array_equal(base, np.repeat([[-20, -20, -26]], 2, axis=1).repeat(2, axis=0))
+
+
+def test_disparities_are_offsets_less_their_shift():
+    offset = np.array([[0, 256, -257, 1, oracle.OFFSET_INVALID, INT32.max]], np.int32)
+    shifts = (np.arange(256) / 4096).astype(np.float32)
+    disparity = np.full(offset.shape, 5, np.float32)
+    _native.to_disparity(offset, shifts, disparity)
+    expected = [0, -1, 257 / 256 - 255 / 4096, -1 / 256 - 1 / 4096, np.nan, -(2.0**23) - 255 / 4096]
+    np.testing.assert_allclose(disparity[0], expected, rtol=1e-7)
 
 
 # ---- the whole chain ---------------------------------------------------------------------------------------

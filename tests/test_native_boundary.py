@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import itertools
 import re
 
 import numpy as np
@@ -93,10 +94,30 @@ def arguments(function):
             "out unwarped": np.zeros((H, W), np.int32),
         },
         "mean_offsets": {
+            "backend": "scalar",
             "offset": np.zeros((H, W), np.int32),
             "radius": 2,
             "max_step": 300,
             "out mean": np.zeros((H, W), np.int32),
+        },
+        "upsample_offsets": {
+            "offset": np.zeros((H, W), np.int32),
+            "max_step": 300,
+            "out fine": np.zeros((2 * H, 2 * W - 1), np.int32),
+        },
+        "search_windows": {
+            "least": np.zeros((H, W), f32),
+            "most": np.zeros((H, W), f32),
+            "predicted": np.zeros((2 * H - 1, 2 * W), np.int32),
+            "depth": 32,
+            "clearance": 4,
+            "own_clearance": 6,
+            "out base": np.zeros((2 * H - 1, 2 * W), np.int32),
+        },
+        "to_disparity": {
+            "offset": np.zeros((H, W), np.int32),
+            "shifts": np.zeros(256, f32),
+            "out disparity": np.zeros((H, W), f32),
         },
         "transfer_disparity": {
             "left": np.zeros((H, W), f32),
@@ -276,6 +297,9 @@ FUNCTIONS = [
     "warp",
     "unwarp_offsets",
     "mean_offsets",
+    "upsample_offsets",
+    "search_windows",
+    "to_disparity",
     "transfer_disparity",
     "depth_candidates",
     "vote_depth",
@@ -307,6 +331,7 @@ FREE = {
     ("matching_cost", "target"): {1},
     ("fit_offsets", "target"): {1},
     ("warp", "prediction"): {1},
+    ("upsample_offsets", "out fine"): {0, 1},  # one less than twice as many will do, see below
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -602,6 +627,39 @@ def test_bounds_of_means_are_kept(name, most):
             call("mean_offsets", {**arguments("mean_offsets"), name: value})
 
 
+@pytest.mark.parametrize("function", ["upsample_offsets", "search_windows"])
+@pytest.mark.parametrize("size", [(2 * H + 1, 2 * W), (2 * H, 2 * W + 1), (2 * H - 2, 2 * W), (H, W), (0, 0)])
+def test_levels_of_other_sizes_are_refused(function, size):
+    values = arguments(function)
+    fine = {name: np.zeros(size, np.int32) for name in ("out fine", "predicted", "out base") if name in values}
+    with pytest.raises(ValueError, match="twice the size"):
+        call(function, {**values, **fine})
+
+
+def test_bounds_of_search_windows_are_kept():
+    values = arguments("search_windows")
+    for name in ("clearance", "own_clearance"):
+        for value in (0, 16):
+            call("search_windows", {**values, name: value})
+        for value in (-1, 17, 2**31 - 1, -(2**31)):
+            with pytest.raises(ValueError, match="clearance"):
+                call("search_windows", {**values, name: value})
+    for value in (0, 31, -32, 1056):
+        with pytest.raises(ValueError, match="multiple of 32"):
+            call("search_windows", {**values, "depth": value})
+    with pytest.raises(ValueError, match="max_step"):
+        call("upsample_offsets", {**arguments("upsample_offsets"), "max_step": -1})
+
+
+def test_windows_about_numbers_out_of_this_world():
+    values = arguments("search_windows")
+    for least, most in itertools.product(np.float32([np.nan, np.inf, -np.inf, 3e38, -3e38]), repeat=2):
+        values["least"], values["most"] = (np.full((H, W), value) for value in (least, most))
+        values["predicted"][:] = np.random.default_rng(0).choice([-(2**31), 0, 2**31 - 1], (2 * H - 1, 2 * W))
+        call("search_windows", values)
+        assert (np.abs(values["out base"] + 16) <= 10).all()
+
+
 def test_negative_slant_is_refused():
     with pytest.raises(ValueError, match="slant"):
         call("aggregation", {**arguments("aggregation"), "max_slant": -1})
@@ -760,7 +818,9 @@ def test_empty_images_are_no_work(backend, size, target_width):
     offset = np.zeros(size, np.int32)
     _native.selection(backend, sums, base, words, target, *shown, 2, 0, offset)
     _native.unwarp_offsets(offset, base, 65535, offset.copy())
-    _native.mean_offsets(offset, 10, 1 << 20, offset.copy())
+    _native.mean_offsets(backend, offset, 10, 1 << 20, offset.copy())
+    _native.upsample_offsets(offset, 0, np.zeros((2 * size[0], 2 * size[1]), np.int32))
+    _native.to_disparity(offset, np.zeros(256, np.float32), np.zeros(size, np.float32))
 
 
 @every_backend

@@ -6,8 +6,16 @@ from scipy import ndimage
 
 from colmap_sph.errors import RectificationError
 from colmap_sph.stereo.disparity_range import columns_with_counterparts, few_digits, parallax_range
+from colmap_sph.stereo.search import prediction as prediction_module
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
-from colmap_sph.stereo.search.prediction import Prediction, about_coarser, from_coarser, from_seeds, searched_depth
+from colmap_sph.stereo.search.prediction import (
+    Prediction,
+    about_coarser,
+    from_coarser,
+    from_seeds,
+    is_flat,
+    searched_depth,
+)
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, STEP, num_levels, range_depth
 
 
@@ -124,10 +132,23 @@ def finer(slope: float, size: int) -> np.ndarray:
     return 2 * slope * (np.arange(size) - 0.5) / 2
 
 
+def warped(
+    monkeypatch: pytest.MonkeyPatch,
+    offset: np.ndarray,
+    prior: Prediction,
+    shape: tuple[int, int],
+    depth: int,
+    radius: int,
+) -> Prediction:
+    """What is searched of a level that is warped even where it is flat."""
+    monkeypatch.setattr(prediction_module, "is_flat", lambda _: False)
+    return from_coarser(offset, prior, shape, depth, radius, (-1000, 1000))
+
+
 @pytest.mark.parametrize("slope", [0.3, -0.7])
-def test_a_slanted_surface_is_predicted_where_it_is(slope: float) -> None:
+def test_a_slanted_surface_is_predicted_where_it_is(slope: float, monkeypatch: pytest.MonkeyPatch) -> None:
     offset = np.tile(slope * np.arange(60), (50, 1))
-    prediction = from_coarser(steps(offset), prior_of(0 * offset), (99, 119), 32, 4)
+    prediction = warped(monkeypatch, steps(offset), prior_of(0 * offset), (99, 119), 32, 4)
     assert prediction.offset.shape == prediction.base.shape == (99, 119)
     assert prediction.depth == 32
     inner = np.s_[:, 14:-14]
@@ -137,40 +158,42 @@ def test_a_slanted_surface_is_predicted_where_it_is(slope: float) -> None:
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.4])
-def test_gaps_are_filled_along_what_was_predicted(slope: float) -> None:
+def test_gaps_are_filled_along_what_was_predicted(slope: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """A surface five pixels from the predicted one, and parallel to it, with holes."""
     prior = np.tile(slope * np.arange(60), (50, 1))
     offset = steps(prior + 5)
     offset[20:35, 20:40] = INVALID
     offset[5, 7] = INVALID
-    prediction = from_coarser(offset, prior_of(prior), (100, 120), 32, 4)
+    prediction = warped(monkeypatch, offset, prior_of(prior), (100, 120), 32, 4)
     assert np.abs(prediction.offset / SUBPIXEL - 10 - finer(slope, 120))[:, 14:-14].max() < 0.02
 
 
-def test_a_level_without_any_match_leaves_what_was_predicted() -> None:
+def test_a_level_without_any_match_leaves_what_was_predicted(monkeypatch: pytest.MonkeyPatch) -> None:
     prior = np.tile(0.4 * np.arange(60), (50, 1))
-    prediction = from_coarser(np.full(prior.shape, INVALID, np.int32), prior_of(prior), (100, 120), 64, 4)
+    prediction = warped(monkeypatch, np.full(prior.shape, INVALID, np.int32), prior_of(prior), (100, 120), 64, 4)
     assert np.abs(prediction.offset / SUBPIXEL - finer(0.4, 120))[:, 14:-14].max() < 0.02
 
 
-def test_one_outlier_predicts_nothing() -> None:
+def test_one_outlier_predicts_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     offset = np.zeros((30, 30), np.int32)
     offset[12, 17] = 90 * SUBPIXEL
-    prediction = from_coarser(offset, prior_of(np.zeros((30, 30))), (60, 60), 32, 4)
+    prediction = warped(monkeypatch, offset, prior_of(np.zeros((30, 30))), (60, 60), 32, 4)
     assert not prediction.offset.any()
     assert (prediction.base == -16).all()
 
 
-def test_noise_of_a_surface_is_averaged() -> None:
+def test_noise_of_a_surface_is_averaged(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     offset = rng.normal(0, 0.3, (60, 80))
-    prediction = from_coarser(steps(offset), prior_of(np.zeros((60, 80))), (120, 160), 32, 4)
+    prediction = warped(monkeypatch, steps(offset), prior_of(np.zeros((60, 80))), (120, 160), 32, 4)
     assert (prediction.offset / SUBPIXEL / 2).std() < 0.1
 
 
 @pytest.mark.parametrize("depth", [32, 64])
 @pytest.mark.parametrize("radius", [0, 2, 4])
-def test_the_window_holds_all_offsets_around_where_they_fit(depth: int, radius: int) -> None:
+def test_the_window_holds_all_offsets_around_where_they_fit(
+    depth: int, radius: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Blocks of some pixels, of which some are alike and others differ by much; windows see their median.
 
     What is predicted is a mean over pixels up to three columns away and three pixels off, which a smaller radius
@@ -179,7 +202,7 @@ def test_the_window_holds_all_offsets_around_where_they_fit(depth: int, radius: 
     rng = np.random.default_rng(depth + radius)
     blocks = np.kron(rng.integers(-12, 13, (6, 8)), np.ones((9, 9), int))
     blocks[:, :36] //= 3
-    prediction = from_coarser(steps(blocks), prior_of(0.0 * blocks), (108, 144), depth, radius)
+    prediction = warped(monkeypatch, steps(blocks), prior_of(0.0 * blocks), (108, 144), depth, radius)
     first, last = prediction.first, prediction.first + depth - 1
     own = 2 * ndimage.median_filter(blocks, 5, mode="nearest")
     fitting = 0
@@ -192,12 +215,12 @@ def test_the_window_holds_all_offsets_around_where_they_fit(depth: int, radius: 
     assert fitting > 108 * 144 // 3
 
 
-def test_a_step_is_searched_for_on_both_sides() -> None:
+def test_a_step_is_searched_for_on_both_sides(monkeypatch: pytest.MonkeyPatch) -> None:
     """A window that fits holds both surfaces; one that does not holds each pixel's own, with room for its fit."""
     for step in (5, 40):
         offset = np.zeros((40, 60), np.int32)
         offset[:, 30:] = step * SUBPIXEL
-        prediction = from_coarser(offset, prior_of(np.zeros((40, 60))), (80, 120), 32, 4)
+        prediction = warped(monkeypatch, offset, prior_of(np.zeros((40, 60))), (80, 120), 32, 4)
         truth = np.where(np.arange(120) < 60, 0, 2 * step)
         room = np.minimum(truth - prediction.first, prediction.first + 31 - truth)
         assert room.min() >= (4 if step == 5 else 5)
@@ -221,7 +244,7 @@ def test_the_first_offset_is_the_rounded_prediction_and_the_base() -> None:
 def middles(
     offset: np.ndarray, shape: tuple[int, int], depth: int, low: int, high: int, radius: int
 ) -> np.ndarray:
-    prediction = about_coarser(offset, shape, depth, radius, low, high)
+    prediction = about_coarser(offset, shape, depth, radius, (low, high))
     assert not prediction.warps and prediction.margin == 0 and not prediction.offset.any()
     np.testing.assert_array_equal(prediction.first, prediction.base)
     return prediction.base
@@ -236,7 +259,7 @@ def test_a_level_is_flat_where_few_surfaces_are_steep(steep: float, flat: bool, 
     profile = np.cumsum(slope) + 30 * (place // 50 % 2)
     offset = steps(np.broadcast_to(profile, (60, 400)))
     offset = np.ascontiguousarray(offset.T if axis == 0 else offset)
-    assert Prediction(offset, np.zeros_like(offset), 32).is_flat() == flat
+    assert is_flat(offset) == flat
 
 
 def test_without_warping_a_slanted_surface_is_searched_for() -> None:

@@ -1,15 +1,17 @@
 """What a level's left image is compared with: warped, as it is at edges, and from two starts."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
 from scipy import ndimage
 
-from colmap_sph.stereo import matching
 from colmap_sph.stereo.census import CENSUS_INVALID, RectifiedImage, census
 from colmap_sph.stereo.matching import MatchingOptions, match_pair
+from colmap_sph.stereo.search import prediction as prediction_module
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
-from colmap_sph.stereo.search.prediction import Prediction, with_tears
+from colmap_sph.stereo.search.prediction import Prediction, torn_by
 from colmap_sph.stereo.search.target import Matches, Target, make_target
 
 
@@ -27,6 +29,13 @@ def unwarped(base: np.ndarray | int, shape: tuple[int, int]) -> Prediction:
 def torn_of(prediction: Prediction) -> np.ndarray:
     assert prediction.torn is not None
     return prediction.torn
+
+
+def with_tears(warped: Prediction, other: Prediction) -> Prediction:
+    torn = torn_by(warped.offset)
+    if not torn.any():
+        return warped
+    return replace(warped, base=np.where(torn, other.base, warped.base), torn=torn)
 
 
 # ---- tears -------------------------------------------------------------------------------------------------
@@ -190,5 +199,5 @@ def test_edges_on_a_slope_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     near = ndimage.binary_dilation(scene.is_object, iterations=8)
     near &= ~ndimage.binary_erosion(scene.is_object, iterations=8)
     right = scene.right_share(near, None)
-    monkeypatch.setattr(matching, "with_tears", lambda warped, _: warped)
+    monkeypatch.setattr(prediction_module, "torn_by", lambda offset: np.zeros(offset.shape, bool))
     assert right > scene.right_share(near, None) + 0.03

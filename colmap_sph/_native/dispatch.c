@@ -36,6 +36,7 @@
      selection_##version, \
      match_##version, \
      fit_offsets_##version, \
+     mean_offsets_##version, \
      depth_candidates_##version, \
      compare_depths_##version, \
      fit_planes_##version, \

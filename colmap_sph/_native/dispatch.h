@@ -13,6 +13,7 @@ typedef struct {
     selection_fn *selection;
     match_fn *match;
     fit_offsets_fn *fit_offsets;
+    mean_offsets_fn *mean_offsets;
     depth_candidates_fn *depth_candidates;
     compare_depths_fn *compare_depths;
     fit_planes_fn *fit_planes;

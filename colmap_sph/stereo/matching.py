@@ -21,11 +21,9 @@ from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
 from colmap_sph.stereo.search.prediction import (
     Prediction,
-    about_coarser,
     from_coarser,
     from_seeds,
     searched_depth,
-    with_tears,
 )
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
 from colmap_sph.stereo.search.seeds import Seeds
@@ -225,10 +223,7 @@ def match_pair(
         if offset is None:
             prediction = from_seeds(seeds, shape, level, low, high)
         else:
-            prediction = from_coarser(offset, prediction, shape, depth, options.range_radius)
-            np.clip(prediction.offset, low * SUBPIXEL, high * SUBPIXEL, out=prediction.offset)
-            unwarped = about_coarser(offset, shape, depth, options.range_radius, low, high)
-            prediction = unwarped if prediction.is_flat() else with_tears(prediction, unwarped)
+            prediction = from_coarser(offset, prediction, shape, depth, options.range_radius, (low, high))
         unseeded: Matches | None = None
         if offset is None and level > 0 and seeds is not None and len(seeds):
             whole_range = from_seeds(None, shape, level, low, high)

@@ -39,6 +39,17 @@ static int check_left_right(int max_difference, int max_excess) {
            check(max_excess >= 0, "the excess must not be negative");
 }
 
+/* The next finer level has twice as many rows and columns, or one less. */
+static int check_finer(const sizes *size) {
+    return check_width(size->FINE_W) &&
+           check((size->FINE_H + 1) / 2 == size->H && (size->FINE_W + 1) / 2 == size->W,
+                 "the finer level must have twice the size, or one less");
+}
+
+static level_sizes level_sizes_of(const sizes *size) {
+    return (level_sizes){size->H, size->W, size->FINE_H, size->FINE_W};
+}
+
 static match_size match_size_of(const sizes *size) {
     return (match_size){size->H, size->W, size->TARGET_W, size->D, 0};
 }
@@ -259,6 +270,7 @@ FUNCTION(unwarp_offsets, UNWARP_OFFSETS, check_unwarp_offsets,
          "Offsets in a warped image, 1/256 pixel, to those in the image that it was warped from.");
 
 #define MEAN_OFFSETS(X) \
+    X(VALUE, backend, backend) \
     X(IN, int32, offset, H, W) \
     X(VALUE, int, radius) \
     X(VALUE, int, max_step) \
@@ -278,7 +290,7 @@ static int run_mean_offsets(void *arguments) {
     if (!sums) {
         return -1;
     }
-    mean_offsets(a->offset, a->size.H, a->size.W, a->radius, a->max_step, sums, a->mean);
+    a->backend->mean_offsets(a->offset, a->size.H, a->size.W, a->radius, a->max_step, sums, a->mean);
     free(sums);
     return 0;
 }
@@ -286,8 +298,82 @@ static int run_mean_offsets(void *arguments) {
 FUNCTION(mean_offsets, MEAN_OFFSETS, check_mean_offsets,
          "Of every offset the mean of those near it that differ from it by no more than `max_step`.");
 
-native_function *const matching_functions[] = {&census_function,       &matching_cost_function,
-                                               &aggregation_function,  &selection_function,
-                                               &match_function,        &fit_offsets_function,
-                                               &warp_function,         &unwarp_offsets_function,
-                                               &mean_offsets_function, NULL};
+#define UPSAMPLE_OFFSETS(X) \
+    X(IN, int32, offset, H, W) \
+    X(VALUE, int, max_step) \
+    X(OUT, int32, fine, FINE_H, FINE_W)
+ARGUMENTS(upsample_offsets, UPSAMPLE_OFFSETS);
+
+static int check_upsample_offsets(const void *arguments) {
+    const upsample_offsets_arguments *a = arguments;
+    return check_finer(&a->size) && check(a->max_step >= 0, "max_step must not be negative");
+}
+
+static int run_upsample_offsets(void *arguments) {
+    const upsample_offsets_arguments *a = arguments;
+    upsample_offsets(a->offset, level_sizes_of(&a->size), a->max_step, a->fine);
+    return 0;
+}
+
+FUNCTION(upsample_offsets, UPSAMPLE_OFFSETS, check_upsample_offsets,
+         "A level's offsets at the pixels of the next finer one, interpolated on surfaces, repeated at steps.");
+
+#define SEARCH_WINDOWS(X) \
+    X(IN, float32, least, H, W) \
+    X(IN, float32, most, H, W) \
+    X(IN, int32, predicted, FINE_H, FINE_W) \
+    X(VALUE, int, depth) \
+    X(VALUE, int, clearance) \
+    X(VALUE, int, own_clearance) \
+    X(OUT, int32, base, FINE_H, FINE_W)
+ARGUMENTS(search_windows, SEARCH_WINDOWS);
+
+static int check_search_windows(const void *arguments) {
+    const search_windows_arguments *a = arguments;
+    return check_finer(&a->size) &&
+           check(a->depth > 0 && a->depth <= MAX_DEPTH && a->depth % DEPTH_STEP == 0,
+                 "the number of disparities must be a multiple of 32, at most 1024") &&
+           check(a->clearance >= 0 && a->clearance <= a->depth / 2 && a->own_clearance >= 0 &&
+                     a->own_clearance <= a->depth / 2,
+                 "a clearance must lie between 0 and half the number of disparities");
+}
+
+static int run_search_windows(void *arguments) {
+    const search_windows_arguments *a = arguments;
+    const search_limits limits = {a->depth, a->clearance, a->own_clearance};
+    search_windows(a->predicted, a->least, a->most, level_sizes_of(&a->size), limits, a->base);
+    return 0;
+}
+
+FUNCTION(
+    search_windows, SEARCH_WINDOWS, check_search_windows,
+    "First residuals to search about predicted offsets, by the least and most of the level above around them.");
+
+#define TO_DISPARITY(X) \
+    X(IN, int32, offset, H, W) \
+    X(IN, float32, shifts, 256) \
+    X(OUT, float32, disparity, H, W)
+ARGUMENTS(to_disparity, TO_DISPARITY);
+
+static int run_to_disparity(void *arguments) {
+    const to_disparity_arguments *a = arguments;
+    to_disparity(a->offset, a->size.H * a->size.W, a->shifts, a->disparity);
+    return 0;
+}
+
+FUNCTION(to_disparity, TO_DISPARITY, any,
+         "Disparities, pixels, of offsets, less the shift of their fraction; NaN where there is no offset.");
+
+native_function *const matching_functions[] = {&census_function,
+                                               &matching_cost_function,
+                                               &aggregation_function,
+                                               &selection_function,
+                                               &match_function,
+                                               &fit_offsets_function,
+                                               &warp_function,
+                                               &unwarp_offsets_function,
+                                               &mean_offsets_function,
+                                               &upsample_offsets_function,
+                                               &search_windows_function,
+                                               &to_disparity_function,
+                                               NULL};

@@ -103,10 +103,34 @@ void unwarp_offsets(const int32_t *offset, const int32_t *prediction, ptrdiff_t 
 
 /* Every offset becomes the mean, rounded towards itself, of those within `radius` of it that differ from it by no
  * more than `max_step`. `sums` has room for two rows. */
-void mean_offsets(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int radius, int max_step,
-                  int32_t *sums, int32_t *mean);
+typedef void mean_offsets_fn(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int radius, int max_step,
+                             int32_t *sums, int32_t *mean);
+
+/* A level and the next finer one, of twice as many rows and columns or one less. */
+typedef struct {
+    ptrdiff_t height, width, fine_height, fine_width;
+} level_sizes;
+
+/* Offsets of a level's pixels at those of the next finer one: interpolated where 3 x 3 of them differ by no more
+ * than `max_step`, else repeated. */
+void upsample_offsets(const int32_t *offset, level_sizes size, int max_step, int32_t *fine);
+
+/* What the pixels of a level search about their predicted offsets (1/256 pixel), so many residuals each: the first
+ * one, in pixels. It is half of them before the prediction, or as near to that as leaves `clearance` beyond the
+ * least and the most offset of the neighbourhood, in pixels of the level above; where both do not fit, halfway
+ * between them. The prediction itself is left `own_clearance`. */
+typedef struct {
+    int depth, clearance, own_clearance;
+} search_limits;
+
+void search_windows(const int32_t *predicted, const float *least, const float *most, level_sizes size,
+                    search_limits limits, int32_t *base);
+
+/* Disparities in pixels, minus the offsets and what `shifts` says by their fraction; NaN where there is none. */
+void to_disparity(const int32_t *offset, ptrdiff_t pixels, const float *shifts, float *disparity);
 
 census_fn census_scalar, census_avx2;
 fit_offsets_fn fit_offsets_scalar, fit_offsets_avx2, fit_offsets_avx512;
+mean_offsets_fn mean_offsets_scalar, mean_offsets_avx2, mean_offsets_avx512;
 
 #endif

@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph import _native
+
 INVALID = np.iinfo(np.int32).min
 """The offset of a pixel that has none."""
 SUBPIXEL = 256
@@ -61,10 +63,8 @@ def remove_small_segments(offset: NDArray[np.int32], min_segment: int) -> None:
 
 def to_disparity(offset: NDArray[np.int32]) -> NDArray[np.float32]:
     """(H, W) disparities, pixels, of (H, W) offsets, without pixel locking; NaN where there is no offset."""
-    disparity = offset.astype(np.float32)
-    disparity *= np.float32(-1 / SUBPIXEL)
-    disparity -= evening_shifts(offset)[offset & (SUBPIXEL - 1)]
-    disparity[offset == INVALID] = np.nan
+    disparity = np.empty(offset.shape, dtype=np.float32)
+    _native.to_disparity(offset, evening_shifts(offset), disparity)
     return disparity
 
 

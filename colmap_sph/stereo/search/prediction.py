@@ -8,13 +8,14 @@ windows that are compared show the same. Offsets are those of `offsets`; *residu
 predicted ones by.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
+from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.search.offsets import INVALID, MEDIAN_SIDE, SUBPIXEL
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, range_depth
 from colmap_sph.stereo.search.seeds import Seeds, interpolated_disparity
@@ -77,15 +78,6 @@ class Prediction:
         first += self.base
         return first if self.torn is None else np.where(self.torn, self.base, first)
 
-    def is_flat(self) -> bool:
-        """Whether hardly any surface is stretched or slanted."""
-        places = self.offset[::2, ::2]
-        across = np.abs(np.diff(places, axis=1)[:-1])
-        slope = np.maximum(across, np.abs(np.diff(places, axis=0)[:, :-1]))
-        surface = int(np.count_nonzero(slope <= 2 * _EDGE * SUBPIXEL))
-        steep = surface - int(np.count_nonzero(slope <= 2 * _STEEP * SUBPIXEL))
-        return steep <= _FLAT_SHARE * surface
-
     @property
     def margin(self) -> int:
         """Columns of a warped image beyond the sides of the reference that are searched from inside of it."""
@@ -122,13 +114,14 @@ def from_seeds(seeds: Seeds | None, shape: tuple[int, ...], level: int, low: int
 
 
 def from_coarser(
-    offset: NDArray[np.int32], prior: Prediction, shape: tuple[int, ...], depth: int, radius: int
+    offset: NDArray[np.int32],
+    prior: Prediction,
+    shape: tuple[int, ...],
+    depth: int,
+    radius: int,
+    offsets: tuple[int, int],
 ) -> Prediction:
     """What a level searches, from the offsets of the level above.
-
-    A pixel searches about its predicted offset, or with the window shifted so that all offsets of its
-    neighbourhood lie inside, where they fit. What was not found lies as far from what was predicted as the nearest
-    that was.
 
     Parameters
     ----------
@@ -141,87 +134,86 @@ def from_coarser(
     depth : int
         Number of residuals that a pixel searches.
     radius : int
-        Of the neighbourhood, pixels of the coarser level.
-
-    Returns
-    -------
-    Prediction
-    """
-    own = _filled(offset, prior)
-    predicted = _upsample(2 * _mean_on_surfaces(own), shape)
-    least, most = (_repeated(2 * values, shape) for values in _neighbourhood(own, radius))
-    del own
-    half = depth / 2
-    # In place: arrays of the finer level are large.
-    above = np.maximum(np.subtract(most, predicted, out=most) + (_CLEARANCE - half), 0, out=most)
-    below = np.maximum(np.subtract(predicted, least, out=least) + (_CLEARANCE - half), 0, out=least)
-    # Where the neighbourhood does not fit, towards its middle.
-    both = (above > 0) & (below > 0)
-    shift = np.subtract(above, below, out=above)
-    shift[both] /= 2
-    limit = half - _OWN_CLEARANCE
-    np.clip(shift, -limit, limit, out=shift)
-    shift -= half
-    base = np.round(shift, out=shift).astype(np.int32)
-    del most, least, above, below, both, shift
-    return Prediction(_in_steps(predicted), base, depth)
-
-
-def about_coarser(
-    offset: NDArray[np.int32], shape: tuple[int, ...], depth: int, radius: int, low: int, high: int
-) -> Prediction:
-    """What a level searches without warping: about the middle of each neighbourhood's offsets.
-
-    Parameters
-    ----------
-    offset, shape, depth, radius
-        As of `from_coarser`.
-    low, high : int
+        Of the neighbourhood whose offsets a pixel searches, too, pixels of the coarser level.
+    offsets : (int, int)
         Least and most offset, pixels of the finer level.
 
     Returns
     -------
     Prediction
+        Warps, unless hardly any surface is stretched or slanted.
     """
-    valid = offset != INVALID
-    if not valid.any():
-        base = np.full(shape, (low + high - depth) // 2, dtype=np.int32)
-        return Prediction(np.zeros_like(base), base, depth, warps=False)
-    own = _median(_fill_nearest(_in_pixels(offset), valid))
+    own = _filled(offset, prior)
+    predicted = _upsampled(2 * _mean_on_surfaces(own), shape)
+    low, high = offsets
+    np.clip(predicted, low * SUBPIXEL, high * SUBPIXEL, out=predicted)
+    if is_flat(predicted):
+        return about_coarser(offset, shape, depth, radius, offsets)
     least, most = _neighbourhood(own, radius)
+    base = np.empty_like(predicted)
+    _native.search_windows(least, most, predicted, depth, _CLEARANCE, _OWN_CLEARANCE, base)
+    torn = torn_by(predicted)
+    if not torn.any():
+        return Prediction(predicted, base, depth)
+    np.copyto(base, _windows_about(own, least, most, shape, depth, offsets), where=torn)
+    return Prediction(predicted, base, depth, torn=torn)
+
+
+def about_coarser(
+    offset: NDArray[np.int32], shape: tuple[int, ...], depth: int, radius: int, offsets: tuple[int, int]
+) -> Prediction:
+    """What a level searches without warping."""
+    valid = offset != INVALID
+    if valid.any():
+        own = _median(_fill_nearest(_in_pixels(offset), valid))
+        base = _windows_about(own, *_neighbourhood(own, radius), shape, depth, offsets)
+    else:
+        base = np.full(shape, (sum(offsets) - depth) // 2, dtype=np.int32)
+    return Prediction(np.zeros_like(base), base, depth, warps=False)
+
+
+def _windows_about(
+    own: NDArray[np.float32],
+    least: NDArray[np.float32],
+    most: NDArray[np.float32],
+    shape: tuple[int, ...],
+    depth: int,
+    offsets: tuple[int, int],
+) -> NDArray[np.int32]:
+    """First offsets to search without warping, pixels: about the middle of each neighbourhood's offsets."""
     fits = 2 * (most - least) <= depth - 2 * _CLEARANCE
     # A little towards the neighbourhood's middle even where it does not fit.
     reach = np.float32((depth - 2 * _OWN_CLEARANCE) / 4)
     middle = (least + most) / 2
     centre = 2 * np.where(fits, middle, np.clip(middle, own - reach, own + reach))
-    fine = np.round(_upsample(centre, shape) - depth / 2).astype(np.int32)
+    base = _upsampled(_in_steps(centre), shape)
+    base += SUBPIXEL // 2
+    base //= SUBPIXEL
+    base -= depth // 2
+    low, high = offsets
     first = low - SPARE
-    base = np.clip(fine, first, max(high + 1 + SPARE - depth, first))
-    return Prediction(np.zeros_like(base), base, depth, warps=False)
+    return np.clip(base, first, max(high + 1 + SPARE - depth, first), out=base)
 
 
-def with_tears(warped: Prediction, unwarped: Prediction) -> Prediction:
-    """The one prediction, and near its steps the other.
+def is_flat(predicted: NDArray[np.int32]) -> bool:
+    """Whether hardly any surface is stretched or slanted."""
+    places = predicted[::2, ::2]
+    across = np.abs(np.diff(places, axis=1)[:-1])
+    slope = np.maximum(across, np.abs(np.diff(places, axis=0)[:, :-1]))
+    surface = int(np.count_nonzero(slope <= 2 * _EDGE * SUBPIXEL))
+    steep = surface - int(np.count_nonzero(slope <= 2 * _STEEP * SUBPIXEL))
+    return steep <= _FLAT_SHARE * surface
 
-    Parameters
-    ----------
-    warped, unwarped : Prediction
-        Of the same pixels, from `from_coarser` and `about_coarser`.
 
-    Returns
-    -------
-    Prediction
-    """
-    steps = np.zeros(warped.offset.shape, dtype=np.uint8)
-    across, down = (np.abs(np.diff(warped.offset, axis=axis)) > _TEAR * SUBPIXEL for axis in (1, 0))
+def torn_by(predicted: NDArray[np.int32]) -> NDArray[np.bool_]:
+    """(H, W) bool: what lies as near to a step of the prediction as a window reaches."""
+    steps = np.zeros(predicted.shape, dtype=np.uint8)
+    across, down = (np.abs(np.diff(predicted, axis=axis)) > _TEAR * SUBPIXEL for axis in (1, 0))
     steps[:, 1:] |= across
     steps[:, :-1] |= across
     steps[1:] |= down
     steps[:-1] |= down
-    torn = cv2.dilate(steps, np.ones((2 * _TORN_RADIUS + 1,) * 2, dtype=np.uint8)) > 0
-    if not torn.any():
-        return warped
-    return replace(warped, base=np.where(torn, unwarped.base, warped.base), torn=torn)
+    return np.asarray(cv2.dilate(steps, np.ones((2 * _TORN_RADIUS + 1,) * 2, dtype=np.uint8)) > 0)
 
 
 def searched_depth(low: int, high: int, most: int) -> int:
@@ -250,11 +242,11 @@ def _median(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.asarray(cv2.medianBlur(values, MEDIAN_SIDE), dtype=np.float32)
 
 
-def _mean_on_surfaces(offset: NDArray[np.float32]) -> NDArray[np.float32]:
+def _mean_on_surfaces(offset: NDArray[np.float32]) -> NDArray[np.int32]:
     steps = _in_steps(offset)
     mean = np.empty_like(steps)
-    _native.mean_offsets(steps, _MEAN_RADIUS, _MAX_STEP * SUBPIXEL, mean)
-    return _in_pixels(mean)
+    _native.mean_offsets(backend(), steps, _MEAN_RADIUS, _MAX_STEP * SUBPIXEL, mean)
+    return mean
 
 
 def _neighbourhood(values: NDArray[np.float32], radius: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -263,19 +255,11 @@ def _neighbourhood(values: NDArray[np.float32], radius: int) -> tuple[NDArray[np
     return np.asarray(cv2.erode(values, window)), np.asarray(cv2.dilate(values, window))
 
 
-def _repeated(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Twice the size, cut to `shape`."""
-    doubled = (2 * values.shape[1], 2 * values.shape[0])
-    return np.asarray(cv2.resize(values, doubled, interpolation=cv2.INTER_NEAREST)[: shape[0], : shape[1]])
-
-
-def _upsample(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Twice the size, cut to `shape`: interpolated on surfaces and repeated at steps."""
-    doubled = (2 * values.shape[1], 2 * values.shape[0])
-    least, most = _neighbourhood(values, 1)
-    flat = (most - least <= _MAX_SURFACE_STEP).astype(np.float32)
-    interpolated = cv2.resize(values, doubled, interpolation=cv2.INTER_LINEAR)[: shape[0], : shape[1]]
-    return np.where(_repeated(flat, shape) > 0, interpolated, _repeated(values, shape))
+def _upsampled(offset: NDArray[np.int32], shape: tuple[int, ...]) -> NDArray[np.int32]:
+    """At the next finer level's pixels, of which the offsets are: interpolated on surfaces, repeated at steps."""
+    fine = np.empty(shape, dtype=np.int32)
+    _native.upsample_offsets(offset, _MAX_SURFACE_STEP * SUBPIXEL, fine)
+    return fine
 
 
 def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:

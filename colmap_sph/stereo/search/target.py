@@ -139,8 +139,9 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     # Windows of torn pixels that begin left of the right image must not reach what lies before it here.
     gap = prediction.depth
     as_it_is = words.shape[1] + gap
-    both = np.full((height, as_it_is + right_width), CENSUS_INVALID)
+    both = np.empty((height, as_it_is + right_width), dtype=np.uint64)
     both[:, : words.shape[1]] = words
+    both[:, words.shape[1] : as_it_is] = CENSUS_INVALID
     del words  # the widest arrays of a level, one at a time
     both[:, as_it_is:] = census(right)
     columns = np.concatenate([columns, np.full((height, gap), -1, dtype=np.int32), own_columns], axis=1)
