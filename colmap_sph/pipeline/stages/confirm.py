@@ -23,6 +23,7 @@ from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
+from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
 from colmap_sph.stereo.region.focus import Focus, region_of
@@ -233,18 +234,26 @@ class ConfirmStage(Stage[str, ConfirmTask]):
                 report.skipped_images[name] = self._why_empty(name)
                 self.context.progress.leave_out("image", name, report.skipped_images[name])
             else:
-                report.out_of_region[name] = "it sees too few sparse points in the region, and no depth"
+                report.out_of_region[name] = (
+                    "it has no depth in the region, of which it sees too few sparse points"
+                )
         if not report.images:
             raise NoResultError(self._why_nothing())
 
     def _shows_enough(self, name: str) -> bool:
         """Whether an image shows so much of the region, where there is one, that it ought to have some depth."""
         context = self.context
-        if context.region is None or not context.scene.has_tracks:
+        scene = context.scene
+        if context.region is None:
             return True
-        observed = context.scene.points[context.scene.view(name).point_indices]
-        inside = np.count_nonzero(is_inside(context.region, observed))
-        return int(inside) >= context.options.pairs.min_shared_points
+        view = scene.view(name)
+        points = scene.points[view.point_indices] if scene.has_tracks else scene.points
+        points = points[is_inside(context.region, points) & sees(view, points)]
+        mask = read_view_mask(context.workspace.mask_path(name), view)
+        if mask is not None:
+            columns, rows = np.floor(view.project(points)[0]).astype(int).T
+            points = points[mask[rows, columns] > 0]
+        return len(points) >= context.options.pairs.min_shared_points
 
     def _why_empty(self, name: str) -> str:
         """Why an image has no depth, as far as it is known."""
