@@ -91,10 +91,10 @@ def with_fisheye(block: DemoBlock, folder: Path) -> None:
     fish = pycolmap.Reconstruction()
     for camera in model.cameras.values():
         K = camera.calibration_matrix()
-        lens = [0.9 * K[0, 0], 0.9 * K[1, 1], K[0, 2], K[1, 2], 0.03, -0.01, 0.0, 0.0]
+        params = [0.9 * K[0, 0], 0.9 * K[1, 1], K[0, 2], K[1, 2], 0.03, -0.01, 0.0, 0.0]
         size = {"width": camera.width, "height": camera.height}
         fish.add_camera_with_trivial_rig(
-            pycolmap.Camera(camera_id=camera.camera_id, model="OPENCV_FISHEYE", params=lens, **size)
+            pycolmap.Camera(camera_id=camera.camera_id, model="OPENCV_FISHEYE", params=params, **size)
         )
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
