@@ -58,6 +58,11 @@ class Window:
         self.wait_for_drawing()
 
     def wait_for_drawing(self) -> None:
+        """Until the cloud has been drawn at all, and again after what was done last."""
+        limit = time.monotonic() + 20
+        while self.page.evaluate("document.querySelector('#view:not([data-drawn])') !== null"):
+            assert time.monotonic() < limit
+            self.page.wait_for_timeout(20)
         self.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def picture_of(self, selector: str) -> np.ndarray:

@@ -29,6 +29,7 @@ function showCloud() {
     gl.uniformMatrix4fv(gl.getUniformLocation(shaders, "seen"), false, matrix(camera, canvas.width / Math.max(canvas.height, 1), 4));
     gl.uniform1f(gl.getUniformLocation(shaders, "size"), spacing * Math.min(canvas.height, canvas.width) * 0.85);
     gl.drawArrays(gl.POINTS, 0, count);
+    canvas.dataset.drawn = count;
   };
   const redraw = () => { if (!waiting) { waiting = true; requestAnimationFrame(draw); } };
   const start = { turn: 0.35, rise: 0.75, distance: 2.4 * reach, target: data.cloud.middle };
@@ -115,8 +116,9 @@ function offerCopy() {
 }
 
 window.addEventListener("beforeprint", () => document.querySelectorAll("img[loading]").forEach((image) => { image.loading = "eager"; }));
-showCloud();
 showMap();
 document.querySelectorAll(".sortable").forEach(sortable);
 showPairs();
 offerCopy();
+// Graphics without a card take their time: all else is there before.
+requestAnimationFrame(() => setTimeout(showCloud));
