@@ -277,7 +277,7 @@ def test_the_whole_cloud_comes_as_one_looks(browser: "Browser", tmp_path: Path) 
     )
     assert is_ground.mean() > 0.99
     asked_for = {address.removeprefix(server.address) for address in asked}
-    assert asked_for >= {"", "index.json", "node/2/0"} and all(
+    assert asked_for >= {"", "index.json", "node/3/0"} and all(
         address.startswith(server.address) for address in asked
     )
     assert "points drawn" in page.locator("#status").inner_text()

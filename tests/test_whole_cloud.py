@@ -21,7 +21,7 @@ from small_workspaces import ground_workspace, write_cloud
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError
 from colmap_sph.pages.whole_cloud import CloudServer, blocks
-from colmap_sph.pages.whole_cloud.blocks import FAN, CloudBlocks, CloudFrame
+from colmap_sph.pages.whole_cloud.blocks import FAN, LEAVES, CloudBlocks, CloudFrame
 from colmap_sph.project.workspace import Workspace
 
 NAMES = ["a.png", "b.png"]
@@ -40,17 +40,18 @@ def tree_of(path: Path, frame: CloudFrame = WORLD) -> Iterator[CloudBlocks]:
 
 
 def nodes_of(tree: CloudBlocks) -> list[tuple[int, int]]:
-    widths = [FAN**height for height in range(tree.height + 1)]
-    return [(height, k) for height, width in enumerate(widths) for k in range(-(-tree.num_blocks // width))]
+    leaves = tree.num_blocks * LEAVES
+    return [(height, k) for height in range(tree.height + 1) for k in range(-(-leaves // FAN**height))]
 
 
 @pytest.fixture
 def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     """High trees of small clouds."""
-    monkeypatch.setattr(blocks, "_BLOCK", 256)
-    monkeypatch.setattr(blocks, "_NODE", 128)
-    monkeypatch.setattr(blocks, "_TELLING", 32)
-    monkeypatch.setattr(blocks, "_MOST_HEIGHT", 3)
+    monkeypatch.setattr(blocks, "_BLOCK", 512)
+    monkeypatch.setattr(blocks, "_NODE", 64)
+    monkeypatch.setattr(blocks, "_QUARTERS", 128)
+    monkeypatch.setattr(blocks, "_TELLING", 128)
+    monkeypatch.setattr(blocks, "_KEPT_BLOCKS", 2)
 
 
 def line_cloud(path: Path, count: int) -> np.ndarray:
@@ -62,12 +63,12 @@ def line_cloud(path: Path, count: int) -> np.ndarray:
 
 
 @pytest.mark.usefixtures("small_blocks")
-@pytest.mark.parametrize("count", [1, 255, 256, 257, 5000, 16_384, 40_000])
-def test_the_nodes_together_are_the_cloud(count: int, tmp_path: Path) -> None:
-    """Each point once, with its colour; of more than 64 blocks these are larger."""
+@pytest.mark.parametrize(("count", "height"), [(1, 2), (511, 2), (512, 2), (513, 3), (5000, 4), (40_000, 6)])
+def test_the_nodes_together_are_the_cloud(count: int, height: int, tmp_path: Path) -> None:
+    """Each point once, with its colour."""
     line_cloud(tmp_path / "a.ply", count)
     with tree_of(tmp_path / "a.ply") as tree:
-        assert tree.height <= 3
+        assert tree.height == height
         found = [tree.node(*node) for node in nodes_of(tree)]
     places = np.concatenate([places for places, _ in found])
     colours = np.concatenate([colours for _, colours in found]).astype(int)
@@ -78,29 +79,35 @@ def test_the_nodes_together_are_the_cloud(count: int, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("small_blocks")
 def test_every_level_is_a_fair_sample(tmp_path: Path) -> None:
     """Of every part of the cloud the root has its share, and so have all nodes of a height together."""
-    line_cloud(tmp_path / "a.ply", 256 * 60)
+    line_cloud(tmp_path / "a.ply", 512 * 60)
     with tree_of(tmp_path / "a.ply") as tree:
-        assert tree.height == 3
+        assert tree.height == 5
         nodes = {node: tree.node(*node)[0][:, 0] for node in nodes_of(tree)}
-    for height in range(1, 4):
+    for height, number in ((1, 128), (2, 64), (3, 16), (4, 4), (5, 1)):
         places = np.concatenate([each for node, each in nodes.items() if node[0] == height])
-        blocks_hit = np.bincount((places // 256).astype(int), minlength=60)
-        assert (blocks_hit == 128 // FAN**height).all()
+        assert (np.bincount((places // 512).astype(int), minlength=60) == number).all()
     # Within a block they are not its first points, but anywhere.
-    upper = np.concatenate([each for node, each in nodes.items() if node[0] > 0]) % 256
-    assert upper.min() < 20 and upper.max() > 236 and 100 < upper.mean() < 156
+    upper = np.concatenate([each for node, each in nodes.items() if node[0] > 0]) % 512
+    assert upper.min() < 20 and upper.max() > 492 and 200 < upper.mean() < 312
 
 
 @pytest.mark.usefixtures("small_blocks")
 def test_nodes_lie_where_their_boxes_are(tmp_path: Path) -> None:
-    line_cloud(tmp_path / "a.ply", 256 * 20)
+    line_cloud(tmp_path / "a.ply", 512 * 20)
     with tree_of(tmp_path / "a.ply", CloudFrame(np.eye(3)[[1, 0, 2]], np.array([100.0, 0, 0]), 10.0)) as tree:
-        leaves = [tree.node(0, number)[0] for number in range(20)]
+        leaves = [tree.node(0, number)[0] for number in range(20 * LEAVES)]
+        quarters = [tree.node(1, number)[0] for number in range(20 * LEAVES // FAN)]
     for number, (box, places) in enumerate(zip(tree.boxes, leaves, strict=True)):
         assert box is not None
-        middle = np.percentile(places[:, 1], [1, 99])
-        assert (np.abs(middle - box[[1, 4]]) < 2).all()
-        assert places[:, 1].min() >= (256 * number - 100) / 10 - 1e-4
+        block = number // LEAVES
+        assert places[:, 1].min() >= (512 * block - 100) / 10 - 1e-4
+        assert places[:, 1].max() <= (512 * (block + 1) - 100) / 10 + 1e-4
+        # A sixteenth of a block each, in their order along the line.
+        assert np.ptp(places[:, 1]) < 2 * 51.2 / LEAVES
+        assert abs(np.median(places[:, 1]) - box[[1, 4]].mean()) < 2
+        assert number % LEAVES == 0 or places[:, 1].min() > leaves[number - 1][:, 1].max()
+        quarter = quarters[number // FAN][:, 1]
+        assert quarter.min() < places[:, 1].max() and quarter.max() > places[:, 1].min()
 
 
 @pytest.mark.usefixtures("small_blocks")
@@ -108,10 +115,11 @@ def test_points_that_are_nowhere_are_left_out(tmp_path: Path) -> None:
     points = line_cloud(tmp_path / "a.ply", 3000)
     points[::3] = np.nan
     points[1::3, 2] = 1e30
-    points[256:512] = np.inf
+    points[512:1024] = np.inf
     write_cloud(tmp_path / "a.ply", points)
     with tree_of(tmp_path / "a.ply") as tree:
-        assert tree.boxes[1] is None
+        assert tree.boxes[LEAVES : 2 * LEAVES] == [None] * LEAVES
+        assert all(box is not None for box in tree.boxes[:LEAVES])
         found = np.concatenate([tree.node(*node)[0] for node in nodes_of(tree)])
     expected = points[2::3, 0][~np.isinf(points[2::3, 0])]
     assert sorted(found[:, 0].tolist()) == expected.tolist()
@@ -164,7 +172,7 @@ def test_a_file_that_is_cut_off_meanwhile(tmp_path: Path) -> None:
         os.truncate(tmp_path / "a.ply", 2000)
         with pytest.raises(InputError, match="was cut off"):
             tree.node(0, 0)
-        for node in ((0, 1), (1, 0), (99, 0), (0, 999_999)):
+        for node in ((0, 16), (3, 0), (99, 0), (0, 999_999)):
             with pytest.raises(InputError, match="no such part"):
                 tree.node(*node)
 
@@ -210,10 +218,10 @@ def test_the_page_and_its_parts_are_served(server: CloudServer) -> None:
     assert status == 200 and b"&lt;b&gt;dense&lt;/b&gt;" in page and b"<b>" not in page
     assert "default-src 'none'" in headers["Content-Security-Policy"]
     index = json.loads(get(f"{server.address}index.json")[1])
-    assert index["count"] == 300_000 and len(index["blocks"]) == 5 and index["height"] == 2
+    assert index["count"] == 300_000 and len(index["leaves"]) == 32 and index["height"] == 3
     total = 0
-    for height in range(3):
-        for number in range(-(-5 // FAN**height)):
+    for height in range(4):
+        for number in range(-(-32 // FAN**height)):
             status, content, _ = get(f"{server.address}node/{height}/{number}")
             assert status == 200 and len(content) % 15 == 0
             total += len(content) // 15

@@ -14,7 +14,7 @@ import numpy as np
 from colmap_sph.errors import InputError, OptionError, printable, reason_of
 from colmap_sph.pages.markup import from_template, style_and_script
 from colmap_sph.pages.vertical import map_axes
-from colmap_sph.pages.whole_cloud.blocks import FAN, CloudBlocks, CloudFrame
+from colmap_sph.pages.whole_cloud.blocks import FAN, LEAVES, CloudBlocks, CloudFrame
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.files import real_path
 from colmap_sph.project.scene_reader import read_scene
@@ -94,9 +94,9 @@ class CloudServer:
             "count": self.blocks.layout.count,
             "fan": FAN,
             "height": self.blocks.height,
-            "shares": self.blocks.shares,
+            "shares": [share / LEAVES for share in self.blocks.shares],
             "behind": _BEHIND * max(farthest, 1.0),
-            "blocks": boxes,
+            "leaves": boxes,
         }
 
     def run(self) -> None:

@@ -1,12 +1,14 @@
 // ---- the whole cloud, in as many points as the view can show -------------------------------------------------
 // The cloud is a tree: the root has few points of all of it, each child more of a part, and the leaves the rest. What
 // is drawn is the root, and below it what is in view and not as dense as the screen yet, the coarsest first.
-const MOST_DRAWN = 6e6, MOST_KEPT = 12e6, AT_ONCE = 4, DENSE = 1.4;
+// There are never more points than a few for each pixel of the screen, nor than can be drawn in a moment.
+const MOST_DRAWN = 6e6, MOST_KEPT = 12e6, PER_PIXEL = 6, FEWEST = 2e5, AT_ONCE = 4, DENSE = 1, SIZE = 2;
+const MOMENT = 3000, MOMENT_IN_MOTION = 60, REST = 250, REDRAWN_AFTER = 150; // milliseconds
 const canvas = document.getElementById("view"), status = document.getElementById("status");
 
-// Boxes of the nodes of each height, from those of the blocks: least x, y, z, largest x, y, z; null without points.
+// Boxes of the nodes of each height, from those of the leaves: least x, y, z, largest x, y, z; null without points.
 function boxes(index) {
-  const heights = [index.blocks];
+  const heights = [index.leaves];
   while (heights.length <= index.height) {
     const below = heights.at(-1), made = [];
     for (let first = 0; first < below.length; first += index.fan) {
@@ -18,18 +20,39 @@ function boxes(index) {
   return heights;
 }
 
+// How many boxes there are, on average, where each of them is: so much denser do points lie than those of one of them.
+// Seen along the shortest side of all.
+function layers(leaves, whole) {
+  const [x, y] = [0, 1, 2].sort((a, b) => whole[b + 3] - whole[b] - (whole[a + 3] - whole[a]));
+  const cells = 128, counts = new Uint32Array(cells * cells);
+  const cell = (value, axis) => Math.min(Math.floor(cells * (value - whole[axis]) / (whole[axis + 3] - whole[axis] || 1)), cells - 1);
+  const forCells = (box, what) => {
+    for (let row = cell(box[y], y); row <= cell(box[y + 3], y); row += 1) {
+      for (let column = cell(box[x], x); column <= cell(box[x + 3], x); column += 1) what(row * cells + column);
+    }
+  };
+  for (const box of leaves) if (box) forCells(box, (place) => { counts[place] += 1; });
+  return leaves.map((box) => {
+    let sum = 0, number = 0;
+    if (box) forCells(box, (place) => { sum += 1 / counts[place]; number += 1; });
+    return number / (sum || 1);
+  });
+}
+
 // All nodes, with about how many points they have, and how far these and those above lie apart.
 function tree(index) {
-  const heights = boxes(index), taken = index.shares.reduce((sum, share) => sum + share, 0);
+  const heights = boxes(index);
+  const whole = heights.at(-1)[0], deep = whole ? layers(index.leaves, whole) : [];
   const above = (height) => index.shares.slice(height).reduce((sum, share) => sum + share, 0);
   const node = (height, number) => {
     const box = heights[height]?.[number];
     if (!box) return null;
-    const width = index.fan ** height, blocks = Math.min(width, index.blocks.length - number * width);
+    const width = index.fan ** height, leaves = Math.min(width, index.leaves.length - number * width);
     const sides = [0, 1, 2].map((k) => box[k + 3] - box[k]).sort((a, b) => b - a);
+    const of = deep.slice(number * width, (number + 1) * width), depth = of.reduce((sum, each) => sum + each, 0) / leaves;
     const area = sides[0] * Math.max(sides[1], 1e-3 * sides[0]) || 1e-12;
-    return { key: `${height}/${number}`, height, number, box, count: index.shares[height] * blocks,
-      apart: Math.sqrt(area / (blocks * (height ? above(height) : taken))) };
+    return { key: `${height}/${number}`, height, number, box, count: index.shares[height] * leaves,
+      apart: Math.sqrt(area / (leaves * above(height) * Math.max(depth, 1))) };
   };
   const children = (parent) => (parent.height === 0 ? [] : Array.from({ length: index.fan }, (_, k) =>
     node(parent.height - 1, parent.number * index.fan + k)).filter((child) => child));
@@ -46,7 +69,7 @@ function isSeen(box, seen) {
 }
 
 // Nodes to draw, the coarsest on the screen first, and of each those below it.
-function wanted(cloud, camera, seen, pixels) {
+function wanted(cloud, camera, seen, pixels, most) {
   const [, , back] = axes(camera), eye = camera.target.map((value, k) => value + camera.distance * back[k]);
   const onScreen = (node) => {
     const beside = eye.map((value, k) => Math.max(node.box[k] - value, value - node.box[k + 3], 0));
@@ -56,7 +79,7 @@ function wanted(cloud, camera, seen, pixels) {
   let points = 0;
   while (waiting.length) {
     const [, node] = waiting.splice(waiting.reduce((best, each, k) => (each[0] > waiting[best][0] ? k : best), 0), 1)[0];
-    if (points + node.count > MOST_DRAWN && chosen.length) break;
+    if (points + node.count > most && chosen.length) break;
     points += node.count;
     chosen.push(node);
     node.below = [];
@@ -77,7 +100,8 @@ async function showWholeCloud() {
   gl.enable(gl.DEPTH_TEST);
   gl.clearColor(0.063, 0.078, 0.102, 1);
   const kept = new Map(), coming = new Set();
-  let chosen = [], waiting = false, now = 0, trouble = "";
+  const onePixel = new Uint8Array(4);
+  let chosen = [], waiting = false, now = 0, trouble = "", speed = 5e3, moved = -REST, rest = 0, due = 0, took = 0;
 
   const load = async (node) => {
     coming.add(node.key);
@@ -96,7 +120,8 @@ async function showWholeCloud() {
       trouble = error instanceof TypeError ? "The program that serves the cloud has ended; start colmap_sph view again." : error.message;
     }
     coming.delete(node.key);
-    redraw();
+    fill();
+    if (!due) due = setTimeout(() => { due = 0; redraw(); }, Math.max(REDRAWN_AFTER, 2 * took));
   };
   const forget = () => {
     let points = [...kept.values()].reduce((sum, each) => sum + each.count, 0);
@@ -116,6 +141,12 @@ async function showWholeCloud() {
     }
     return apart;
   };
+  // Have more nodes come, those first that are wanted first; returns those that are not there.
+  const fill = () => {
+    const missing = trouble ? [] : chosen.filter((node) => !kept.has(node.key));
+    for (const node of missing) if (coming.size < AT_ONCE && !coming.has(node.key)) load(node);
+    return missing;
+  };
   const draw = () => {
     waiting = false;
     now += 1;
@@ -123,7 +154,9 @@ async function showWholeCloud() {
     const size = [canvas.clientWidth * sharp, canvas.clientHeight * sharp].map(Math.round);
     if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
     const pixels = 0.85 * Math.min(canvas.height, canvas.width), seen = matrix(camera, canvas.width / Math.max(canvas.height, 1), index.behind);
-    chosen = wanted(cloud, camera, seen, pixels);
+    const began = performance.now(), moment = began - moved < REST ? MOMENT_IN_MOTION : MOMENT;
+    const most = Math.min(MOST_DRAWN, PER_PIXEL * canvas.width * canvas.height, Math.max(speed * moment, FEWEST));
+    chosen = wanted(cloud, camera, seen, pixels, most);
     const apart = spacings();
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
@@ -133,7 +166,7 @@ async function showWholeCloud() {
       const each = kept.get(node.key);
       if (!each) continue;
       each.used = now;
-      gl.uniform1f(sizeAt, 1.3 * apart.get(node.key) * pixels);
+      gl.uniform1f(sizeAt, SIZE * apart.get(node.key) * pixels);
       [gl.FLOAT, gl.UNSIGNED_BYTE].forEach((kind, k) => {
         gl.bindBuffer(gl.ARRAY_BUFFER, each.buffers[k]);
         gl.vertexAttribPointer(places[k], 3, kind, true, 0, 0);
@@ -141,15 +174,18 @@ async function showWholeCloud() {
       gl.drawArrays(gl.POINTS, 0, each.count);
       drawn += each.count;
     }
+    gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, onePixel); // waits for the drawing
+    took = performance.now() - began;
+    if (drawn > FEWEST / 4) speed += 0.3 * (drawn / Math.max(took, 1) - speed);
     forget();
-    const missing = trouble ? [] : chosen.filter((node) => !kept.has(node.key));
-    for (const node of missing) if (coming.size < AT_ONCE && !coming.has(node.key)) load(node);
+    const missing = fill();
     status.textContent = trouble || `${drawn.toLocaleString("en")} of ${index.count.toLocaleString("en")} points drawn${missing.length ? " …" : ""}`;
-    canvas.dataset.missing = missing.length;
+    canvas.dataset.missing = missing.length + (moment === MOMENT ? 0 : 1);
     canvas.dataset.drawn = drawn;
   };
   const redraw = () => { if (!waiting) { waiting = true; requestAnimationFrame(draw); } };
-  const camera = controls(canvas, { turn: 0.35, rise: 0.75, distance: 2.4, target: [0, 0, 0] }, 0.001, 50, redraw);
+  const moving = () => { moved = performance.now(); clearTimeout(rest); rest = setTimeout(redraw, REST); redraw(); };
+  const camera = controls(canvas, { turn: 0.35, rise: 0.75, distance: 2.4, target: [0, 0, 0] }, 0.001, 50, moving);
   canvas.addEventListener("webglcontextlost", () => { trouble = "The graphics card has no memory left; reload the page."; });
   new ResizeObserver(redraw).observe(canvas);
 }
