@@ -3,8 +3,8 @@
 Points that lie one after the other in the file of a fusion are mostly of one image. So blocks of them are nodes of
 a tree, which are joined by fours towards the root, and divided by fours into quarters and leaves, along planes.
 Each block is put into one random order: the root takes the first points of all blocks, the nodes below it the next
-of theirs, and the leaves the rest. What is drawn of nodes, down to whichever, is a fair sample. Nothing is written,
-and little kept in memory.
+of theirs, and the leaves the rest. What is drawn of nodes, down to whichever, is a fair sample. Nothing is
+written, and little kept in memory.
 """
 
 import os
@@ -173,13 +173,11 @@ class CloudBlocks:
 
     def index_block(self, number: int) -> None:
         """Look at a block, the next one: find where it is, and keep what the upper nodes take of it."""
-        upper = sum(self.shares[_KEPT_HEIGHT:])
-        places, colours = self._read(number, 0, max(upper, _TELLING))
+        places, _ = self._read(number, 0, _TELLING)
         planes = Planes(places) if len(places) else None
         self._planes.append(planes)
         self.boxes += [None] * LEAVES if planes is None else planes.boxes
-        kept = round(len(places) * upper / max(upper, _TELLING))
-        self._upper.append((places[:kept].copy(), colours[:kept].copy()))
+        self._upper.append(self._read(number, 0, sum(self.shares[_KEPT_HEIGHT:])))
 
     def node(self, height: int, number: int) -> Points:
         """Points of a node.
