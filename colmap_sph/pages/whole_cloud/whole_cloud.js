@@ -22,7 +22,7 @@ function boxes(index) {
 
 // How many boxes there are, on average, where each of them is: so much denser do points lie than those of one of them.
 // Seen along the shortest side of all.
-function layers(leaves, whole) {
+function layers(boxed, whole) {
   const [x, y] = [0, 1, 2].sort((a, b) => whole[b + 3] - whole[b] - (whole[a + 3] - whole[a]));
   const cells = 128, counts = new Uint32Array(cells * cells);
   const cell = (value, axis) => Math.min(Math.floor(cells * (value - whole[axis]) / (whole[axis + 3] - whole[axis] || 1)), cells - 1);
@@ -31,8 +31,8 @@ function layers(leaves, whole) {
       for (let column = cell(box[x], x); column <= cell(box[x + 3], x); column += 1) what(row * cells + column);
     }
   };
-  for (const box of leaves) if (box) forCells(box, (place) => { counts[place] += 1; });
-  return leaves.map((box) => {
+  for (const box of boxed) if (box) forCells(box, (place) => { counts[place] += 1; });
+  return boxed.map((box) => {
     let sum = 0, number = 0;
     if (box) forCells(box, (place) => { sum += 1 / counts[place]; number += 1; });
     return number / (sum || 1);
@@ -42,17 +42,16 @@ function layers(leaves, whole) {
 // All nodes, with about how many points they have, and how far these and those above lie apart.
 function tree(index) {
   const heights = boxes(index);
-  const whole = heights.at(-1)[0], deep = whole ? layers(index.leaves, whole) : [];
+  const whole = heights.at(-1)[0], deep = heights.map((each) => (whole ? layers(each, whole) : []));
   const above = (height) => index.shares.slice(height).reduce((sum, share) => sum + share, 0);
   const node = (height, number) => {
     const box = heights[height]?.[number];
     if (!box) return null;
     const width = index.fan ** height, leaves = Math.min(width, index.leaves.length - number * width);
     const sides = [0, 1, 2].map((k) => box[k + 3] - box[k]).sort((a, b) => b - a);
-    const of = deep.slice(number * width, (number + 1) * width), depth = of.reduce((sum, each) => sum + each, 0) / leaves;
     const area = sides[0] * Math.max(sides[1], 1e-3 * sides[0]) || 1e-12;
     return { key: `${height}/${number}`, height, number, box, count: index.shares[height] * leaves,
-      apart: Math.sqrt(area / (leaves * above(height) * Math.max(depth, 1))) };
+      apart: Math.sqrt(area / (leaves * above(height) * Math.max(deep[height][number], 1))) };
   };
   const children = (parent) => (parent.height === 0 ? [] : Array.from({ length: index.fan }, (_, k) =>
     node(parent.height - 1, parent.number * index.fan + k)).filter((child) => child));
