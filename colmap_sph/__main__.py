@@ -1,8 +1,10 @@
 """The program's entry: the command line, once it is loaded, which takes a second or so."""
 
+import os
+import signal
 import sys
 from contextlib import suppress
-from types import TracebackType
+from types import FrameType, TracebackType
 
 from colmap_sph.app.colmap.names import hand_over, is_handed_over
 from colmap_sph.app.standard_streams import prepare_process, silence
@@ -52,6 +54,7 @@ def _command() -> int:
     if is_handed_over(sys.argv[1:]):
         with suppress(InputError):  # said below
             hand_over(sys.argv[1:])
+    _load_colmap()
     from colmap_sph.app import cli
 
     try:
@@ -67,6 +70,23 @@ def _command() -> int:
         print(f"error: The standard output cannot be written ({reason_of(error)}).", file=sys.stderr)
         return OutputError.exit_code
     return code
+
+
+def _load_colmap() -> None:
+    """Load COLMAP's library, and let SIGTERM end the program quietly: the library would print its stack."""
+    is_ignored = signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
+    end = signal.SIG_IGN if is_ignored else _end_quietly
+    signal.signal(signal.SIGTERM, end)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+    try:
+        import colmap_sph.project.colmap_library  # noqa: F401
+    finally:
+        signal.signal(signal.SIGTERM, end)  # in the place of the library's
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+
+
+def _end_quietly(number: int, _: FrameType | None) -> None:
+    os._exit(128 + number)
 
 
 def _refusal(error: BaseException) -> str | None:

@@ -4,7 +4,9 @@ The command line prints the message as one sentence and exits with `exit_code`; 
 for these. A message names the file or option and says what to do.
 """
 
+import os
 import re
+import shlex
 import unicodedata
 from collections.abc import Callable
 
@@ -114,3 +116,24 @@ def _visible(character: str) -> str:
     if unicodedata.category(character) in _UNPRINTABLE or _INVISIBLE.match(character):
         return character.encode("unicode_escape").decode("ascii")
     return character
+
+
+def shell_word(text: str) -> str:
+    r"""Text as one word for bash or zsh, in which nothing is hidden: a line of a log can be copied from it.
+
+    Examples
+    --------
+    >>> print(shell_word("my block"), shell_word("a\x1bb"))
+    'my block' $'a\x1bb'
+    """
+    if printable(text) == text:
+        return shlex.quote(text)
+    return f"$'{''.join(map(_escaped, text))}'"
+
+
+def _escaped(character: str) -> str:
+    if character in "\\'":
+        return f"\\{character}"
+    if printable(character) == character:
+        return character
+    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(character))

@@ -21,6 +21,9 @@ from colmap_sph.app.colmap.options import (
 )
 from colmap_sph.app.colmap.parser import Given, ParseError, parse
 from colmap_sph.app.colmap.settings import run_options, target_of
+from colmap_sph.app.colmap.spelling import spelling_of
+from colmap_sph.app.option_list import option_groups
+from colmap_sph.app.run_command import RunCommand
 from colmap_sph.pipeline.options import RunOptions
 
 CLASSES = {
@@ -237,3 +240,47 @@ def test_a_word_that_is_no_number(word):
 def test_a_default_is_a_32_bit_float():
     assert is_default(ColmapOption("x", 0.01, ""), 0.009999999776482582)
     assert not is_default(ColmapOption("x", 0.01, ""), 0.0101)
+
+
+# ---- what is said of them ----------------------------------------------------------------------------------
+
+
+def test_our_options_are_spelled_as_colmap_does():
+    spell = spelling_of("patch_match_stereo")
+    assert spell("--confirm.min-consistent is 9") == "--PatchMatchStereo.filter_min_num_consistent is 9"
+    assert spell("give fewer --threads or a smaller --max-image-size,") == (
+        "give fewer --PatchMatchStereo.num_threads or a smaller --PatchMatchStereo.max_image_size,"
+    )
+    assert spell("choose another --output.") == "choose another --workspace_path."
+    # What the command does not have is another's.
+    assert spell("raise --num-pairs or --memory.") == (
+        "raise --num-pairs (of colmap_sph run) or --memory (of colmap_sph run)."
+    )
+    fusion = spelling_of("stereo_fusion")
+    assert fusion("try --fusion.input photometric") == "try --input_type photometric"
+    for text in (
+        "--workspace_path x",
+        "/a/--output/b",
+        "give `run` --overwrite, which",
+        "a--threads",
+        "--unknown 7",
+    ):
+        assert spell(text) == fusion(text) == text
+    assert spelling_of("mapper")("--threads") == "--threads"
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_whatever_is_said_can_be_typed(command):
+    """Each option of ours is spelled as one of the command's, or said to be another command's."""
+    spell = spelling_of(command)
+    for group in option_groups(RunCommand):
+        for option in group.options:
+            said = spell(f"try {option.flag} now")
+            flag = said.removeprefix("try --").removesuffix(" now")
+            assert flag in COMMANDS[command].flags() or flag.endswith(" (of colmap_sph run)"), said
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_switch_takes_no_value(command, capsys):
+    assert cli.main([command, "--help=1"]) == 1
+    assert "option '--help' does not take any arguments" in capsys.readouterr().err

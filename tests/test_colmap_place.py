@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -252,6 +253,50 @@ def test_no_file_but_a_cloud_is_replaced(finished, tmp_path, capsys):
         assert words in capsys.readouterr().err
         assert before is None or output.read_bytes() == before
     assert pipe.is_fifo() and len(list(model.iterdir())) == 1
+
+
+@pytest.mark.parametrize("kind", ["bin", "txt"])
+def test_no_model_but_a_clouds_is_replaced(finished, tmp_path, capsys, kind):
+    """As with clouds: a user's model is not lost by a slip; what this program wrote, and nobody changed, is."""
+    dense = with_maps_of_others(finished, tmp_path / "dense")
+    model = tmp_path / "sparse/0"
+    model.mkdir(parents=True)
+    source = pycolmap.Reconstruction(dense / "sparse")
+    (source.write_binary if kind == "bin" else source.write_text)(model)
+    before = {path.name: path.read_bytes() for path in model.iterdir()}
+
+    def fuse(folder: Path) -> int:
+        return command("stereo_fusion", "--workspace_path", dense, "--output_path", folder, "--output_type", kind)
+
+    assert fuse(model) == 3
+    assert re.search(rf"sparse/0/\w+\.{kind} is there already", capsys.readouterr().err)
+    assert {path.name: path.read_bytes() for path in model.iterdir()} == before
+    folder = tmp_path / "new/cloud"
+    assert fuse(folder) == 0
+    first = (folder / f"points3D.{kind}").read_bytes()
+    (folder / "notes").write_text("of others, and in nobody's way")
+    assert fuse(folder) == 0
+    assert (folder / f"points3D.{kind}").read_bytes() == first
+    with (folder / f"points3D.{kind}").open("ab") as file:
+        file.write(b"# mine\n")
+    assert fuse(folder) == 3
+    assert (folder / f"points3D.{kind}").read_bytes() != first
+
+
+def test_no_scan_is_replaced(finished, tmp_path, capsys):
+    """Fusion's clouds, ours and COLMAP's, have a file beside them with as many points."""
+    dense = with_maps_of_others(finished, tmp_path / "dense")
+    scan = tmp_path / "scan.ply"
+    content = (finished.dense / "fused.ply").read_bytes()
+    scan.write_bytes(content)
+    arguments = ["--workspace_path", dense, "--output_path", scan]
+    assert command("stereo_fusion", *arguments) == 3
+    assert "is not from fusion" in capsys.readouterr().err
+    (tmp_path / "scan.ply.vis").write_bytes((7).to_bytes(8, "little"))
+    assert command("stereo_fusion", *arguments) == 3
+    assert scan.read_bytes() == content
+    shutil.copy(finished.dense / "fused.ply.vis", tmp_path / "scan.ply.vis")
+    assert command("stereo_fusion", *arguments) == 0
 
 
 def test_a_cloud_goes_where_a_link_leads(finished, tmp_path):

@@ -344,3 +344,28 @@ def test_a_model_that_may_not_grow(tmp_path: Path) -> None:
     assert "Traceback" not in done.stderr
     assert "ulimit -f" in done.stderr.splitlines()[-1]
     assert not (dense / "sparse").exists()
+
+
+@pytest.mark.parametrize("seconds", [0.15, 0.4, 0.6, 0.8, 1.0])
+def test_an_end_while_the_program_loads_is_quiet(seconds: float) -> None:
+    """COLMAP's library, once loaded, would print its stack."""
+    process = started([sys.executable, "-P", "-m", "colmap_sph", "run", "--help-all"])
+    time.sleep(seconds)
+    process.send_signal(signal.SIGTERM)
+    said = process.communicate(timeout=20)[0]
+    assert process.returncode in (143, -signal.SIGTERM, 0)
+    assert "Aborted at" not in said and "SIGTERM" not in said and "Traceback" not in said
+
+
+def test_colmaps_library_leaves_the_signal_to_us() -> None:
+    """The moment after it is loaded, without waiting for it."""
+    code = textwrap.dedent(
+        """
+        import os, signal, sys
+        from colmap_sph import __main__
+        __main__._load_colmap()
+        os.kill(os.getpid(), signal.SIGTERM)
+        """
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (143, "", "")

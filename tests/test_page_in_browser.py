@@ -1,6 +1,7 @@
 """The page in a browser: it draws, obeys keys and narrow windows, complains of nothing, and names do nothing."""
 
 import shutil
+import time
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
@@ -10,12 +11,14 @@ import cv2
 import numpy as np
 import pytest
 from small_workspaces import HOSTILE_NAMES, ground_workspace
+from test_whole_cloud import coloured_ground
 
 from colmap_sph.pages import write_page
+from colmap_sph.pages.whole_cloud import CloudServer
 from colmap_sph.project.workspace import Workspace
 
 if TYPE_CHECKING:
-    from playwright.sync_api import Browser
+    from playwright.sync_api import Browser, Page
 
 sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install playwright")
 NAMES = [f"{letter}.png" for letter in "dabce"]
@@ -55,6 +58,11 @@ class Window:
         self.wait_for_drawing()
 
     def wait_for_drawing(self) -> None:
+        """Until the cloud has been drawn at all, and again after what was done last."""
+        limit = time.monotonic() + 20
+        while self.page.evaluate("document.querySelector('#view:not([data-drawn])') !== null"):
+            assert time.monotonic() < limit
+            self.page.wait_for_timeout(20)
         self.page.evaluate("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
     def picture_of(self, selector: str) -> np.ndarray:
@@ -231,3 +239,64 @@ def test_hostile_names_do_nothing(browser: "Browser", tmp_path: Path) -> None:
     assert window.page.locator("script").count() == 2
     assert window.said == []
     window.close()
+
+
+# ---- the whole cloud ---------------------------------------------------------------------------------------
+
+
+def test_the_whole_cloud_comes_as_one_looks(browser: "Browser", tmp_path: Path) -> None:
+    """From afar a part of it, near by all that is in view; the west is red, the east green."""
+    server = CloudServer(coloured_ground(tmp_path / "dense"))
+    server.run_in_background()
+    page = browser.new_page(viewport={"width": 500, "height": 400})
+    said: list[str] = []
+    asked: list[str] = []
+    page.on("console", lambda message: said.append(message.text))
+    page.on("pageerror", lambda error: said.append(str(error)))
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(server.address)
+    wait_until_complete(page)
+    drawn = int(page.evaluate("document.getElementById('view').dataset.drawn"))
+    assert 20_000 < drawn <= 300_000
+    page.locator("#view").focus()
+    page.keyboard.press("t")
+    wait_until_complete(page)
+    picture = picture_of(page)
+    red = np.abs(picture - [30, 30, 200]).max(axis=2) < 12
+    green = np.abs(picture - [60, 160, 40]).max(axis=2) < 12
+    assert red.sum() > 3000 and green.sum() > 3000
+    assert abs(np.nonzero(red)[1].mean() - np.nonzero(green)[1].mean()) > 60
+    # Next to it, the ground has no gaps, and there is nothing more to come.
+    for _ in range(12):
+        page.keyboard.press("+")
+    wait_until_complete(page)
+    picture = picture_of(page)
+    middle = picture[60:-60, 60:-60]
+    is_ground = (np.abs(middle - [30, 30, 200]).max(axis=2) < 12) | (
+        np.abs(middle - [60, 160, 40]).max(axis=2) < 12
+    )
+    assert is_ground.mean() > 0.99
+    asked_for = {address.removeprefix(server.address) for address in asked}
+    assert asked_for >= {"", "index.json", "node/3/0"} and all(
+        address.startswith(server.address) for address in asked
+    )
+    assert "points drawn" in page.locator("#status").inner_text()
+    assert said == []
+    page.close()
+    server.stop()
+    server.close()
+
+
+def wait_until_complete(page: "Page") -> None:
+    limit = time.monotonic() + 20
+    page.wait_for_timeout(200)  # for the keys to act
+    while page.evaluate("document.getElementById('view').dataset.missing") != "0":
+        assert time.monotonic() < limit
+        page.wait_for_timeout(50)
+
+
+def picture_of(page: "Page") -> np.ndarray:
+    """(H, W, 3) blue, green and red, of the cloud."""
+    picture = cv2.imdecode(np.frombuffer(page.locator("#view").screenshot(), np.uint8), cv2.IMREAD_COLOR)
+    assert picture is not None
+    return picture.astype(int)

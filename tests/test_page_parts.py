@@ -13,14 +13,15 @@ from colmap_sph.errors import InputError
 from colmap_sph.evaluation.ply_files import read_ply
 from colmap_sph.pages.block_map import Ground, footprint, frame_around, looks_towards, seen_from_above
 from colmap_sph.pages.pictures import COLOURS, depth_picture, normal_picture, picture_uri, reason_picture
-from colmap_sph.pages.reasons import Partner, Reason, filled, find_reasons
+from colmap_sph.pages.reasons import Partner, Reason, find_reasons
 from colmap_sph.pages.samples import MapSamples, grid_of
 from colmap_sph.pages.small_cloud import STEPS, thin_out
 from colmap_sph.pages.vertical import map_axes
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.images.reading import read_small_colours
 from colmap_sph.project.map_files import read_some_pixels, write_depth_map, write_normal_map
-from colmap_sph.scene import View
+from colmap_sph.scene import Region, View
+from colmap_sph.stereo.region.shown import count_shown, filled
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 100.0
 K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
@@ -104,6 +105,45 @@ def test_masked_and_blank_pixels_are_told_apart_from_others() -> None:
     assert (reasons[15:, 10:20] == Reason.NOT_FOUND).all()
     assert (reasons[:, 20:30] == Reason.MASKED).all()
     assert (reasons[:, 30:] == Reason.CONFIRMED).all()
+
+
+def test_what_lies_outside_of_a_region_was_not_asked_for() -> None:
+    """Ground 100 x 75 units wide; the region are 20 x 75 in its middle, of which half has a depth."""
+    view = view_at(0, 0, ALTITUDE)
+    found = np.zeros(SHAPE, np.float32)
+    found[15:, 16:24] = ALTITUDE
+    samples = samples_of(view, found)
+    region = Region(np.array([[-10.0, -100, -1], [10, 100, 1]]))
+    arguments = (view, samples, [partner_at(5.0)])
+    reasons, _ = find_reasons(*arguments, blank=np.zeros(SHAPE, bool), min_angle=1.0, region=region)
+    wanted = np.abs((samples.columns - WIDTH / 2) * ALTITUDE / FOCAL) <= 10
+    assert wanted.sum() == 8
+    assert (reasons[:, ~wanted] == Reason.OUTSIDE).all()
+    assert (reasons[15:, wanted] == Reason.CONFIRMED).all()
+    assert (reasons[:15, wanted] == Reason.NOT_FOUND).all()
+    # Elsewhere, and behind the camera, nothing is asked for; without any depth, what is in the outline.
+    for box in ([[500.0, 0, -1], [510, 1, 1]], [[-1.0, -1, 60], [1, 1, 70]]):
+        reasons, _ = find_reasons(
+            *arguments, blank=np.zeros(SHAPE, bool), min_angle=1.0, region=Region(np.array(box))
+        )
+        assert (reasons[:, ~wanted] == Reason.OUTSIDE).all()
+    nothing = (view, samples_of(view, 0.0), [partner_at(5.0)])
+    reasons, _ = find_reasons(*nothing, blank=np.zeros(SHAPE, bool), min_angle=1.0, region=region)
+    assert (reasons[:, wanted] == Reason.NOT_FOUND).all()
+    assert (reasons[:, :12] == Reason.OUTSIDE).all() and (reasons[:, 28:] == Reason.OUTSIDE).all()
+
+
+def test_pixels_that_show_a_region_are_counted() -> None:
+    """Ground, half a unit per pixel: columns within 10 units show a region 20 wide, with a depth or without."""
+    view = view_at(0, 0, ALTITUDE)
+    found = np.full((HEIGHT, WIDTH), ALTITUDE, np.float32)
+    found[::2] = 0
+    kept = found.copy()
+    kept[:, :80] = 0
+    kept[:, 121:] = 0
+    region = Region(np.array([[-10.0, -100, -1], [10, 100, 1]]))
+    assert count_shown(view, found, kept, region) == 41 * HEIGHT
+    assert count_shown(view, np.zeros_like(found), np.zeros_like(found), region) == WIDTH * HEIGHT
 
 
 def test_without_partners_one_image_sees_all_and_without_depth_nothing_is_known() -> None:
@@ -265,7 +305,7 @@ def decoded(uri: str) -> np.ndarray:
 
 
 def test_pictures_show_what_they_should() -> None:
-    reasons = np.repeat(np.arange(8, dtype=np.uint8), 50).reshape(8, 50)
+    reasons = np.repeat(np.arange(len(Reason), dtype=np.uint8), 50).reshape(-1, 50)
     assert np.array_equal(
         decoded(picture_uri(reason_picture(reasons), 5000, exact=True))[:, 0], list(COLOURS.values())
     )

@@ -220,7 +220,7 @@ def test_an_unfinished_run_is_shown_and_said_to_be_so(tmp_path: Path, capsys: py
     assert f"not finished: {sentence}\n" in err
     page = Page(workspace.root)
     assert sentence in page.text("p")
-    assert "There is no cloud yet." in page.text("p")
+    assert "There is no cloud yet: " in page.text("p")
     assert not page.all("canvas")
 
 

@@ -1,6 +1,8 @@
 """A run on a part of the scene: what lies outside is not worked on, what lies inside is as in the whole run."""
 
 import json
+import re
+import shutil
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 from clouds import read_fused
 from conftest import FinishedRun
 from scipy.spatial import cKDTree
+from test_pages import Page
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -220,7 +223,7 @@ def test_rectified_images_are_cut_to_what_shows_the_region(block: DemoBlock, sur
     scene = anchored(read_scene(block.sparse_dir))
     low, high = np.percentile(scene.points + scene.anchor, [30, 60], axis=0)
     region = Region(np.array([[low[0], low[1], -50], [high[0], high[1], 50]]))
-    part, focus = focused(scene, region, 10, "--region")
+    part, focus, _ = focused(scene, region, 10, "--region")
     options = RectificationOptions(surface=surface)
     tried = 0
     for first, second in zip(part.views[:-1], part.views[1:], strict=True):
@@ -258,7 +261,7 @@ def test_a_scene_is_reduced_to_what_shows_a_region(tmp_path):
     scene = grid_scene(origin)
     corner = np.array([[15, 15], [18, 15], [18, 18], [15, 18]]) + origin[:2]
     region = read_region(str(geojson(tmp_path / "corner", [corner.tolist()])))
-    part, focus = focused(scene, region, 1, "--region")
+    part, focus, _ = focused(scene, region, 1, "--region")
     assert [view.name for view in part.views] == ["10 10"]
     assert focus.region.box[:, :2].tolist() == [[15, 15], [18, 18]]
     view = scene.view("10 10")
@@ -409,3 +412,87 @@ def test_a_dry_run_plans_the_region_alone(block: DemoBlock, region_run: RegionRu
     whole = make_plan(project, RunOptions())
     part = make_plan(project, RunOptions(region=region_run.given))
     assert part.seconds < 0.8 * whole.seconds
+
+
+# ---- what is told of it -----------------------------------------------------------------------------------------
+
+
+def test_coverage_is_that_of_the_pixels_which_show_the_region(region_run: RegionRun, block: DemoBlock):
+    """Against exact depth: a pixel shows the region where its piece of surface lies in it."""
+    scene = read_scene(region_run.dense / "sparse")
+    report = region_run.report
+    assert report.in_region.keys() == report.coverage.keys()
+    compared = 0
+    for view in scene.views:
+        truth, _ = block.truth(view.name)
+        points = world_points(view, truth).reshape(-1, 3)
+        shown = is_inside(region_run.region, points).reshape(truth.shape) & (truth > 0)
+        depth = read_depth_map(region_run.dense / f"stereo/depth_maps/{view.name}.geometric.bin")
+        if not (depth > 0).any():
+            continue
+        compared += 1
+        assert report.in_region[view.name] == pytest.approx(shown.mean(), abs=0.04)
+        assert report.coverage[view.name] == pytest.approx(
+            np.count_nonzero(depth) / shown.sum(), rel=0.1, abs=0.02
+        )
+    assert compared > 5
+
+
+def test_the_page_tells_what_lies_outside(region_run: RegionRun):
+    page = Page(region_run.dense)
+    assert "outside the region" in page.text("b")
+    bars = [each["aria-label"] or "" for each in page.all("svg") if each.get("class") == "bar"]
+    names = sorted(region_run.report.coverage)
+    assert len(bars) == len(names)
+    for name, words in zip(names, bars, strict=True):
+        shares = dict(re.findall(r"([a-z ]+?) ([\d.]+) %", words.replace(", ", ",")))
+        outside = float(shares.get("outside the region", 0)) / 100
+        shown = region_run.report.in_region.get(name, 0)
+        assert outside == pytest.approx(1 - shown, abs=0.06)
+        confirmed = float(shares.get("confirmed", 0)) / 100
+        assert confirmed == pytest.approx(region_run.report.coverage[name] * shown, abs=0.02)
+
+
+def test_the_page_of_a_whole_run_knows_no_region(finished: FinishedRun):
+    assert "outside the region" not in Page(finished.dense).source
+    assert finished.report.region is None and finished.report.in_region == {}
+
+
+def test_images_with_too_few_points_are_named(block: DemoBlock, tmp_path, capsys):
+    """Fewer than asked for: left out with their reason, and no failure of the run."""
+    scene = anchored(read_scene(block.sparse_dir))
+    low = (scene.points + scene.anchor).min(axis=0)
+    box = f"{low[0]},{low[1]},-99,{low[0] + 12},{low[1] + 12},99"
+    part, _, _ = focused(scene, read_region(box), 1, "--region")
+    least = sorted(len(view.point_indices) for view in part.views)[len(part.views) // 3] + 1
+    part, _, too_few = focused(scene, read_region(box), least, "--region")
+    assert too_few and all(0 < number < least for number in too_few.values())
+    assert not too_few.keys() & {view.name for view in part.views}
+    arguments = ["run", "--model", str(block.sparse_dir), "--output", str(tmp_path / "dense"), "--threads", "2"]
+    code = cli.main([*arguments, f"--region={box}", "--pairs.min-shared-points", str(least)])
+    said = capsys.readouterr().err
+    report = json.loads((tmp_path / "dense/colmap_sph/report.json").read_text())
+    assert code == (5 if report["skipped_images"] else 0)
+    assert too_few.keys() <= report["out_of_region"].keys()
+    assert f"{len(report['out_of_region'])} left out" in said
+    page = Page(tmp_path / "dense")
+    for name, number in too_few.items():
+        assert f"sees {number} sparse points in the region and near it, fewer than {least}" in page.text("li")
+        assert name in page.text("b")
+
+
+def test_maps_of_images_outside_are_not_those_of_the_run(finished: FinishedRun, tmp_path):
+    """In a workspace with maps of a whole run, a run on a corner shows the corner alone."""
+    dense = tmp_path / "dense"
+    shutil.copytree(finished.dense, dense)
+    points = read_scene(dense / "sparse").points
+    low = points[:, :2].min(axis=0)
+    report = colmap_sph.run(
+        workspace=dense, options=RunOptions(region=f"{low[0]},{low[1]},-99,{low[0] + 8},{low[1] + 8},99")
+    )
+    assert 2 <= report.images < 10
+    page = Page(dense)
+    assert f"{report.images} of 10 images with depth maps, {report.points:,} points" in page.text("p")
+    assert page.all("canvas")
+    bars = [each["aria-label"] or "" for each in page.all("svg") if each.get("class") == "bar"]
+    assert sum(words == "outside the region 100.0 %" for words in bars) == 10 - len(report.coverage)

@@ -12,6 +12,7 @@ import tyro
 import colmap_sph
 from colmap_sph.app.colmap.commands import answer as colmap_answer
 from colmap_sph.app.colmap.commands import is_colmap_command
+from colmap_sph.app.colmap.spelling import spelling_of
 from colmap_sph.app.completion import short_completion
 from colmap_sph.app.demo import run_demo
 from colmap_sph.app.display import Display
@@ -121,6 +122,7 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal) -> int:
         logger.info("Interrupted")
         _print_interrupted(None, terminal)
 
+    terminal.spell = spelling_of(arguments[0])
     try:
         with stop_on_signals(last_words):
             return colmap_answer(arguments, terminal)

@@ -1,6 +1,7 @@
 """`colmap_sph report` and `colmap_sph view`: the page of a workspace, made again, or shown in the browser."""
 
 import os
+import signal
 import sys
 import webbrowser
 from dataclasses import dataclass
@@ -11,8 +12,9 @@ import tyro
 
 from colmap_sph.app.display import Display
 from colmap_sph.app.terminal import Terminal, print_result
-from colmap_sph.errors import InputError, OutputError
+from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pages import write_page
+from colmap_sph.pages.whole_cloud import CloudServer
 from colmap_sph.project.claim import check_links
 from colmap_sph.project.sparse_model import has_model
 from colmap_sph.project.workspace import Workspace
@@ -39,6 +41,11 @@ class ViewCommand:
 
     workspace: Annotated[Path, tyro.conf.Positional]
     """Dense workspace, such as dense."""
+    full: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show the whole cloud instead, the more of it the nearer one looks: served to this machine alone, until
+    Ctrl-C."""
+    port: int = 0
+    """Port of this machine for --full, such as one that ssh -L brings to another; 0: any that is free."""
 
 
 def report_command(command: ReportCommand, terminal: Terminal) -> int:
@@ -52,15 +59,51 @@ def report_command(command: ReportCommand, terminal: Terminal) -> int:
 def view_command(command: ViewCommand, terminal: Terminal) -> int:
     """`colmap_sph view`: the page's path on the standard output, the page in the browser."""
     workspace = opened(command.workspace)
+    if command.full:
+        return _serve_cloud(workspace, command.port, terminal)
+    if command.port:
+        raise OptionError("--port is for --full, which is missing; the page alone needs none.", "port")
     _bring_up_to_date(workspace, terminal)
     print_result(str(workspace.page_path))
     page = workspace.page_path.absolute()
-    has_windows = sys.platform == "darwin" or any(os.environ.get(name) for name in _WINDOWS)
-    if not has_windows or not webbrowser.open(page.as_uri()):
+    if not _is_shown(page.as_uri()):
         raise InputError(
             f"No browser can be opened here; open {page} in one, or copy it to a machine with a screen: it is one "
             "file."
         )
+    return 0
+
+
+def _is_shown(address: str) -> bool:
+    """Show an address in the browser, where there is one."""
+    has_windows = sys.platform == "darwin" or any(os.environ.get(name) for name in _WINDOWS)
+    return has_windows and webbrowser.open(address)
+
+
+def _serve_cloud(workspace: Workspace, port: int, terminal: Terminal) -> int:
+    """Serve the whole cloud until Ctrl-C; its address on the standard output."""
+    with Display(terminal) as display:
+        is_begun = False
+
+        def looked_at(blocks: int) -> None:
+            nonlocal is_begun
+            if not is_begun:
+                display.start("look at the cloud", blocks)
+                is_begun = True
+            display.advance()
+
+        server = CloudServer(workspace, port=port, looked_at=looked_at)
+    try:
+        print_result(server.address)
+        is_shown = _is_shown(server.address)
+        where = "shown in the browser" if is_shown else "open the address above in a browser on this machine"
+        terminal.say(f"The whole cloud is served to this machine alone: {where}. Ctrl-C ends it.")
+        server.run()
+    except KeyboardInterrupt as stop:
+        if getattr(stop, "signal_number", signal.SIGINT) != signal.SIGINT:
+            raise
+    finally:
+        server.close()
     return 0
 
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from shlex import quote
 from typing import Annotated, Literal
 
 import tyro
@@ -23,6 +22,7 @@ from colmap_sph.app.option_list import Option, option_groups
 from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.spelling import EVERYDAY
 from colmap_sph.app.terminal import Terminal
+from colmap_sph.errors import shell_word
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
 from colmap_sph.pipeline.presets import Quality
@@ -207,6 +207,9 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     terminal.table("Depth maps", ["image", "coverage", "agreement"], rows, caption)
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
     facts = [("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")]
+    if report.region is not None:
+        left = f"; {len(report.out_of_region)} left out that see too little of it" if report.out_of_region else ""
+        facts.append(("region", f"in {len(report.coverage)} images, of whose pixels in it coverage is{left}"))
     if report.stretched:
         facts.append(("values", report.stretched))
     facts.append(("agreement", _agreement(report)))
@@ -223,7 +226,7 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
     if workspace.page_path.is_file():
         facts.append(
-            ("look at", f"{workspace.page_path}, in a browser: colmap_sph view {quote(str(workspace.root))}")
+            ("look at", f"{workspace.page_path}, in a browser: colmap_sph view {shell_word(str(workspace.root))}")
         )
     terminal.facts(facts)
     for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):

@@ -1,11 +1,9 @@
 """Arguments → the command as one types it into a shell, to repeat it."""
 
-import os
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from colmap_sph.errors import printable
+from colmap_sph.errors import shell_word
 
 
 def as_typed(arguments: Sequence[str]) -> str:
@@ -18,23 +16,9 @@ def as_typed(arguments: Sequence[str]) -> str:
     >>> print(as_typed(["run", "--model", "my block/sparse/0", "--images", "a\x1bb"]))
     colmap_sph run --model 'my block/sparse/0' --images $'a\x1bb'
     """
-    return " ".join(["colmap_sph", *map(_word, arguments)])
+    return " ".join(["colmap_sph", *map(shell_word, arguments)])
 
 
 def to_repeat(arguments: Sequence[str]) -> str:
     """The same from any folder, as paths in the arguments belong to the current one."""
-    return f"cd {_word(str(Path.cwd()))} && {as_typed(arguments)}"
-
-
-def _word(argument: str) -> str:
-    if printable(argument) == argument:
-        return shlex.quote(argument)
-    return f"$'{''.join(map(_escaped, argument))}'"
-
-
-def _escaped(character: str) -> str:
-    if character in "\\'":
-        return f"\\{character}"
-    if printable(character) == character:
-        return character
-    return "".join(f"\\x{byte:02x}" for byte in os.fsencode(character))
+    return f"cd {shell_word(str(Path.cwd()))} && {as_typed(arguments)}"

@@ -9,7 +9,7 @@ import logging
 import re
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from datetime import datetime
 
@@ -28,9 +28,16 @@ _RULES = 3
 
 
 class Terminal:
-    """The standard error stream, a terminal or not."""
+    """The standard error stream, a terminal or not.
+
+    Attributes
+    ----------
+    spell : callable
+        What is said → the same in other words, before it is made printable.
+    """
 
     def __init__(self) -> None:
+        self.spell: Callable[[str], str] = str
         self._stream = sys.stderr
         self._console = Console(file=self._stream, highlight=False)
         self._bars: rich.progress.Progress | None = None
@@ -49,7 +56,7 @@ class Terminal:
 
     def say(self, text: object, *, label: str = "", style: str = "") -> None:
         """Say something in one line, behind a label of that style."""
-        line = Text.assemble((f"{label} " if label else "", style), printable(text))
+        line = Text.assemble((f"{label} " if label else "", style), printable(self.spell(str(text))))
         if self.is_interactive:
             self._console.print(line, soft_wrap=True)
         else:
@@ -67,6 +74,7 @@ class Terminal:
 
     def facts(self, rows: Sequence[tuple[str, str]]) -> None:
         """Show names and what is known of them, one a line."""
+        rows = [(name, self.spell(value)) for name, value in rows]
         if self.is_interactive:
             self._print_facts(rows)
         else:

@@ -21,7 +21,7 @@ _POINTS_PER_CELL = 3.0
 # Share of points and cameras that the frame goes around; it is then wider by so much.
 _INSIDE = 98.0
 _MARGIN = 0.04
-_NOTHING_LOST = (Reason.CONFIRMED, Reason.MASKED)
+_NOTHING_LOST = (Reason.CONFIRMED, Reason.OUTSIDE, Reason.MASKED)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ class Ground:
         -------
         picture : (h, w, 4) uint8 ndarray
         shares : dict
-            Of all cells with any sample those that are weak for each reason, the largest first.
+            Of all cells with any sample that was asked for those that are weak for each reason, the largest first.
         """
         lost = self.samples.copy()
         lost[list(_NOTHING_LOST)] = 0
@@ -192,7 +192,8 @@ class Ground:
         why = lost.argmax(axis=0)
         table = np.array([COLOURS[reason] for reason in Reason], np.uint8)
         picture = np.dstack([table[why], np.where(weak, 255, 0).astype(np.uint8)])
-        known = max(int(self.samples.any(axis=0).sum()), 1)
+        wanted = [reason for reason in Reason if reason != Reason.OUTSIDE]
+        known = max(int(self.samples[wanted].any(axis=0).sum()), 1)
         shares = {reason: float((weak & (why == reason)).sum() / known) for reason in Reason}
         largest = sorted(shares.items(), key=lambda item: -item[1])
         return picture, {reason: share for reason, share in largest if share > 0}

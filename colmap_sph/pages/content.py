@@ -26,12 +26,18 @@ class CloudSample:
         Points of the whole cloud.
     lack : str
         Why there are none.
+    doubt : str
+        Why they may not be of the maps that are shown.
+    is_of_others : bool
+        Whether the cloud is left out as it is not of the maps that are shown.
     """
 
     points: NDArray[np.float64]
     colours: NDArray[np.uint8]
     total: int
     lack: str
+    doubt: str = ""
+    is_of_others: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,7 +49,7 @@ class ImageFacts:
     shares : tuple of float
         Share of its samples of each `Reason`.
     found : float
-        Share with a photometric depth.
+        Share with a photometric depth, of those that show the region.
     gsd : float or None
         Median of depth by focal length where there is a geometric depth, model units per pixel.
     has_maps : bool
@@ -69,8 +69,8 @@ class ImageFacts:
 
     @property
     def coverage(self) -> float:
-        """Share with a geometric depth."""
-        return self.shares[Reason.CONFIRMED]
+        """Share with a geometric depth, of those samples that show the region."""
+        return self.shares[Reason.CONFIRMED] / max(1 - self.shares[Reason.OUTSIDE], 1e-9)
 
 
 def read_picture(workspace: Workspace, view: View) -> Bytes | None:
@@ -104,7 +104,7 @@ def facts_of_image(
     return ImageFacts(
         view.name,
         tuple((counts / reasons.size).tolist()),
-        float((samples.photometric > 0).mean()),
+        int((samples.photometric > 0).sum()) / max(reasons.size - int(counts[Reason.OUTSIDE]), 1),
         gsd,
         samples.has_maps,
         pictures,

@@ -17,8 +17,8 @@ MOST_LINES = 100
 
 _COLUMNS = [
     ("image", "Name of the image"),
-    ("coverage", "Share of pixels with a confirmed depth"),
-    ("matched", "Share of pixels with a depth by its own pairs, confirmed or not"),
+    ("coverage", "Share of pixels with a confirmed depth; of a region, of those that show it"),
+    ("matched", "Share of pixels with a depth by its own pairs, confirmed or not; of a region likewise"),
     ("agreement", "Sparse points that agree with its depth map"),
     ("rows, px", "How far rows of its pairs disagree"),
     ("GSD", "What a pixel covers, model units (median)"),
@@ -37,6 +37,7 @@ def image_values(content: Content, run: RunFacts) -> dict[str, Any]:
     left_out = [
         *run.skipped_images.items(),
         *((name, f"incomplete: {why}") for name, why in run.incomplete.items()),
+        *run.out_of_region.items(),
     ]
     shown = sum(bool(image.pictures) for image in content.images)
     words = ""
@@ -55,7 +56,9 @@ def image_values(content: Content, run: RunFacts) -> dict[str, Any]:
 def _image_row(place: int, content: Content, run: RunFacts, pairs: list[PairFacts]) -> dict[str, Any]:
     image = content.images[place]
     view = content.scene.views[place]
-    lost = max((share, reason) for reason, share in zip(Reason, image.shares, strict=True) if reason)
+    lost = max(
+        (share, reason) for reason, share in zip(Reason, image.shares, strict=True) if reason > Reason.OUTSIDE
+    )
     coverage = run.coverage.get(image.name, image.coverage)
     points = run.points_of.get(image.name)
     cells = [

@@ -61,7 +61,11 @@ def map_values(content: Content) -> dict[str, Any]:
         )
         + "A triangle is a camera, and points where it looks, a diamond one that looks down; "
         + "choose one to see its pictures.",
-        "reasons": [_reason(reason, content.images) for reason in Reason],
+        "reasons": [
+            _reason(reason, content.images)
+            for reason in Reason
+            if reason != Reason.OUTSIDE or (content.run is not None and content.run.region is not None)
+        ],
     }
 
 

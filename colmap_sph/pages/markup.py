@@ -2,6 +2,7 @@
 
 import base64
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -25,21 +26,9 @@ _ANGLE_BARS = 24
 
 def render(content: Content) -> str:
     """Return the page's text."""
-    environment = Environment(
-        loader=FileSystemLoader(_FOLDER),
-        autoescape=True,
-        undefined=StrictUndefined,
-        # Names of files may hold characters that reorder or hide what stands beside them.
-        finalize=lambda value: value if isinstance(value, Markup) else printable_text(value),
-    )
-    style = (_FOLDER / "page.css").read_text(encoding="utf-8")
-    script = (_FOLDER / "page.js").read_text(encoding="utf-8")
     run = content.run or RunFacts()
     values: dict[str, Any] = {
-        "style": Markup(style),
-        "style_hash": _hash(style),
-        "script": Markup(script),
-        "script_hash": _hash(script),
+        **style_and_script("page.css", "cloud.js", "page.js"),
         "version": colmap_sph.__version__,
         **_head(content, run),
         **cloud_values(content),
@@ -52,7 +41,31 @@ def render(content: Content) -> str:
         "names": [printable(image.name) for image in content.images],
         "pairs": [[pair.left, pair.right, pair.angle, pair.rows] for pair in content.pairs],
     }
-    return environment.get_template("page.html").render(values)
+    return from_template("page.html", values)
+
+
+def from_template(name: str, values: Mapping[str, Any]) -> str:
+    """Fill in a template of this folder."""
+    environment = Environment(
+        loader=FileSystemLoader(_FOLDER),
+        autoescape=True,
+        undefined=StrictUndefined,
+        # Names of files may hold characters that reorder or hide what stands beside them.
+        finalize=lambda value: value if isinstance(value, Markup) else printable_text(value),
+    )
+    return environment.get_template(name).render(values)
+
+
+def style_and_script(style_name: str, *script_names: str) -> dict[str, str]:
+    """Values of a template for a page's own style and scripts, of files of this folder, and their digests."""
+    style = (_FOLDER / style_name).read_text(encoding="utf-8")
+    script = "".join((_FOLDER / name).read_text(encoding="utf-8") for name in script_names)
+    return {
+        "style": Markup(style),
+        "style_hash": _hash(style),
+        "script": Markup(script),
+        "script_hash": _hash(script),
+    }
 
 
 def printable_text(value: object) -> object:
@@ -73,6 +86,11 @@ def _head(content: Content, run: RunFacts) -> dict[str, Any]:
     if changed:
         some = ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
         notices.insert(0, ("out of date", f"maps were made again after the run that this tells of ended: {some}."))
+    if run.until == "photometric":
+        words = "the run ended with depth that images have by their own pairs, and no other image confirms."
+        notices.insert(0, ("photometric maps only", words))
+    if content.cloud.doubt:
+        notices.insert(0, ("in doubt", content.cloud.doubt))
     if content.missing:
         notices.insert(0, ("not finished", f"{content.missing[:1].upper()}{content.missing[1:]}."))
     root = real_path(content.workspace.root)
@@ -81,14 +99,19 @@ def _head(content: Content, run: RunFacts) -> dict[str, Any]:
         "headline": _headline(content, run),
         "notices": notices,
         "facts": _facts(content, run),
-        "how_to_look": f"The whole cloud is {content.workspace.fused_path.name}, beside the folder of this page: "
-        "CloudCompare, MeshLab and Blender open it. Depth and normal maps are in stereo, as COLMAP has them; "
+        "how_to_look": (
+            f"The whole cloud is {content.workspace.fused_path.name}, beside the folder of this page: colmap_sph "
+            "view --full shows all of it, and CloudCompare, MeshLab and Blender open it. "
+            if content.cloud.total
+            else ""
+        )
+        + "Depth and normal maps are in stereo, as COLMAP has them; "
         "colmap gui and the meshers of COLMAP and OpenMVS take the whole folder as their workspace.",
     }
 
 
 def _headline(content: Content, run: RunFacts) -> str:
-    with_depth = sum(image.coverage > 0 for image in content.images)
+    with_depth = sum(covered > 0 for covered in _coverage(content, run))
     words = f"{with_depth:,} of {number(len(content.images), 'image')} with depth maps"
     if content.cloud.total:
         words += f", {content.cloud.total:,} points"
@@ -96,15 +119,20 @@ def _headline(content: Content, run: RunFacts) -> str:
     return f"{words}, in {duration(seconds)}." if seconds else f"{words}."
 
 
+def _coverage(content: Content, run: RunFacts) -> list[float]:
+    """Share of pixels of each image with a depth of the kind with which the run ended."""
+    return [image.coverage if run.last_maps == "geometric" else image.found for image in content.images]
+
+
 def _facts(content: Content, run: RunFacts) -> list[tuple[str, str, str]]:
-    coverage = [image.coverage for image in content.images if image.coverage > 0]
+    coverage = [share for share in _coverage(content, run) if share > 0]
     gsd = [image.gsd for image in content.images if image.gsd is not None]
     angles = [pair.angle for pair in content.pairs if pair.angle is not None]
     facts = [
         (
             "coverage",
             percent(sum(coverage) / len(coverage)) if coverage else "–",
-            "Mean share of pixels with a depth",
+            "Mean share of pixels with a depth" + (", of those that show the region" if run.region else ""),
         ),
         ("points", f"{content.cloud.total:,}", "Of the fused cloud"),
         (

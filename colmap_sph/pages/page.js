@@ -1,49 +1,10 @@
-"use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const find = (id) => document.getElementById(id);
 
 // ---- the cloud: 16-bit places along the map's axes, turned about their middle ------------------------------
-const VERTEX = `attribute vec3 place; attribute vec3 colour; uniform mat4 seen; uniform float size; varying vec3 shade;
-void main() { gl_Position = seen * vec4(place, 1.0); gl_PointSize = clamp(size / gl_Position.w, 1.0, 24.0); shade = colour; }`;
-const FRAGMENT = `precision mediump float; varying vec3 shade; void main() { gl_FragColor = vec4(shade, 1.0); }`;
-
 function decoded(text, count) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
   return { places: new Uint16Array(bytes.buffer, 0, 3 * count), colours: bytes.subarray(6 * count) };
-}
-
-function program(gl) {
-  const made = gl.createProgram();
-  for (const [kind, text] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, text);
-    gl.compileShader(shader);
-    gl.attachShader(made, shader);
-  }
-  gl.linkProgram(made);
-  return made;
-}
-
-function attribute(gl, shaders, name, values, type) {
-  const place = gl.getAttribLocation(shaders, name);
-  gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
-  gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
-  gl.enableVertexAttribArray(place);
-  gl.vertexAttribPointer(place, 3, type, true, 0, 0);
-}
-
-// Column-major matrix: places 0..1 → clip coordinates of a camera that turns about `target`.
-function matrix(camera, aspect) {
-  const [ct, st, cr, sr] = [Math.cos(camera.turn), Math.sin(camera.turn), Math.cos(camera.rise), Math.sin(camera.rise)];
-  const right = [ct, st, 0], up = [-st * sr, ct * sr, cr], back = [st * cr, -ct * cr, sr];
-  const offset = (axis) => -axis.reduce((sum, value, k) => sum + value * camera.target[k], 0);
-  const near = camera.distance / 50, far = camera.distance + 4;
-  const across = 1.7 / Math.max(aspect, 1), upwards = 1.7 * Math.min(aspect, 1);
-  const rows = [[...right, offset(right)].map((value) => value * across), [...up, offset(up)].map((value) => value * upwards)];
-  const depth = [...back, offset(back) - camera.distance];
-  rows.push(depth.map((value, k) => value * (near + far) / (near - far) + (k === 3 ? 2 * near * far / (near - far) : 0)));
-  rows.push(depth.map((value) => -value));
-  return Float32Array.from({ length: 16 }, (_, k) => rows[k % 4][k >> 2]);
 }
 
 function showCloud() {
@@ -58,57 +19,21 @@ function showCloud() {
   gl.enable(gl.DEPTH_TEST);
   gl.clearColor(0.063, 0.078, 0.102, 1);
   const reach = data.cloud.reach, spacing = 2.4 * reach / Math.sqrt(count);
-  const start = () => ({ turn: 0.35, rise: 0.75, distance: 2.4 * reach, target: data.cloud.middle });
-  let camera = start(), waiting = false;
+  let waiting = false;
   const draw = () => {
     waiting = false;
     const sharp = window.devicePixelRatio || 1;
     [canvas.width, canvas.height] = [canvas.clientWidth * sharp, canvas.clientHeight * sharp].map(Math.round);
     gl.viewport(0, 0, canvas.width, canvas.height);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    gl.uniformMatrix4fv(gl.getUniformLocation(shaders, "seen"), false, matrix(camera, canvas.width / Math.max(canvas.height, 1)));
+    gl.uniformMatrix4fv(gl.getUniformLocation(shaders, "seen"), false, matrix(camera, canvas.width / Math.max(canvas.height, 1), 4));
     gl.uniform1f(gl.getUniformLocation(shaders, "size"), spacing * Math.min(canvas.height, canvas.width) * 0.85);
     gl.drawArrays(gl.POINTS, 0, count);
+    canvas.dataset.drawn = count;
   };
   const redraw = () => { if (!waiting) { waiting = true; requestAnimationFrame(draw); } };
-  const turn = (x, y) => { camera.turn += x; camera.rise = Math.min(Math.max(camera.rise + y, -1.57), 1.57); };
-  const zoom = (factor) => { camera.distance = Math.min(Math.max(camera.distance * factor, 0.05 * reach), 20); };
-  const move = (x, y) => {
-    const [ct, st, cr, sr] = [Math.cos(camera.turn), Math.sin(camera.turn), Math.cos(camera.rise), Math.sin(camera.rise)];
-    const right = [ct, st, 0], up = [-st * sr, ct * sr, cr];
-    camera.target = camera.target.map((value, k) => value + camera.distance * (up[k] * y - right[k] * x));
-  };
-  const fingers = new Map();
-  canvas.addEventListener("pointerdown", (event) => { fingers.set(event.pointerId, event); canvas.setPointerCapture(event.pointerId); canvas.focus({ preventScroll: true }); });
-  for (const name of ["pointerup", "pointercancel"]) canvas.addEventListener(name, (event) => fingers.delete(event.pointerId));
-  canvas.addEventListener("pointermove", (event) => {
-    const last = fingers.get(event.pointerId);
-    if (!last) return;
-    const side = canvas.clientHeight, x = (event.clientX - last.clientX) / side, y = (event.clientY - last.clientY) / side;
-    const other = [...fingers.values()].find((finger) => finger.pointerId !== event.pointerId);
-    if (other) {
-      const apart = (finger) => Math.hypot(finger.clientX - other.clientX, finger.clientY - other.clientY) || 1;
-      zoom(apart(last) / apart(event));
-      move(x / 2, y / 2);
-    } else if (event.shiftKey || event.buttons & 6) move(x, y); else turn(-4 * x, 3 * y);
-    fingers.set(event.pointerId, event);
-    redraw();
-  });
-  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-  canvas.addEventListener("wheel", (event) => { event.preventDefault(); zoom(Math.exp(Math.sign(event.deltaY) * Math.min(Math.abs(event.deltaY), 120) / 600)); redraw(); }, { passive: false });
-  const ways = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
-  canvas.addEventListener("keydown", (event) => {
-    const way = ways[event.key];
-    if (event.ctrlKey || event.altKey || event.metaKey) return;
-    if (way) event.shiftKey ? move(-0.05 * way[0], -0.05 * way[1]) : turn(0.1 * way[0], 0.1 * way[1]);
-    else if (event.key === "+" || event.key === "=") zoom(0.85);
-    else if (event.key === "-") zoom(1 / 0.85);
-    else if (event.key === "0" || event.key === "Home") camera = start();
-    else if (event.key === "t" || event.key === "T") Object.assign(camera, { turn: 0, rise: 1.57 });
-    else return;
-    event.preventDefault();
-    redraw();
-  });
+  const start = { turn: 0.35, rise: 0.75, distance: 2.4 * reach, target: data.cloud.middle };
+  const camera = controls(canvas, start, 0.05 * reach, 20, redraw);
   canvas.addEventListener("webglcontextlost", () => { find("view-lack").hidden = false; });
   new ResizeObserver(redraw).observe(canvas);
 }
@@ -191,8 +116,9 @@ function offerCopy() {
 }
 
 window.addEventListener("beforeprint", () => document.querySelectorAll("img[loading]").forEach((image) => { image.loading = "eager"; }));
-showCloud();
 showMap();
 document.querySelectorAll(".sortable").forEach(sortable);
 showPairs();
 offerCopy();
+// Graphics without a card take their time: all else is there before.
+requestAnimationFrame(() => setTimeout(showCloud));

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.pages.block_map import Frame, Ground, footprint, frame_around, surface_points
+from colmap_sph.pages.cloud_sample import read_cloud
 from colmap_sph.pages.content import CloudSample, Content
 from colmap_sph.pages.image_facts import (
     ImageFacts,
@@ -19,19 +20,17 @@ from colmap_sph.pages.image_facts import (
 )
 from colmap_sph.pages.markup import render
 from colmap_sph.pages.pair_facts import PairFacts, pairs_of
-from colmap_sph.pages.reasons import Partner, find_reasons
+from colmap_sph.pages.reasons import Partner, Reason, find_reasons
 from colmap_sph.pages.run_facts import RunFacts, read_run_facts
 from colmap_sph.pages.samples import MapSamples, read_samples, samples_per_side
 from colmap_sph.pages.vertical import map_axes
-from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.partners.pairs import overlapping_views
 
-# Points of the cloud to look at; of an image's surface, to stand for it where there is no cloud; to frame the map.
-_CLOUD_SAMPLE = 800_000
+# Points of an image's surface, to stand for it where there is no cloud; of the cloud, to frame the map.
 _SURFACE_SAMPLE = 300
 _FRAME_SAMPLE = 100_000
 # Partners of a view to look from, where it is not known which were its.
@@ -94,16 +93,18 @@ def gather(workspace: Workspace, progress: Progress) -> Content:
     facts = read_run_facts(workspace)
     progress.start("report", 2 * len(scene.views))
     samples = {}
+    told = facts or RunFacts()
     for view in scene.views:
-        samples[view.name] = read_samples(workspace, view, samples_per_side(len(scene.views)))
+        kinds = told.kinds_of(view.name)
+        samples[view.name] = read_samples(workspace, view, samples_per_side(len(scene.views)), kinds)
         progress.advance()
-    cloud = _read_cloud(workspace, scene)
+    cloud = read_cloud(workspace, scene, samples)
     if not cloud.total and not any(each.has_maps for each in samples.values()):
         raise InputError(
             f"There is nothing to show of {workspace.root} yet: it has neither depth maps nor a cloud; "
             "run colmap_sph run first."
         )
-    block = _Block(workspace, scene, facts or RunFacts(), samples, cloud)
+    block = _Block(workspace, scene, told, samples, cloud)
     images = []
     for view in scene.views:
         images.append(block.look_at(view))
@@ -131,6 +132,8 @@ class _Block:
         surface = self.cloud.points[:: -(-len(self.cloud.points) // _FRAME_SAMPLE) or 1]
         surface = surface if len(surface) else np.concatenate(list(surfaces.values()))
         self.pairs = pairs_of(self.workspace, self.scene, self.facts, surfaces)
+        region = self.facts.region
+        self._region = None if region is None else region.as_region().moved(-self.scene.origin)
         self._partners = self._find_partners()
         self._shown = self._choose_shown()
         centers = np.array([view.center for view in self.scene.views])
@@ -149,7 +152,10 @@ class _Block:
             [Partner(other, self.samples[other.name]) for other in others],
             blank=find_blank(picture, samples.geometric.shape),
             min_angle=self.facts.min_angle,
+            region=self._region,
         )
+        if not self.facts.kinds_of(view.name):
+            reasons[:] = Reason.OUTSIDE
         self.ground.add(view, samples, reasons, depth)
         pictures: tuple[Picture, ...] = ()
         if view.name in self._shown:
@@ -186,26 +192,16 @@ class _Block:
         return {*worst, *(rest[k] for k in np.linspace(0, len(rest) - 1, _MOST_SHOWN - len(worst)).astype(int))}
 
 
-def _read_cloud(workspace: Workspace, scene: Scene) -> CloudSample:
-    """A sample of the cloud, in the scene's coordinates; without a cloud the reason in words."""
-    if not workspace.fused_path.exists():
-        return CloudSample(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), 0, "There is no cloud yet.")
-    try:
-        points, colours, total = read_some_points(workspace.fused_path, _CLOUD_SAMPLE)
-    except InputError as error:
-        return CloudSample(np.zeros((0, 3)), np.zeros((0, 3), np.uint8), 0, str(error))
-    return CloudSample(points - scene.origin, colours, total, "" if total else "The cloud has no points.")
-
-
 def _missing(block: _Block, facts: RunFacts | None) -> str:
     """What is missing of a finished run, in a sentence."""
     lacks = []
     expected = block.samples if facts is None else {name for name, share in facts.coverage.items() if share > 0}
-    without = [name for name in expected if name in block.samples and not block.samples[name].has_geometric]
+    told = block.facts
+    without = [name for name in expected if name in block.samples and not block.samples[name].has(told.last_maps)]
     if without:
-        lacks.append(f"{len(without)} of {len(expected)} images have no geometric depth map")
-    if not block.cloud.total:
-        lacks.append("there is no cloud")
+        lacks.append(f"{len(without)} of {len(expected)} images have no {told.last_maps} depth map")
+    if not block.cloud.total and told.until == "cloud":
+        lacks.append("the cloud is of other depth maps" if block.cloud.is_of_others else "there is no cloud")
     if facts is None:
         lacks.append("no run of this program has come to its end here, so that its numbers are not known")
     return f"{', '.join(lacks[:-1])}{' and ' if len(lacks) > 1 else ''}{lacks[-1]}" if lacks else ""

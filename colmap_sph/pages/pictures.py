@@ -13,6 +13,7 @@ Bytes = NDArray[np.uint8]
 # Red, green, blue of each reason: told apart by people who do not see all colours, on white and on black.
 COLOURS: dict[Reason, tuple[int, int, int]] = {
     Reason.CONFIRMED: (148, 163, 184),
+    Reason.OUTSIDE: (90, 96, 106),
     Reason.MASKED: (30, 30, 34),
     Reason.ONE_IMAGE: (230, 159, 0),
     Reason.NO_PARALLAX: (240, 228, 66),

@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.pages.samples import MapSamples
-from colmap_sph.scene import View, pixel_transfer
+from colmap_sph.scene import Region, View, pixel_transfer
+from colmap_sph.stereo.region.inside import is_inside
+from colmap_sph.stereo.region.shown import filled
+from colmap_sph.stereo.region.window import outline_on
 
 # Between two samples depth may change by more than among those around.
 _SLACK = 0.02
@@ -19,17 +22,19 @@ class Reason(IntEnum):
     """Why a pixel has no geometric depth, in the order of the gates; or that it has one."""
 
     CONFIRMED = 0
-    MASKED = 1
-    ONE_IMAGE = 2
-    NO_PARALLAX = 3
-    BLANK = 4
-    NOT_FOUND = 5
-    CONTRADICTED = 6
-    ALONE = 7
+    OUTSIDE = 1
+    MASKED = 2
+    ONE_IMAGE = 3
+    NO_PARALLAX = 4
+    BLANK = 5
+    NOT_FOUND = 6
+    CONTRADICTED = 7
+    ALONE = 8
 
 
 WORDS = {
     Reason.CONFIRMED: ("confirmed", "depth confirmed by other images: what is fused"),
+    Reason.OUTSIDE: ("outside the region", "not asked for: what it shows lies outside the region"),
     Reason.MASKED: ("masked", "ignored under the mask"),
     Reason.ONE_IMAGE: ("one image only", "no partner of the image has the place in view"),
     Reason.NO_PARALLAX: ("no parallax", "partners see it from nearly the same place"),
@@ -59,6 +64,7 @@ def find_reasons(
     *,
     blank: NDArray[np.bool_],
     min_angle: float,
+    region: Region | None = None,
 ) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     """Say of each sample of a view what became of it.
 
@@ -73,6 +79,8 @@ def find_reasons(
         Where the image shows nothing that could be matched.
     min_angle : float
         Less parallax tells no depth, degrees.
+    region : Region, optional
+        Where depth was asked for, finite, in the view's world frame.
 
     Returns
     -------
@@ -93,20 +101,28 @@ def find_reasons(
     reasons[has_own] = Reason.ALONE
     reasons[has_own & met] = Reason.CONTRADICTED
     reasons[has_own & unseen] = Reason.ONE_IMAGE
+    reasons[samples.ignored] = Reason.MASKED
+    if region is not None:
+        reasons[~_shows(region, view, samples, depth) & ~has_own] = Reason.OUTSIDE
     reasons[samples.geometric > 0] = Reason.CONFIRMED
-    reasons[samples.ignored & (samples.geometric <= 0)] = Reason.MASKED
     return reasons, depth
 
 
-def filled(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Depths with the nearest one in place of none; 0 everywhere where there is not any."""
-    none = (depth <= 0).astype(np.uint8)
-    if none.all() or not none.any():
-        return depth
-    _, labels = cv2.distanceTransformWithLabels(none, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
-    of_label = np.zeros(int(labels.max()) + 1, np.float32)
-    of_label[labels[none == 0]] = depth[none == 0]
-    return np.asarray(of_label[labels], np.float32)
+def _shows(region: Region, view: View, samples: MapSamples, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """(h, w): does the sample show a region? Where no depth of the view is known, it may."""
+    columns, rows = (grid.ravel() for grid in np.meshgrid(samples.columns, samples.rows))
+    outline = outline_on(view, region.box)
+    if outline is None:
+        return np.zeros(depth.shape, bool)
+    # A convex outline: inside is on the same side of each of its edges.
+    along = np.roll(outline, -1, axis=0) - outline
+    across = along[:, :1] * (rows + 0.5 - outline[:, 1:]) - along[:, 1:] * (columns + 0.5 - outline[:, :1])
+    shows: NDArray[np.bool_] = np.asarray((across >= 0).all(axis=0))
+    known = depth.ravel() > 0
+    pixels = np.stack([columns, rows, np.ones_like(rows)])[:, known].astype(np.float64)
+    points = (view.R.T @ np.linalg.inv(view.K) @ pixels * depth.ravel()[known]).T + view.center
+    shows[known] &= is_inside(region, points)
+    return shows.reshape(depth.shape)
 
 
 def _look_from(

@@ -1,14 +1,16 @@
 """``report.json`` and the records of the maps → what is known of the last run, and what of that is out of date."""
 
 from collections.abc import Iterable
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 
 import msgspec
+import numpy as np
 from msgspec import Meta
 
 from colmap_sph.project.state.ownership import map_place
 from colmap_sph.project.state.records import read_json, read_record
-from colmap_sph.project.workspace import Workspace
+from colmap_sph.project.workspace import MapKind, Workspace
+from colmap_sph.scene import Region
 
 _MAX_BYTES = 1 << 28
 # As in COLMAP; what `--pairs.min-triangulation-angle` is where nobody asked for something else.
@@ -16,10 +18,27 @@ _USUAL_MIN_ANGLE = 1.0
 
 # Numbers that are printed; nothing says that the file is this program's.
 _MOST = 1e12
+_MOST_CORNERS = 20_000
 Positive = Annotated[float, Meta(ge=0, le=_MOST)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 Count = Annotated[int, Meta(ge=0, le=int(_MOST))]
 MatchedPair = tuple[str, str, Positive | None]
+Coordinate = Annotated[float, Meta(ge=-_MOST, le=_MOST)]
+Corner = tuple[Coordinate, Coordinate, Coordinate]
+Ring = Annotated[list[tuple[Coordinate, Coordinate]], Meta(min_length=3, max_length=_MOST_CORNERS)]
+Polygon = Annotated[list[Ring], Meta(min_length=1, max_length=_MOST_CORNERS)]
+
+
+class RegionFacts(msgspec.Struct, frozen=True):
+    """The region that a run worked on, in the model's coordinates; see `RunReport`."""
+
+    box: tuple[Corner, Corner]
+    polygons: Annotated[list[Polygon], Meta(max_length=_MOST_CORNERS)] = []
+
+    def as_region(self) -> Region:
+        """The same in the words of the scene."""
+        polygons = tuple(tuple(np.array(ring) for ring in rings) for rings in self.polygons)
+        return Region(np.array(self.box), polygons)
 
 
 class RunFacts(msgspec.Struct, frozen=True):
@@ -39,6 +58,9 @@ class RunFacts(msgspec.Struct, frozen=True):
     polishing: str = ""
     row_residual: Positive | None = None
     row_residuals: dict[str, Positive] = {}
+    until: Literal["cloud", "geometric", "photometric"] = "cloud"
+    region: RegionFacts | None = None
+    out_of_region: dict[str, str] = {}
     coverage: dict[str, Share] = {}
     agreement: dict[str, Share | None] = {}
     overall_agreement: Share | None = None
@@ -52,6 +74,17 @@ class RunFacts(msgspec.Struct, frozen=True):
     reused: dict[str, Count] = {}
     seconds: dict[str, Positive] = {}
     peak_memory: Count = 0
+
+    @property
+    def last_maps(self) -> MapKind:
+        """The kind of maps with which the run ended; others that are there are of another run."""
+        return "photometric" if self.until == "photometric" else "geometric"
+
+    def kinds_of(self, name: str) -> tuple[MapKind, ...]:
+        """Kinds of maps of an image that may be of the run: none where its region was not looked for in it."""
+        if self.region is not None and name not in self.coverage:
+            return ()
+        return ("photometric",) if self.until == "photometric" else get_args(MapKind)
 
     @property
     def warnings(self) -> list[tuple[str, str]]:
@@ -78,14 +111,14 @@ def read_run_facts(workspace: Workspace) -> RunFacts | None:
 
 
 def changed_since(workspace: Workspace, facts: RunFacts, names: Iterable[str]) -> list[str]:
-    """Those of the images `names` whose geometric maps are not those of which ``report.json`` tells.
+    """Those of the images `names` whose last maps are not those of which ``report.json`` tells.
 
     A run that was ended before its end has made some anew, and has not said so yet.
     """
     changed = []
     for name in names:
         coverage = facts.coverage.get(name)
-        record = read_record(map_place(workspace, name, "geometric").record)
+        record = read_record(map_place(workspace, name, facts.last_maps).record)
         if coverage is not None and record is not None and record.facts.get("coverage", coverage) != coverage:
             changed.append(name)
     return changed

@@ -1,9 +1,11 @@
 """A view's maps and mask → what is needed of them for a page: values at a grid of pixels."""
 
 import math
+from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +54,10 @@ class MapSamples:
     has_geometric: bool
     ignored: NDArray[np.bool_]
 
+    def has(self, kind: MapKind) -> bool:
+        """Whether there is a map of this kind."""
+        return self.has_geometric if kind == "geometric" else self.has_photometric
+
     @property
     def has_maps(self) -> bool:
         """Whether there is any map of the view."""
@@ -68,11 +74,17 @@ def grid_of(view: View, per_side: int) -> tuple[NDArray[np.int64], NDArray[np.in
     return rows, columns
 
 
-def read_samples(workspace: Workspace, view: View, per_side: int) -> MapSamples:
-    """Read a view's depth maps and mask at a grid of pixels; what is missing or damaged has no depth there."""
+def read_samples(
+    workspace: Workspace, view: View, per_side: int, kinds: Collection[MapKind] = get_args(MapKind)
+) -> MapSamples:
+    """Read a view's depth maps and mask at a grid of pixels; what is missing or damaged has no depth there.
+
+    Maps of other `kinds` count as missing.
+    """
     rows, columns = grid_of(view, per_side)
-    photometric = _depth(workspace, view, "photometric", rows, columns)
-    geometric = _depth(workspace, view, "geometric", rows, columns)
+    photometric, geometric = (
+        _depth(workspace, view, kind, rows, columns) if kind in kinds else None for kind in get_args(MapKind)
+    )
     none = np.zeros((len(rows), len(columns)), np.float32)
     return MapSamples(
         rows,

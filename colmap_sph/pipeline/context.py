@@ -24,7 +24,7 @@ from colmap_sph.scene import Region, Scene
 from colmap_sph.stereo.agreement import SparseTracks
 from colmap_sph.stereo.extent import outline_of
 from colmap_sph.stereo.partners.stations import Stations
-from colmap_sph.stereo.region.focus import Focus, focused
+from colmap_sph.stereo.region.focus import Focus, focused, region_of
 from colmap_sph.stereo.region.window import Window
 
 logger = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ class Context:
         return Stations(self.scene, self.options.pairs.min_triangulation_angle)
 
     def in_region(self) -> "Context":
-        """The same with what of the scene shows the region that the options ask for, if they do.
+        """The same with what of the scene shows the region that the options ask for, if they do; it is reported.
 
         Raises `InputError` where nothing does.
         """
@@ -75,14 +75,25 @@ class Context:
         if not given:
             return self
         least = self.options.pairs.min_shared_points
-        scene, focus = focused(self.scene, read_region(given), least, f"--region {given}")
+        scene, focus, too_few = focused(self.scene, read_region(given), least, f"--region {given}")
         logger.info("%d of %d images show the region", len(scene.views), len(self.scene.views))
+        near = focus.near.moved(self.scene.origin + self.scene.anchor)
+        self.report.region = {
+            "box": near.box.tolist(),
+            "polygons": [[ring.tolist() for ring in rings] for rings in near.polygons],
+        }
+        for name, number in too_few.items():
+            self.report.out_of_region[name] = (
+                f"it sees {number} sparse points in the region and near it, fewer than {least} "
+                "(--pairs.min-shared-points)"
+            )
+            logger.info("%s left out: %s", name, self.report.out_of_region[name])
         return replace(self, scene=scene, focus=focus)
 
     @property
     def region(self) -> Region | None:
         """What results are cut to; None: nothing."""
-        return None if self.focus is None else self.focus.region
+        return region_of(self.focus)
 
     @cached_property
     def _outlines(self) -> dict[str, NDArray[np.float64]]:
@@ -97,9 +108,9 @@ class Context:
         """The part of an image that is worked on: the pixels around its outline."""
         return Window.around(self._outlines[name])
 
-    def cut(self, name: str) -> tuple[Region, Window] | tuple[()]:
+    def cut(self, name: str) -> tuple[object, ...]:
         """Where the results of an image are cut off, as a part of their keys: nothing, where they are not."""
-        return () if self.region is None else (self.region, self.window(name))
+        return () if self.focus is None else (self.focus.region, self.window(name), self.focus.box)
 
     @cached_property
     def sparse_tracks(self) -> SparseTracks:

@@ -7,7 +7,7 @@ from typing import TypeVar
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.workers import for_all
-from colmap_sph.project.state.records import vouching_in_background
+from colmap_sph.project.state.background import vouching_in_background
 
 logger = logging.getLogger(__name__)
 

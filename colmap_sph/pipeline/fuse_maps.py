@@ -1,7 +1,7 @@
 """Fusion as a step of its own: the maps of a dense workspace, whoever made them → a cloud at any path."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import choose_pairs
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.report_files import make_page
 from colmap_sph.pipeline.stages.fuse_to import FuseToStage
 from colmap_sph.pipeline.stages.fusion_partners import partners_in_fusion
 from colmap_sph.pipeline.stages.fusion_parts import index_in_model
@@ -21,14 +22,14 @@ from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.cloud_output import CloudOutput
 from colmap_sph.project.map_files import has_depth, map_size
-from colmap_sph.project.pair_lists import pairs_on_disk, read_lines
+from colmap_sph.project.pair_lists import read_lines
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import map_place, named
 from colmap_sph.project.state.records import altered_files, read_record, whole_digests
 from colmap_sph.project.workspace import MapKind, Workspace, mask_path
 from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.anchor import anchored
-from colmap_sph.stereo.partners.pairing import as_pair
+from colmap_sph.stereo.partners.pairing import Pair, as_pair
 
 logger = logging.getLogger(__name__)
 
@@ -77,19 +78,32 @@ def fuse_maps(
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         check_fusion(context)
         with timed_stage("select pairs", 1, progress, report):
-            matched = [as_pair(*names) for names in pairs_on_disk(workspace, scene)]
-            pairs = matched or choose_pairs(workspace, scene, options, None).unique_pairs()
+            pairs = _pairs_of_maps(context, mapped) or choose_pairs(workspace, scene, options, None).unique_pairs()
             progress.advance()
         names = sorted(mapped)
         partners = partners_in_fusion(context, dict.fromkeys(pairs, ""), names)
         own_region = None if region is None else region.moved(-scene.origin - scene.anchor)
-        execute(FuseToStage(context, partners, _sources(context, mapped), output, own_region))
+        stage = FuseToStage(context, partners, _sources(context, mapped), output, own_region)
+        execute(stage)
+        if stage.is_the_workspaces:
+            make_page(context)
     report.images = len(names)
     if not report.points:
         raise NoResultError(
             "No point survived fusion: no image agrees with enough others on any piece of surface."
         )
     return report
+
+
+def _pairs_of_maps(context: Context, mapped: Mapping[str, View]) -> list[Pair]:
+    """The pairs by which this program made the maps; there may be files of others, matched with other options."""
+    pairs: dict[Pair, None] = {}
+    for name in mapped:
+        files = context.map_files(name, context.options.fusion.input)
+        if not altered_files(read_record(files.record), (files.depth, files.normals)):
+            pairs |= dict.fromkeys(as_pair(name, other) for other in files.partners() if other in mapped)
+    logger.info("Pairs of the maps: %d", len(pairs))
+    return list(pairs)
 
 
 def _listed(workspace: Workspace, scene: Scene) -> list[View]:

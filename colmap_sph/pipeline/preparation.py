@@ -115,7 +115,7 @@ class Preparation:
         self._verify = verify
         self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
-        self.names = self._names()
+        self.names = self._names(report or RunReport())
         originals = self._originals
         if originals.mask_dir is not None:
             check_masks(originals.mask_dir, cameras_of_images(originals.model), originals.image_dir)
@@ -128,12 +128,13 @@ class Preparation:
             report or RunReport(),
         )
 
-    def _names(self) -> tuple[str, ...]:
+    def _names(self, report: RunReport) -> tuple[str, ...]:
         names = tuple(image_names(self._originals.model))
         if not self._options.region:
             return names
         scene = anchored(foreseen_scene(self._originals, names, self._options.undistortion))
-        whole = Context(self.workspace, scene, self._options, Keys(self.workspace, self._options))
+        keys = Keys(self.workspace, self._options)
+        whole = Context(self.workspace, scene, self._options, keys, report=report)
         return tuple(view.name for view in whole.in_region().scene.views)
 
     def run(self, executor: "Executor") -> None:

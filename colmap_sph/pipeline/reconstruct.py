@@ -213,6 +213,7 @@ def reconstruct(
     """
     progress = Silent() if progress is None else progress
     report = report or RunReport()
+    report.until = until
     make_dir(workspace.state_dir)
     with one_opencv_thread():
         is_polishing = given is not None and options.polish.is_wanted

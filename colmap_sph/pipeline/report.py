@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from colmap_sph.pipeline.stages.facts import Agreement
 
@@ -101,8 +101,17 @@ class RunReport:
         has enough ties to tell.
     row_residuals : dict
         Image name → the same of its pairs.
+    until : {"cloud", "geometric", "photometric"}
+        The last results that were asked for.
+    region : dict or None
+        Where a region was asked for: the ``box`` of its surfaces, and ``polygons`` in it, model coordinates.
+    in_region : dict
+        Image name → share of its pixels that show the region; empty without one.
+    out_of_region : dict
+        Image name → why the region is not looked for in it, though it may see some of it.
     coverage : dict
-        Image name → share of its pixels with a geometric depth.
+        Image name → share of its pixels with a geometric depth (photometric, where these are the last results): of
+        those that show the region, where one is asked for.
     agreement : dict
         Image name → share of the sparse points it observes that agree with its geometric depth map; None where
         fewer than ten tell.
@@ -145,6 +154,10 @@ class RunReport:
     pose_movement: dict[str, float] = field(default_factory=dict)
     row_residual: float | None = None
     row_residuals: dict[str, float] = field(default_factory=dict)
+    until: str = "cloud"
+    region: dict[str, list[Any]] | None = None
+    in_region: dict[str, float] = field(default_factory=dict)
+    out_of_region: dict[str, str] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None

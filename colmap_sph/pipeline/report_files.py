@@ -3,7 +3,6 @@
 import json
 import logging
 import resource
-import shlex
 import sys
 import time
 from collections.abc import Iterator, Mapping
@@ -12,7 +11,7 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
-from colmap_sph.errors import OutputError, reason_of
+from colmap_sph.errors import OutputError, reason_of, shell_word
 from colmap_sph.pages import write_page
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.options import RunOptions
@@ -42,7 +41,7 @@ def command_of(project: Project, options: RunOptions) -> str:
     if options.region and Path(options.region).exists():
         options = replace(options, region=str(Path(options.region).absolute()))
     words += _changed(asdict(options), asdict(RunOptions()), "--")
-    return shlex.join(words)
+    return " ".join(map(shell_word, words))
 
 
 def write_report(context: Context) -> None:

@@ -1,6 +1,7 @@
 """A cloud at any path, in each of the kinds of COLMAP's ``stereo_fusion``: PLY, or a model, binary or text."""
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,14 +13,18 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.project.files import make_dir, real_path
+from colmap_sph.project.files import make_dir, open_regular, real_path, whole_digest
 from colmap_sph.project.map_coordinates import move_cloud
-from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, load_model
+from colmap_sph.project.state.records import altered_files, begin, read_record, vouch
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
 
 _PLY_START = b"ply"
 _PLY_END = b"end_header\n"
+_PLY_COUNT = re.compile(rb"^element vertex (\d{1,18})\s*$", re.MULTILINE)
+_HEADER_BYTES = 4096
+_MODEL_KINDS = ("bin", "txt")
 # Of a model in map coordinates.
 _FAR_POINT = np.dtype([("xyz", "<f8", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
 
@@ -49,7 +54,8 @@ class CloudOutput:
         if self.kind == "ply":
             for path in self.files:
                 _check_file(path)
-            _check_is_cloud(self.path)
+            is_own = real_path(self.path) == real_path(workspace.fused_path)  # where nothing of others is lost
+            _check_is_cloud(*self.files, is_own=is_own)
             return
         if self.path.exists() and not self.path.is_dir():
             raise OutputError(f"{self.path} is a file, and the cloud's model a folder; name a folder.")
@@ -59,6 +65,18 @@ class CloudOutput:
             raise OutputError(
                 f"{self.path} holds a binary model, which is read before a text one; name another folder."
             )
+        for record, files in map(self._model, _MODEL_KINDS):
+            foreign = altered_files(read_record(record), files)
+            if foreign:
+                raise OutputError(
+                    f"{foreign[0]} is there already, and not as this program wrote a cloud's model there; name "
+                    "another folder, or remove that model."
+                )
+
+    def _model(self, kind: str) -> tuple[Path, tuple[Path, ...]]:
+        """The record of a cloud's model of this kind, and its files."""
+        files = (f"{stem}.{kind}" for stem in (*MODEL_FILES, *RIG_FILES))
+        return self.path / f"colmap_sph_{kind}.json", tuple(self.path / file for file in files)
 
     def write(self, made: Workspace, sparse_dir: Path, origin: NDArray[np.float64]) -> None:
         """Put a finished cloud there.
@@ -84,8 +102,11 @@ class CloudOutput:
             else:
                 make_dir(self.path)
                 model = cloud_as_model(made.cloud_paths, sparse_dir, origin)
+                record, files = self._model(self.kind)
+                begin(record, files)  # from here on they are ours, whatever happens
                 write: Callable[[Path], None] = model.write_binary if self.kind == "bin" else model.write_text
                 write(self.path)
+                vouch(record, "", {file: whole_digest(file) for file in files})
         except (OSError, RuntimeError) as error:
             raise OutputError(
                 f"{self.path} cannot be written ({reason_of(error)}); check space and permissions."
@@ -121,17 +142,33 @@ def _check_file(path: Path) -> None:
         raise OutputError(f"{path} is a device or a pipe, and the cloud is a file; name a file.")
 
 
-def _check_is_cloud(path: Path) -> None:
-    """Raise `OutputError` for a file that is no cloud: a slip must not cost an image or a map."""
+def _check_is_cloud(path: Path, visibility: Path, *, is_own: bool) -> None:
+    """Raise `OutputError` for a file that no fusion made: a slip must not cost an image, a map, or a scan.
+
+    Fusion, ours and COLMAP's, puts a file beside its cloud that begins with the number of its points.
+    """
     if not path.is_file():
         return
     try:
-        with path.open("rb") as file:
-            start = file.read(len(_PLY_START))
+        start = _start_of(path)
+        count = _start_of(visibility)[:8] if visibility.is_file() else b""
     except OSError as error:
         raise OutputError(f"{path} cannot be replaced ({reason_of(error)}); name another file.") from error
-    if start not in (b"", _PLY_START):
+    if not start:
+        return
+    if not start.startswith(_PLY_START):
         raise OutputError(f"{path} is there already, and is no cloud; name another file, or remove this one.")
+    found = _PLY_COUNT.search(start)
+    if not is_own and (found is None or int(found[1]) != int.from_bytes(count, "little")):
+        raise OutputError(
+            f"{path} is there already, and is not from fusion, which would have put {visibility.name} beside it; "
+            "name another file, or remove this one."
+        )
+
+
+def _start_of(path: Path) -> bytes:
+    with open_regular(path) as file:
+        return file.read(_HEADER_BYTES)
 
 
 def read_back(output: CloudOutput, workspace: Workspace) -> pycolmap.Reconstruction:

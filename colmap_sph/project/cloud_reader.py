@@ -2,6 +2,7 @@
 
 import os
 import re
+from dataclasses import dataclass
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,15 @@ _COLOURS = ("red", "green", "blue")
 # What is read of a large cloud: so many pieces, evenly spread, of so many bytes.
 _PIECES = 4096
 _PIECE_BYTES = 1 << 18
+
+
+@dataclass(frozen=True)
+class PlyLayout:
+    """Type of a point, the number of points, and where in the file the first begins."""
+
+    kind: np.dtype[Any]
+    count: int
+    begin: int
 
 
 def read_some_points(path: Path, most: int) -> tuple[NDArray[np.float64], NDArray[np.uint8], int]:
@@ -53,20 +63,26 @@ def read_some_points(path: Path, most: int) -> tuple[NDArray[np.float64], NDArra
     """
     try:
         with open_regular(path) as file:
-            kind, count, begin = _layout(path, file)
-            points = _read_pieces(file, kind, count, begin, most)
+            layout = read_layout(path, file)
+            points = _read_pieces(file, layout, most)
     except OSError as error:
         raise InputError(f"The cloud {path} cannot be read ({reason_of(error)}); fuse again.") from error
+    return *points_of(points), layout.count
+
+
+def points_of(points: NDArray[np.void]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """(n, 3) places and (n, 3) colours of a file's points, less those that are not finite or absurdly far."""
+    kind = points.dtype
     xyz = np.column_stack([points[name].astype(np.float64) for name in "xyz"])
     rgb = np.full(xyz.shape, 128, np.uint8)
     if all(name in (kind.names or ()) and kind[name] == np.uint8 for name in _COLOURS):
         rgb = np.column_stack([points[name] for name in _COLOURS])
     likely = is_plausible(xyz)
-    return xyz[likely], rgb[likely], count
+    return xyz[likely], rgb[likely]
 
 
-def _layout(path: Path, file: BufferedReader) -> tuple[np.dtype[Any], int, int]:
-    """Type of a point, the number of points, and where the first begins; checked against the file's size."""
+def read_layout(path: Path, file: BufferedReader) -> PlyLayout:
+    """Read how a cloud lies in a file, and check it against the file's size; raises as `read_some_points`."""
     start = file.read(_HEADER_BYTES)
     end = _END.search(start)
     header = start[: end.start()].decode("ascii", "replace").splitlines() if end else []
@@ -91,11 +107,14 @@ def _layout(path: Path, file: BufferedReader) -> tuple[np.dtype[Any], int, int]:
     count = int(element[2][:15])
     if os.fstat(file.fileno()).st_size < end.end() + count * kind.itemsize:
         raise InputError(f"{path} is cut off; fuse again.")
-    return kind, count, end.end()
+    return PlyLayout(kind, count, end.end())
 
 
-def _read_pieces(file: BufferedReader, kind: np.dtype[Any], count: int, begin: int, most: int) -> NDArray[np.void]:
+def _read_pieces(file: BufferedReader, layout: PlyLayout, most: int) -> NDArray[np.void]:
     """Points of evenly spread pieces of the file, all of it where it is small."""
+    kind = layout.kind
+    count = layout.count
+    begin = layout.begin
     length = max(_PIECE_BYTES // kind.itemsize, 1)
     pieces = min(-(-count // length), _PIECES)
     is_whole = pieces * length >= count

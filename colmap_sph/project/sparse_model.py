@@ -114,7 +114,10 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 def submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Reconstruction:
-    """Return the model of images `names` alone, with the tracks of two or more observations they share."""
+    """Return the model of images `names` alone, with the tracks of two or more observations they share.
+
+    Points that nobody observes, as of imported models, stay.
+    """
     part = pycolmap.Reconstruction()
     images = [model.image(i) for i in model.reg_image_ids() if model.image(i).name in names]
     for camera_id in sorted({image.camera_id for image in images}):
@@ -126,7 +129,7 @@ def submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Recons
     ids = {image.image_id for image in images}
     for point_id, point in model.points3D.items():
         elements = [element for element in point.track.elements if element.image_id in ids]
-        if len(elements) >= 2:
+        if len(elements) >= 2 or not point.track.length():
             kept = pycolmap.Point3D()
             kept.xyz = point.xyz
             kept.color = point.color

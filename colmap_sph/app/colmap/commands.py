@@ -15,6 +15,7 @@ from colmap_sph.app.colmap.patch_match import make_maps
 from colmap_sph.app.display import Display
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE, header, print_summary
+from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.terminal import Terminal, standard_output
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.project.workspace import Workspace
@@ -46,7 +47,7 @@ def answer(arguments: Sequence[str], terminal: Terminal) -> int:
     workspace = Workspace(Path(str(given.plain["workspace_path"])))
     with workspace_log(workspace, header(arguments)), Display(terminal) as display:
         make = make_maps if name == "patch_match_stereo" else make_cloud
-        report = make(given.plain, given.sectioned, progress=display)
+        report = make(given.plain, given.sectioned, command=to_repeat(arguments), progress=display)
     _print_end(given, report, workspace, terminal)
     return PARTIAL_EXIT_CODE if report.incomplete else 0
 

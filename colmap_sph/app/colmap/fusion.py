@@ -19,6 +19,7 @@ def make_cloud(
     chosen: Mapping[str, Value],
     *,
     region: Region | None = None,
+    command: str = "",
     progress: Progress | None = None,
 ) -> RunReport:
     """Fuse the maps of a dense workspace.
@@ -31,6 +32,8 @@ def make_cloud(
         Those of `StereoFusion` that the user chose; ours are at their own defaults otherwise.
     region : Region, optional
         Where points are wanted, where no file says so.
+    command : str
+        What to type to do the same again.
     progress : Progress, optional
 
     Returns
@@ -49,7 +52,9 @@ def make_cloud(
     project.check()
     workspace = open_workspace(project)
     with spelled_as_colmap(STEREO_FUSION, "StereoFusion"):
-        return fuse_maps(workspace, output, options, region=region, progress=progress)
+        report = fuse_maps(workspace, output, options, region=region, progress=progress)
+    report.command = command
+    return report
 
 
 def output_of(plain: Mapping[str, Value]) -> CloudOutput:

@@ -119,8 +119,10 @@ class _Parser(argparse.ArgumentParser):
 
 
 def _as_colmap(message: str) -> str:
-    """What `argparse` says of a flag without a value, or of one that is short for several, in COLMAP's words."""
+    """What `argparse` says of a flag without a value, with one too many, or short for several, as COLMAP does."""
     flag = message.removeprefix("argument ").partition(":")[0]
+    if "ignored explicit argument" in message:
+        return f"option '{flag.rpartition('/')[2]}' does not take any arguments"
     if "expected one argument" in message:
         return f"the required argument for option '{flag}' is missing"
     return f"option {printable(message).replace('ambiguous option: ', '', 1)}"

@@ -12,7 +12,11 @@ from colmap_sph.project.project import Project, open_workspace
 
 
 def make_maps(
-    plain: Mapping[str, Value], chosen: Mapping[str, Value], *, progress: Progress | None = None
+    plain: Mapping[str, Value],
+    chosen: Mapping[str, Value],
+    *,
+    command: str = "",
+    progress: Progress | None = None,
 ) -> RunReport:
     """Make the maps of a dense workspace.
 
@@ -22,6 +26,8 @@ def make_maps(
         Options without a section, by COLMAP's names.
     chosen : mapping of str to value
         Those of `PatchMatchStereo` that the user chose; ours are at their own defaults otherwise.
+    command : str
+        What to type to do the same again.
     progress : Progress, optional
 
     Returns
@@ -42,6 +48,7 @@ def make_maps(
             workspace,
             options,
             progress=progress,
+            report=RunReport(command=command),
             until="geometric" if chosen.get("geom_consistency", True) else "photometric",
             pair_list=pair_list,
             needs_all=not chosen.get("allow_missing_files", False),

@@ -14,6 +14,7 @@ from colmap_sph.project.map_files import read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.pair_lists import fusion_cfg, write_fusion_cfg
 from colmap_sph.project.sparse_model import image_names, load_model
+from colmap_sph.project.state.cloud_marks import map_mark
 from colmap_sph.project.state.ownership import fusion_cfg_place
 from colmap_sph.project.state.records import begin, claim, vouch, vouch_when_on_disk, vouched_facts
 from colmap_sph.project.workspace import mask_path
@@ -41,12 +42,14 @@ _MAX_LIST_BYTES = 1 << 26
 class CloudFacts:
     """The number of points of a cloud, what to advise where they are few, and how many each image made.
 
-    The last is in the order of the images' names, and empty where that is not known.
+    The last is in the order of the images' names, and empty where that is not known. `of_maps` are the marks of
+    the maps that were fused, see `map_mark`.
     """
 
     points: Annotated[int, Meta(ge=0)]
     advice: str
     of_images: tuple[Annotated[int, Meta(ge=0)], ...] = ()
+    of_maps: tuple[str, ...] = ()
 
 
 def known_cloud(context: "Context", key: str) -> CloudFacts | None:
@@ -61,7 +64,9 @@ def begin_cloud(context: "Context") -> None:
     begin(place.record, place.files)
 
 
-def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts, *, is_complete: bool) -> None:
+def vouch_for_cloud(
+    context: "Context", key: str, facts: CloudFacts, names: Sequence[str], *, is_complete: bool
+) -> None:
     """Record that the cloud is ours, and that it is complete, if it is: otherwise the next run makes it again.
 
     Parameters
@@ -70,11 +75,16 @@ def vouch_for_cloud(context: "Context", key: str, facts: CloudFacts, *, is_compl
     key : str
         Under which it was made.
     facts : CloudFacts
+        Without the marks.
+    names : sequence of str
+        Images that were fused.
     is_complete : bool
         Whether nothing that belongs to it could not be read.
     """
     place = context.cloud_place
     digests = {path: whole_digest(path) for path in place.files if path.exists()}
+    kind = context.options.fusion.input
+    facts = replace(facts, of_maps=tuple(map_mark(context.workspace, name, kind) for name in names))
     vouch_when_on_disk(place.record, key, digests, facts, state="done" if is_complete else "void")
 
 
@@ -145,7 +155,8 @@ def facts_of_cloud(
     coverage = context.report.coverage
     options = context.options.fusion
     scene = replace(context.scene, views=tuple(map(context.scene.view, names)))
-    pixels = sum(coverage[view.name] * view.num_pixels for view in scene.views)
+    shares = context.report.in_region
+    pixels = sum(coverage[view.name] * shares.get(view.name, 1.0) * view.num_pixels for view in scene.views)
     if points >= _FEW_POINTS * pixels:
         return CloudFacts(points, "")
     maps: LoadCache[DepthAndNormals] = LoadCache(lambda pair: pair[0].nbytes + pair[1].nbytes)

@@ -18,14 +18,17 @@ from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, key
 from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
 from colmap_sph.project.images.reading import bytes_to_reduce, read_whole_grey
 from colmap_sph.project.masks import read_view_mask
-from colmap_sph.scene import Region, View
+from colmap_sph.scene import View
 from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
+from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
+from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside, is_inside
+from colmap_sph.stereo.region.shown import count_shown
 from colmap_sph.stereo.region.window import Window
 
 if TYPE_CHECKING:
@@ -66,7 +69,10 @@ class EstimateFile:
 
 @dataclass(frozen=True, eq=False)
 class ConfirmTask:
-    """A view and its partners, its sparse points and mask, and where its geometric maps go."""
+    """A view and its partners, its sparse points and mask, and where its geometric maps go.
+
+    `matched` are the images that it was matched with, also where these tell nothing of it.
+    """
 
     reference: EstimateFile
     partners: tuple[EstimateFile, ...]
@@ -78,7 +84,8 @@ class ConfirmTask:
     normal_options: NormalOptions
     refinement_options: RefinementOptions
     depths: Depths | None
-    region: Region | None
+    focus: Focus | None
+    matched: tuple[str, ...]
     maps: MapFiles
     key: str
 
@@ -102,12 +109,13 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
             _usual(task.residuals),
         )
     drop_other_depths(planes[1], task.depths)
-    drop_outside(view, planes[1], task.region)
+    drop_outside(view, planes[1], region_of(task.focus))
+    shown = None if task.focus is None else count_shown(view, estimate.depth, planes[1], task.focus.near)
     whole = task.reference.whole
     normals, depth = (task.reference.window.padded(pixels, whole) for pixels in planes)
     mask = read_view_mask(task.mask, whole)
     agreement = Agreement(*compare_with_sparse(whole, depth, task.sights, mask))
-    return task.maps.write(normals, depth, task.key, agreement)
+    return task.maps.write(normals, depth, task.key, agreement, partners=task.matched, shown=shown)
 
 
 def _usual(residuals: Sequence[float]) -> float:
@@ -159,7 +167,8 @@ class ConfirmStage(Stage[str, ConfirmTask]):
             options.normals,
             options.refinement,
             options.rectification.depths,
-            self.context.region,
+            self.context.focus,
+            tuple(self._all_partners.get(item, [])),
             maps,
             key,
         )
@@ -209,6 +218,8 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         report = self.context.report
         names = [view.name for view in self.context.scene.views]
         report.coverage = {name: results[name].facts.coverage if name in results else 0.0 for name in names}
+        if self.context.focus is not None:
+            report.in_region = {name: result.facts.in_region for name, result in results.items()}
         report.agreement = {name: result.facts.agreement.share for name, result in results.items()}
         report.sparse_points = sum((result.facts.agreement for result in results.values()), Agreement())
         report.overall_agreement = report.sparse_points.share
@@ -217,20 +228,32 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         if failures and not report.images:
             raise NoResultError(f"No image has a depth map ({failures[0]})")
         for name in (name for name, share in report.coverage.items() if share == 0):
-            if name not in report.skipped_images and self._shows_enough(name):
+            if name in report.skipped_images:
+                continue
+            if self._shows_enough(name):
                 report.skipped_images[name] = self._why_empty(name)
                 self.context.progress.leave_out("image", name, report.skipped_images[name])
+            else:
+                report.out_of_region[name] = (
+                    "it has no depth in the region, of which it sees too few sparse points"
+                )
         if not report.images:
             raise NoResultError(self._why_nothing())
 
     def _shows_enough(self, name: str) -> bool:
         """Whether an image shows so much of the region, where there is one, that it ought to have some depth."""
         context = self.context
-        if context.region is None or not context.scene.has_tracks:
+        scene = context.scene
+        if context.region is None:
             return True
-        observed = context.scene.points[context.scene.view(name).point_indices]
-        inside = np.count_nonzero(is_inside(context.region, observed))
-        return int(inside) >= context.options.pairs.min_shared_points
+        view = scene.view(name)
+        points = scene.points[view.point_indices] if scene.has_tracks else scene.points
+        points = points[is_inside(context.region, points) & sees(view, points)]
+        mask = read_view_mask(context.workspace.mask_path(name), view)
+        if mask is not None:
+            columns, rows = np.floor(view.project(points)[0]).astype(int).T
+            points = points[mask[rows, columns] > 0]
+        return len(points) >= context.options.pairs.min_shared_points
 
     def _why_empty(self, name: str) -> str:
         """Why an image has no depth, as far as it is known."""

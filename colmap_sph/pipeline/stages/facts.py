@@ -63,7 +63,10 @@ class Facts:
     Attributes
     ----------
     coverage : float
-        Share of pixels with a depth, 0 to 1, where the stage makes maps.
+        Share of pixels with a depth, 0 to 1, where the stage makes maps: of those that show the region, if one is
+        asked for.
+    in_region : float
+        Share of pixels that show it; 1 without a region.
     agreement : Agreement
         How far the depth map agrees with the sparse points, where the stage makes geometric maps.
     points : int
@@ -79,6 +82,7 @@ class Facts:
     """
 
     coverage: float = 0.0
+    in_region: float = 1.0
     agreement: Agreement = field(default_factory=Agreement)
     points: int = 0
     unread: Mapping[str, str] = field(default_factory=dict)

@@ -151,7 +151,7 @@ class FuseStage(PartsStage):
             facts = facts_of_cloud(context, list(results), points, self._partners_among(results))
             self._known = replace(facts, of_images=tuple(result.facts.points for result in results.values()))
             is_complete = not self._report_unread(results) and len(results) == len(self.items)
-            vouch_for_cloud(context, self._key, self._known, is_complete=is_complete)
+            vouch_for_cloud(context, self._key, self._known, list(results), is_complete=is_complete)
         report_cloud(context, self._known, list(results))
 
     def _partners_among(self, results: Mapping[str, Result]) -> dict[str, tuple[list[str], list[int]]]:
@@ -273,5 +273,6 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         if self._known is None:
             points = sum(result.facts.points for result in results.values())
             self._known = facts_of_cloud(self.context, self._sound, points)
-            vouch_for_cloud(self.context, self._key, self._known, is_complete=self._sound == self._names)
+            is_complete = self._sound == self._names
+            vouch_for_cloud(self.context, self._key, self._known, self._sound, is_complete=is_complete)
         report_cloud(self.context, self._known)

@@ -61,21 +61,21 @@ class FuseToStage(PartsStage):
         points = sum(result.facts.points for result in results.values())
         join_parts(self._stems(results), self._scratch, points)
         self._put_into_place()
-        if self._is_the_workspaces:
+        if self.is_the_workspaces:
             # Ours, but not what a run would make: the next one makes it anew.
-            vouch_for_cloud(context, "", CloudFacts(points, ""), is_complete=False)
+            vouch_for_cloud(context, "", CloudFacts(points, ""), list(results), is_complete=False)
         self._report_unread(results)
         context.report.points = points
 
     @property
-    def _is_the_workspaces(self) -> bool:
+    def is_the_workspaces(self) -> bool:
         """Whether the cloud goes where a run puts its own."""
         fused = self.context.workspace.fused_path
         return self._output.kind == "ply" and real_path(self._output.path) == real_path(fused)
 
     def _put_into_place(self) -> None:
         context = self.context
-        if self._is_the_workspaces:
+        if self.is_the_workspaces:
             # Nothing of others is lost there. The cloud near the origin of a model in map coordinates goes.
             begin(context.cloud_place.record, context.cloud_place.files)
             for path in context.cloud_place.files[2:]:

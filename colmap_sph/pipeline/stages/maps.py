@@ -1,5 +1,6 @@
 """A view's depth and normal map on disk, vouched for by a record."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +11,13 @@ from numpy.typing import NDArray
 
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
-from colmap_sph.project.state.records import begin, vouch_when_on_disk, vouched_facts, whole_digests
+from colmap_sph.project.state.records import (
+    begin,
+    recorded_facts,
+    vouch_when_on_disk,
+    vouched_facts,
+    whole_digests,
+)
 
 MAP_BYTES = 16.0
 """Bytes on disk per pixel, of a depth and a normal map."""
@@ -18,16 +25,18 @@ MAP_BYTES = 16.0
 
 @dataclass(frozen=True)
 class MapFacts:
-    """What the record of maps says of them: the share of pixels with a depth, and the `Agreement`."""
+    """What the record of maps says of them: see `Facts`, `Agreement`, and with which images it was matched."""
 
     coverage: Annotated[float, Meta(ge=0, le=1)]
     tested: Annotated[int, Meta(ge=0)]
     found: Annotated[int, Meta(ge=0)]
     agreeing: Annotated[int, Meta(ge=0)]
+    in_region: Annotated[float, Meta(ge=0, le=1)] = 1.0
+    partners: tuple[str, ...] = ()
 
     def as_facts(self) -> Facts:
         """The same as facts of a stage."""
-        return Facts(self.coverage, Agreement(self.tested, self.found, self.agreeing))
+        return Facts(self.coverage, self.in_region, Agreement(self.tested, self.found, self.agreeing))
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,9 @@ class MapFiles:
         depth: NDArray[np.float32],
         key: str,
         agreement: Agreement | None = None,
+        *,
+        partners: Sequence[str] = (),
+        shown: int | None = None,
     ) -> Facts:
         """Write both maps.
 
@@ -55,16 +67,26 @@ class MapFiles:
             Under which they are vouched for.
         agreement : Agreement, optional
             Of the depth map with the sparse points.
+        partners : sequence of str
+            Names of the images that the view was matched with.
+        shown : int, optional
+            Pixels that show the region, where one is asked for; see `count_shown`.
 
         Returns
         -------
         Facts
-            With the share of pixels with a depth, and the agreement.
+            Without those of other stages.
         """
         begin(self.record, [self.depth, self.normals], sync=False)
         digests = {self.depth: write_depth_map(self.depth, depth)}
         digests[self.normals] = write_normal_map(self.normals, normals)
-        facts = MapFacts(float((depth > 0).mean()), **asdict(agreement or Agreement()))
+        wanted = depth.size if shown is None else shown
+        facts = MapFacts(
+            int(np.count_nonzero(depth > 0)) / max(wanted, 1),
+            **asdict(agreement or Agreement()),
+            in_region=wanted / depth.size,
+            partners=tuple(partners),
+        )
         vouch_when_on_disk(self.record, key, digests, facts)
         return facts.as_facts()
 
@@ -72,6 +94,11 @@ class MapFiles:
         """What is known of the maps, or None where they must be made."""
         known = vouched_facts(self.record, key, [self.depth, self.normals], MapFacts)
         return None if known is None else known.as_facts()
+
+    def partners(self) -> tuple[str, ...]:
+        """Names of the images that the view was matched with, as far as that is known."""
+        known = recorded_facts(self.record, MapFacts)
+        return () if known is None else known.partners
 
     def digests(self) -> tuple[str, ...] | None:
         """Of the whole depth map and the whole normal map, as they were written; None of maps of others."""

@@ -21,12 +21,14 @@ from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.masks import read_view_mask
-from colmap_sph.scene import Region, View
+from colmap_sph.scene import View
 from colmap_sph.stereo.agreement import compare_with_sparse
 from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
+from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside
+from colmap_sph.stereo.region.shown import count_shown
 from colmap_sph.stereo.region.window import Window
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
@@ -60,7 +62,8 @@ class VoteTask:
     normal_options: NormalOptions
     depths: Depths | None
     window: Window
-    region: Region | None
+    focus: Focus | None
+    matched: tuple[str, ...]
     maps: MapFiles
     vote_key: str
     maps_key: str
@@ -72,9 +75,10 @@ def make_photometric_maps(task: VoteTask) -> Facts:
     estimate = read_estimate(task.estimate, view) if task.is_voted else _vote(task, view)
     normals, depth = fit_normals(view, estimate, task.normal_options)
     drop_other_depths(depth, task.depths)
-    drop_outside(view, depth, task.region)
+    drop_outside(view, depth, region_of(task.focus))
+    shown = None if task.focus is None else count_shown(view, estimate.depth, depth, task.focus.near)
     normals, depth = (task.window.padded(pixels, task.view) for pixels in (normals, depth))
-    return task.maps.write(normals, depth, task.maps_key)
+    return task.maps.write(normals, depth, task.maps_key, partners=task.matched, shown=shown)
 
 
 def _vote(task: VoteTask, view: View) -> DepthEstimate:
@@ -85,7 +89,7 @@ def _vote(task: VoteTask, view: View) -> DepthEstimate:
         # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
         estimate.depth[task.window.part(mask) == 0] = 0
     drop_other_depths(estimate.depth, task.depths)
-    drop_outside(view, estimate.depth, task.region, REGION_MARGIN)
+    drop_outside(view, estimate.depth, region_of(task.focus), REGION_MARGIN)
     write_estimate(task.estimate, estimate, task.vote_key)
     return estimate
 
@@ -94,13 +98,15 @@ def report_photometric(context: "Context", votes: Mapping[str, Result]) -> None:
     """Report the photometric maps of a run that ends with them as it would report the geometric ones."""
     report = context.report
     report.coverage = {view.name: 0.0 for view in context.scene.views}
-    for name in votes:
+    if context.focus is not None:
+        report.in_region = {name: result.facts.in_region for name, result in votes.items()}
+    for name, result in votes.items():
         view = context.scene.view(name)
         depth = read_depth_map(context.map_files(name, "photometric").depth)
         mask = read_view_mask(context.workspace.mask_path(name), view)
         sights = context.sparse_tracks.sights(name).between(context.options.rectification.depths)
         agreement = Agreement(*compare_with_sparse(view, depth, sights, mask))
-        report.coverage[name] = float((depth > 0).mean())
+        report.coverage[name] = result.facts.coverage
         report.agreement[name] = agreement.share
         report.sparse_points += agreement
     report.overall_agreement = report.sparse_points.share
@@ -148,7 +154,8 @@ class VoteStage(Stage[str, VoteTask]):
             context.options.normals,
             context.options.rectification.depths,
             window,
-            context.region,
+            context.focus,
+            tuple(self._partners.get(item, [])),
             maps,
             key,
             maps_key,

@@ -7,10 +7,8 @@ import hashlib
 import json
 import logging
 import os
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
@@ -30,6 +28,7 @@ from colmap_sph.project.files import (
     sync_folder,
     whole_digest,
 )
+from colmap_sph.project.state import background
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -40,7 +39,7 @@ T = TypeVar("T")
 
 _STAMP_BLOCKS = 16
 _BLOCK_BYTES = 4096
-_MAX_BYTES = 1 << 20
+_MAX_BYTES = 1 << 24  # of a cloud of all images that a model can have
 
 Word = Annotated[str, Meta(max_length=100)]
 
@@ -205,7 +204,7 @@ def vouch_when_on_disk(
     state: Literal["done", "void"] = "done",
 ) -> None:
     """Do what `vouch` does, once the disk has the files; in `vouching_in_background` without waiting for that."""
-    if not _background.submit(_sync_and_vouch, record, key, files, facts, state):
+    if not background.submit(_sync_and_vouch, record, key, files, facts, state):
         _sync_and_vouch(record, key, files, facts, state)
 
 
@@ -226,65 +225,6 @@ def _sync_and_vouch(
             f"{next(iter(files))} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
     vouch(record, key, files, facts, state=state)
-
-
-class _Background:
-    """A thread that waits for the disk, while any run wants it."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._pool: ThreadPoolExecutor | None = None
-        self._runs = 0
-        self._waiting: list[Future[None]] = []
-
-    def submit(self, function: Callable[..., None], *arguments: object) -> bool:
-        """Have a function called later; False where no run wants the thread."""
-        with self._lock:
-            if self._pool is None:
-                return False
-            self._waiting.append(self._pool.submit(function, *arguments))
-            return True
-
-    def open(self) -> None:
-        """A run begins that wants it."""
-        with self._lock:
-            self._runs += 1
-            self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="vouch")
-
-    def close(self) -> list["Future[None]"]:
-        """A run ends; returns all that is done now, of whichever run."""
-        with self._lock:
-            done = self._waiting
-            self._waiting = []
-            self._runs -= 1
-            pool = self._pool
-            if self._runs == 0:
-                self._pool = None
-        wait(done)
-        if pool is not None and self._runs == 0:
-            pool.shutdown()
-        return done
-
-
-_background = _Background()
-
-
-@contextmanager
-def vouching_in_background() -> Iterator[None]:
-    """Let a thread of its own wait for the disk meanwhile, so that no worker does.
-
-    Raises
-    ------
-    OutputError
-        At the end, where a file or a record could not be written.
-    """
-    _background.open()
-    try:
-        yield
-    finally:
-        done = _background.close()
-    for each in done:
-        each.result()
 
 
 def vouched_facts(record: Path, key: str, files: Sequence[Path], kind: type[T]) -> T | None:
@@ -309,6 +249,26 @@ def vouched_facts(record: Path, key: str, files: Sequence[Path], kind: type[T]) 
         return None
     if altered_files(known, files) or not all(path.is_file() for path in files):
         return None
+    return _facts_of(known, kind)
+
+
+def recorded_facts(record: Path, kind: type[T], files: Sequence[Path] = ()) -> T | None:
+    """Return what a record says of files of ours, whatever key they were made under; None where that is nothing.
+
+    Parameters
+    ----------
+    record, files
+        As for `vouch`; of the files those that must be as the record knows them.
+    kind : type
+        Dataclass of the facts.
+    """
+    known = read_record(record)
+    if known is None or known.state == "making" or altered_files(known, files):
+        return None
+    return _facts_of(known, kind)
+
+
+def _facts_of(known: Record, kind: type[T]) -> T | None:
     try:
         return msgspec.convert(known.facts, kind)
     except (msgspec.MsgspecError, RecursionError):
@@ -370,6 +330,11 @@ def _digest(path: Path) -> str | None:
     with suppress(InputError):
         return whole_digest(path)
     return None
+
+
+def stamp_of(path: Path) -> str:
+    """What tells a file from others without reading all of it; empty for one that cannot be read."""
+    return _stamp_if_readable(path) or ""
 
 
 def _stamp_if_readable(path: Path) -> str | None:

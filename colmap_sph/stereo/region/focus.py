@@ -45,6 +45,11 @@ class Focus:
     region: Region
     box: NDArray[np.float64]
 
+    @property
+    def near(self) -> Region:
+        """What of the region may hold a surface, finite: a pixel shows the region where it shows this."""
+        return Region(self.box, self.region.polygons)
+
     def outline(self, view: View) -> NDArray[np.float64]:
         """Of what of a view of the reduced scene may show the region, see `outline_on`."""
         outline = outline_on(view, self.box)
@@ -52,7 +57,12 @@ class Focus:
         return outline
 
 
-def focused(scene: Scene, region: Region, least_points: int, called: str) -> tuple[Scene, Focus]:
+def region_of(focus: Focus | None) -> Region | None:
+    """What results are cut to; None: nothing."""
+    return None if focus is None else focus.region
+
+
+def focused(scene: Scene, region: Region, least_points: int, called: str) -> tuple[Scene, Focus, dict[str, int]]:
     """Reduce a scene to what shows a region.
 
     Parameters
@@ -70,6 +80,8 @@ def focused(scene: Scene, region: Region, least_points: int, called: str) -> tup
     scene : Scene
         With the points in the region and near it, and the images that see them.
     focus : Focus
+    too_few : dict of str to int
+        Names of the images that see some of these points, but too few, and how many.
 
     Raises
     ------
@@ -101,7 +113,8 @@ def focused(scene: Scene, region: Region, least_points: int, called: str) -> tup
     low, high = np.percentile(scene.points[near], _PERCENTILES, axis=0)
     above = _ABOVE * (high - low) + _ABOVE_FLAT * size
     box = np.stack([np.maximum(inside_scene[0], low - above), np.minimum(inside_scene[1], high + above)])
-    return _with_points(scene, near, box, least_points), Focus(region, box)
+    part, too_few = _with_points(scene, near, box, least_points)
+    return part, Focus(region, box), too_few
 
 
 def _near(region: Region, points: NDArray[np.float64], size: float) -> NDArray[np.bool_]:
@@ -145,14 +158,21 @@ def _distances_from(polygons: Polygons, places: NDArray[np.float64], most: float
     return np.asarray(distances[rows, columns], dtype=np.float64)
 
 
-def _with_points(scene: Scene, kept: NDArray[np.bool_], box: NDArray[np.float64], least_points: int) -> Scene:
-    """The scene with some of its points alone, and the views that show enough of them."""
+def _with_points(
+    scene: Scene, kept: NDArray[np.bool_], box: NDArray[np.float64], least_points: int
+) -> tuple[Scene, dict[str, int]]:
+    """The scene with some of its points and the views that show enough of them; and which views show fewer."""
     points = scene.points[kept]
     new_rows = np.cumsum(kept) - 1
     views = []
+    too_few = {}
     for view in scene.views:
         observed = view.point_indices[kept[view.point_indices]]
         number = len(observed) if scene.has_tracks else np.count_nonzero(sees(view, points))
-        if number >= least_points and outline_on(view, box) is not None:
+        if not number or outline_on(view, box) is None:
+            continue
+        if number >= least_points:
             views.append(replace(view, point_indices=new_rows[observed]))
-    return replace(scene, views=tuple(views), points=points)
+        else:
+            too_few[view.name] = int(number)
+    return replace(scene, views=tuple(views), points=points), too_few

@@ -1,0 +1,42 @@
+"""Which depth maps a cloud was made of: a mark of each in the cloud's record."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import xxhash
+
+from colmap_sph.project.state.records import recorded_facts, stamp_of
+from colmap_sph.project.workspace import MapKind, Workspace
+
+
+@dataclass(frozen=True)
+class _Marked:
+    """What of the facts of a cloud says of what it was made."""
+
+    of_maps: tuple[str, ...] = ()
+
+
+def map_mark(workspace: Workspace, name: str, kind: MapKind) -> str:
+    """16 digits that tell the depth map of an image from others of it, and from those of other images."""
+    stamp = stamp_of(workspace.depth_map_path(name, kind))
+    return xxhash.xxh3_64_hexdigest(f"{name}\0{kind}\0{stamp}".encode("utf-8", "surrogateescape"))
+
+
+def is_cloud_of(workspace: Workspace, maps: Iterable[tuple[str, MapKind]]) -> bool | None:
+    """Whether the cloud of a workspace was made of depth maps that are there, of some of them or all.
+
+    Parameters
+    ----------
+    workspace : Workspace
+    maps : iterable of (str, kind)
+        Names of images with a map of that kind.
+
+    Returns
+    -------
+    bool or None
+        None where that is not known: another program made it, or an earlier version.
+    """
+    known = recorded_facts(workspace.cloud_record_path, _Marked, workspace.cloud_paths)
+    if known is None or not known.of_maps:
+        return None
+    return set(known.of_maps) <= {map_mark(workspace, name, kind) for name, kind in maps}
