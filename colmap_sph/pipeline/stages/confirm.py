@@ -124,6 +124,12 @@ def _image(file: EstimateFile) -> NDArray[np.uint8]:
     return _images.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
 
 
+def confirm_seconds(partners: int, refinement: RefinementOptions) -> float:
+    """Processor seconds per megapixel of an image that has so many partners."""
+    seconds = NORMALS_SECONDS + _CONFIRM_SECONDS * partners
+    return seconds + _REFINE_SECONDS * refinement.images_used(partners)
+
+
 class ConfirmStage(Stage[str, ConfirmTask]):
     """Confirms and refines the depth of every image with a vote."""
 
@@ -179,8 +185,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         pixels = self._pixels(name)
         partners = self._partners(name)
         refinement = self.context.options.refinement
-        seconds = NORMALS_SECONDS + _CONFIRM_SECONDS * len(partners)
-        seconds += _REFINE_SECONDS * refinement.images_used(len(partners))
+        seconds = confirm_seconds(len(partners), refinement)
         memory = _CONFIRM_BYTES * pixels
         if refinement.rounds:
             memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + _IMAGE_BYTES * sum(map(self._pixels, partners))

@@ -109,6 +109,11 @@ def report_photometric(context: "Context", votes: Mapping[str, Result]) -> None:
         raise NoResultError("No image has a depth map: no two of its pairs agree on any depth.")
 
 
+def vote_seconds(pairs: int) -> float:
+    """Processor seconds per megapixel of an image on whose depth so many pairs vote."""
+    return NORMALS_SECONDS + _SECONDS * pairs
+
+
 class VoteStage(Stage[str, VoteTask]):
     """Votes on the depth of every image of the scene. Its results have the keys of the votes."""
 
@@ -162,7 +167,7 @@ class VoteStage(Stage[str, VoteTask]):
 
     def _cost(self, view: View, pixels: int, files: tuple[Path, ...], is_voted: bool) -> Cost:
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
-        seconds = NORMALS_SECONDS + (0 if is_voted else _SECONDS * len(files))
+        seconds = vote_seconds(0 if is_voted else len(files))
         disk = MAP_BYTES * view.num_pixels + (0 if is_voted else _ESTIMATE_BYTES * pixels)
         maps = MAP_BYTES * (view.num_pixels - pixels)
         return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities + maps, disk)

@@ -1,0 +1,146 @@
+"""What a run does with its time: settings from the quickest to the best, and what they are worth.
+
+The settings are those that gave the most for their time on several scenes, see docs/usage.md.
+"""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+from colmap_sph.pipeline.forecast.time_limit import format_time
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.presets import preset
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The options that cost most time, and bring most.
+
+    Attributes
+    ----------
+    sampling : float
+        `--rectification.sampling`.
+    partners : int
+        `--num-pairs`.
+    rounds : int
+        `--refinement.rounds`.
+    """
+
+    sampling: float
+    partners: int
+    rounds: int
+
+    @classmethod
+    def of(cls, options: RunOptions) -> "Settings":
+        """Those of options."""
+        return cls(options.rectification.sampling, options.pairs.num_pairs, options.refinement.rounds)
+
+    def applied(self, options: RunOptions) -> RunOptions:
+        """The options with these settings."""
+        return replace(
+            options,
+            rectification=replace(options.rectification, sampling=self.sampling),
+            pairs=replace(options.pairs, num_pairs=self.partners),
+            refinement=replace(options.refinement, rounds=self.rounds),
+        )
+
+    @property
+    def worth(self) -> str:
+        """What they cost in quality, in a sentence."""
+        if self == NORMAL:
+            return "That is normal quality."
+        return ""
+
+    @property
+    def flags(self) -> str:
+        """What to type for them."""
+        return " ".join(self.words())
+
+    def words(self, kept: Collection[str] = ()) -> list[str]:
+        """What to type for them, less for options that are given already."""
+        values = {
+            "pairs.num_pairs": ("--num-pairs", self.partners),
+            "rectification.sampling": ("--rectification.sampling", self.sampling),
+            "refinement.rounds": ("--refinement.rounds", self.rounds),
+        }
+        return [str(word) for place, words in values.items() if place not in kept for word in words]
+
+
+NORMAL = Settings.of(RunOptions())
+BEST = Settings.of(preset("best"))
+
+LADDER: tuple[Settings, ...] = (
+    Settings(0.35, 2, 0),
+    Settings(0.35, 3, 0),
+    Settings(0.5, 3, 0),
+    Settings(0.5, 3, 1),
+    Settings(0.5, 4, 1),
+    Settings(0.6, 4, 1),
+    Settings(0.7, 4, 1),
+    Settings(0.7, 5, 2),
+    Settings(0.85, 5, 2),
+    Settings(0.85, 6, 2),
+    Settings(1.0, 6, 2),
+    Settings(1.0, 8, 2),
+    NORMAL,
+    Settings(1.15, 12, 2),
+    BEST,
+)
+"""From the quickest to the best."""
+
+
+def choices(options: RunOptions, kept: Collection[str]) -> Sequence[Settings]:
+    """The ladder for a run, with what the user chose in each of its settings.
+
+    Parameters
+    ----------
+    options : RunOptions
+    kept : collection of str
+        Options that stay as they are, see `DIALS`.
+    """
+    given = Settings.of(options)
+    fixed = {
+        field: getattr(given, field)
+        for field, place in (
+            ("sampling", "rectification.sampling"),
+            ("partners", "pairs.num_pairs"),
+            ("rounds", "refinement.rounds"),
+        )
+        if place in kept
+    }
+    return list(dict.fromkeys(replace(each, **fixed) for each in LADDER))
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What is chosen for a time.
+
+    Attributes
+    ----------
+    settings : Settings
+    asked : float
+        Seconds.
+    expected : float
+        Estimated seconds of the whole run, what has passed of it already among them.
+    """
+
+    settings: Settings
+    asked: float
+    expected: float
+
+    @property
+    def is_too_little(self) -> bool:
+        """Whether the time is less than what the quickest settings take."""
+        return self.expected > self.asked
+
+    @property
+    def words(self) -> str:
+        """What is chosen and what it costs, in sentences."""
+        asked, expected = format_time(self.asked), format_time(self.expected)
+        if self.is_too_little:
+            return (
+                f"{asked} is too little: the run takes about {expected} even with {self.settings.flags}. It goes "
+                "on with these; a smaller --max-image-size would be faster."
+            )
+        if self.settings == BEST:
+            return f"{asked} is enough for the best quality, which takes about {expected}: {self.settings.flags}."
+        return f"Chosen for {asked}: {self.settings.flags}, about {expected}. {self.settings.worth}"
