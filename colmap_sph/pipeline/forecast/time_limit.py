@@ -16,9 +16,6 @@ _FORM = re.compile(r"(?:(\d+(?:\.\d+)?)\s*h)?\s*(?:(\d+(?:\.\d+)?)\s*(?:min|m))?
 _LONGEST = 1e7
 """Seconds; nearly four months."""
 
-_AIM = 0.97
-"""Share of the time that is planned for: late is worse than early."""
-
 DIALS = ("rectification.sampling", "pairs.num_pairs", "refinement.rounds")
 """Options that are chosen to keep to a time, by their place in the records."""
 
@@ -70,8 +67,8 @@ class TimeLimit:
 
     @property
     def left(self) -> float:
-        """Seconds that may still be planned."""
-        return _AIM * self.seconds - self.elapsed
+        """Seconds that are left of it."""
+        return self.seconds - self.elapsed
 
     def begun(self, seconds: float) -> "TimeLimit":
         """The same for a run that is only planned, of which so many seconds are spoken for."""

@@ -33,6 +33,10 @@ logger = logging.getLogger(__name__)
 
 # Pairs that are timed, for each worker.
 _PROBES = 2
+# Processor seconds per megapixel of an image that is read for the first time.
+_READ_SECONDS = 0.02
+# What is left of the trust in earlier stages' speed with each stage: others may use the machine, too.
+_FADING = 0.5
 # Pairs that each sampling's estimate rests on.
 _ASKED = 8
 # Processor seconds of what follows the last stage, the page: of any run, and of each image.
@@ -66,9 +70,9 @@ class Pace:
         self._taken = 0.0
 
     def note(self, worked: float, taken: float) -> None:
-        """So much work was done in so many seconds."""
-        self._worked += worked
-        self._taken += taken
+        """So much work was done in so many seconds, since what was noted before."""
+        self._worked = _FADING * self._worked + worked
+        self._taken = _FADING * self._taken + taken
 
     def speed(self, worked: float = 0.0, taken: float = 0.0) -> float:
         """Of all work so far, and of some that is under way; before any, of one second by each worker."""
@@ -216,10 +220,11 @@ class Within:
         number = min(_PROBES * self._workers, len(self._ranks[0]))
         probes = [self._ranks[0][index * len(self._ranks[0]) // number] for index in range(number)]
         context = self._with(self.choose().settings)
-        made = [result for result in executor(ProbeStage(context, probes)).values() if result.made]
-        self._pace.note(
-            sum(result.seconds for result in made), sum(result.taken for result in made) / self._workers
-        )
+        made = {pair: result for pair, result in executor(ProbeStage(context, probes)).items() if result.made}
+        worked = sum(result.seconds for result in made.values())
+        for name in {name for pair in made for name in pair}:
+            worked += _READ_SECONDS * context.scene.view(name).num_pixels / 1e6
+        self._pace.note(worked, sum(result.taken for result in made.values()) / self._workers)
         context.report.skipped_pairs.clear()
         context.report.incomplete.clear()
 
@@ -245,8 +250,14 @@ class Within:
         if rank < self._count(self._ladder[0]):
             return True
         work = progress.underway + self._rank_work(self._settings.sampling, rank)
-        work += self._later_work(rank + 1, self._settings.rounds)
+        work += self._later_work(rank + 1, self._rounds_after(rank))
         return self._seconds(work, self._pace.speed(progress.worked, progress.taken)) <= self._limit.left
+
+    def _rounds_after(self, rank: int) -> int:
+        """Rounds of refinement to keep time for: they bring more than further partners do."""
+        if rank < self._count(self._settings):
+            return self._settings.rounds
+        return max(each.rounds for each in self._ladder)
 
     def _affordable(self, done: int) -> int:
         """How many ranks there is time for in all, so many of which are matched."""
@@ -254,7 +265,7 @@ class Within:
         matching = 0.0
         for rank in range(done, self._most):
             matching += self._rank_work(self._settings.sampling, rank)
-            work = matching + self._later_work(rank + 1, self._settings.rounds)
+            work = matching + self._later_work(rank + 1, self._rounds_after(rank))
             if self._seconds(work, speed) > self._limit.left:
                 return rank
         return self._most
@@ -271,7 +282,7 @@ class Within:
         """
         self._note(VoteStage.name, votes)
         if "refinement.rounds" not in self._kept:
-            rounds = max(each.rounds for each in self._ladder)
+            rounds = self._rounds_after(len(self._ranks))
             while rounds and not self._has_time_for(rounds, matched, votes):
                 rounds -= 1
             self._settings = replace(self._settings, rounds=rounds)
