@@ -262,6 +262,7 @@ def test_it_can_be_repeated(asked: str, project: Path, capsys: pytest.CaptureFix
         report["options"]["rectification"]["sampling"],
         report["options"]["pairs"]["num_pairs"],
         report["options"]["refinement"]["rounds"],
+        report["options"]["normals"]["radius"],
     )
     assert (chosen.sampling, chosen.rounds) == (
         (BEST.sampling, BEST.rounds) if asked == "10h" else (LADDER[0].sampling, LADDER[0].rounds)

@@ -1,7 +1,7 @@
 """What a run chose for its time, kept in the workspace: the same command once more goes on with it."""
 
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import asdict, astuple
 from typing import Annotated
 
 import msgspec
@@ -22,7 +22,7 @@ class Earlier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         See `TimeLimit`.
     kept : tuple of str
         Sorted, see `TimeLimit`.
-    sampling, partners, rounds
+    sampling, partners, rounds, radius
         See `Settings`.
     """
 
@@ -31,11 +31,12 @@ class Earlier(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sampling: Annotated[float, Meta(gt=0)]
     partners: Annotated[int, Meta(ge=1)]
     rounds: Annotated[int, Meta(ge=0)]
+    radius: Annotated[int, Meta(ge=1)]
 
 
 def keep_choice(workspace: Workspace, seconds: float, kept: Collection[str], settings: Settings) -> None:
     """Write down what was chosen for a time; `OutputError` where that is impossible."""
-    choice = Earlier(seconds, tuple(sorted(kept)), settings.sampling, settings.partners, settings.rounds)
+    choice = Earlier(seconds, tuple(sorted(kept)), **asdict(settings))
     with atomic_file(workspace.within_path) as file:
         file.write(msgspec.json.encode(choice))
 
@@ -51,9 +52,9 @@ def not_beyond(
     earlier = read_json(workspace.within_path, Earlier)
     if earlier is None or (earlier.seconds, set(earlier.kept)) != (seconds, set(kept)):
         return ladder
-    most = Settings(earlier.sampling, earlier.partners, earlier.rounds)
+    most = Settings(earlier.sampling, earlier.partners, earlier.rounds, earlier.radius)
     less = (
-        replace(each, partners=min(each.partners, most.partners), rounds=min(each.rounds, most.rounds))
+        Settings(most.sampling, *map(min, astuple(each)[1:], astuple(most)[1:]))
         for each in ladder
         if each.sampling == most.sampling
     )

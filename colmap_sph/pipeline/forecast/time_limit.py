@@ -16,7 +16,7 @@ _FORM = re.compile(r"(?:(\d+(?:\.\d+)?)\s*h)?\s*(?:(\d+(?:\.\d+)?)\s*(?:min|m))?
 _LONGEST = 1e7
 """Seconds; nearly four months."""
 
-DIALS = ("rectification.sampling", "pairs.num_pairs", "refinement.rounds")
+DIALS = ("rectification.sampling", "pairs.num_pairs", "refinement.rounds", "normals.radius")
 """Options that are chosen to keep to a time, by their place in the records."""
 
 
@@ -47,12 +47,12 @@ class TimeLimit:
             raise OptionError(
                 f"within must be more than 0 and at most {_LONGEST:.0f} seconds, not {self.seconds}.", "within"
             )
-        if self.kept.issuperset(DIALS):
+        if self.kept.issuperset(DIALS[:3]):
             raise OptionError(
                 "within has nothing to choose, as pairs.num_pairs, rectification.sampling and refinement.rounds "
                 "are all given; leave out one of the four.",
                 "within",
-                *DIALS,
+                *DIALS[:3],
             )
         if options.polish.is_wanted:
             raise OptionError(

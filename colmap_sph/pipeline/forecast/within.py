@@ -113,7 +113,7 @@ class Within:
         self._settings = self._ladder[0]
         self._has_pairs = any(context.workspace.pairs_dir.glob("*"))
         self._rank_works: dict[tuple[float, int], float] = {}
-        self._later_works: dict[tuple[int, int], float] = {}
+        self._later_works: dict[tuple[int, int, int], float] = {}
 
     # ---- what settings take --------------------------------------------------------------------------------
 
@@ -144,23 +144,25 @@ class Within:
             self._rank_works[sampling, asked] = known
         return known * len(self._ranks[rank])
 
-    def _later_work(self, count: int, rounds: int) -> float:
+    def _later_work(self, count: int, settings: Settings) -> float:
         """Of all stages after the matching of so many ranks."""
-        known = self._later_works.get((count, rounds))
+        case = (count, settings.rounds, settings.radius)
+        known = self._later_works.get(case)
         if known is None:
             partners = partners_of(self._pairs(count))
-            refinement = replace(self._context.options.refinement, rounds=rounds)
+            options = settings.applied(self._context.options)
+            normals, refinement = (options.normals, options.refinement)
             known = estimated_fusion(self._context).seconds
             for name, others in partners.items():
-                seconds = vote_seconds(len(others)) + confirm_seconds(len(others), refinement)
+                seconds = vote_seconds(len(others), normals) + confirm_seconds(len(others), normals, refinement)
                 known += seconds * self._context.window(name).num_pixels / 1e6
-            self._later_works[count, rounds] = known
+            self._later_works[case] = known
         return known
 
     def _work(self, settings: Settings) -> float:
         count = self._count(settings)
         matching = sum(self._rank_work(settings.sampling, rank) for rank in range(count))
-        return matching + self._later_work(count, settings.rounds)
+        return matching + self._later_work(count, settings)
 
     def _seconds(self, work: float, speed: float) -> float:
         """Until the end of the run, with so much work before the page."""
@@ -211,6 +213,7 @@ class Within:
             results |= others
         if "pairs.num_pairs" not in self._kept:
             self._settings = replace(self._settings, partners=done)
+        self._settings = replace(self._settings, radius=self._affordable_radius(done))
         pairs = self._pairs(done)
         context.report.pairs = len(results)
         return self._with(self._settings), {pair: results[pair] for pair in pairs if pair in results}
@@ -250,14 +253,14 @@ class Within:
         if rank < self._count(self._ladder[0]):
             return True
         work = progress.underway + self._rank_work(self._settings.sampling, rank)
-        work += self._later_work(rank + 1, self._rounds_after(rank))
+        work += self._later_work(rank + 1, self._settings_after(rank))
         return self._seconds(work, self._pace.speed(progress.worked, progress.taken)) <= self._limit.left
 
-    def _rounds_after(self, rank: int) -> int:
-        """Rounds of refinement to keep time for: they bring more than further partners do."""
+    def _settings_after(self, rank: int) -> Settings:
+        """What to keep time for: refinement and normals bring more than partners beyond those first chosen."""
         if rank < self._count(self._settings):
-            return self._settings.rounds
-        return max(each.rounds for each in self._ladder)
+            return self._settings
+        return replace(self._settings, rounds=self._ladder[-1].rounds, radius=self._ladder[-1].radius)
 
     def _affordable(self, done: int) -> int:
         """How many ranks there is time for in all, so many of which are matched."""
@@ -265,10 +268,16 @@ class Within:
         matching = 0.0
         for rank in range(done, self._most):
             matching += self._rank_work(self._settings.sampling, rank)
-            work = matching + self._later_work(rank + 1, self._rounds_after(rank))
+            work = matching + self._later_work(rank + 1, self._settings_after(rank))
             if self._seconds(work, speed) > self._limit.left:
                 return rank
         return self._most
+
+    def _affordable_radius(self, done: int) -> int:
+        """The larger radius of normals where there is time for it, too."""
+        usual = replace(self._settings, radius=self._ladder[-1].radius)
+        seconds = self._seconds(self._later_work(done, usual), self._pace.speed())
+        return usual.radius if seconds <= self._limit.left else self._ladder[0].radius
 
     def refined(self, context: Context, matched: Mapping[Pair, Result], votes: Mapping[str, Result]) -> Context:
         """Choose the rounds of refinement that there is time for; return the context with them.
@@ -282,7 +291,7 @@ class Within:
         """
         self._note(VoteStage.name, votes)
         if "refinement.rounds" not in self._kept:
-            rounds = self._rounds_after(len(self._ranks))
+            rounds = self._ladder[-1].rounds
             while rounds and not self._has_time_for(rounds, matched, votes):
                 rounds -= 1
             self._settings = replace(self._settings, rounds=rounds)
