@@ -37,6 +37,8 @@ _PROBES = 2
 _READ_SECONDS = 0.02
 # What is left of the trust in earlier stages' speed with each stage: others may use the machine, too.
 _FADING = 0.5
+# Share of what is left that further partners may count on: where the rest takes longer, refinement must not pay.
+_CAUTION = 0.9
 # Pairs that each sampling's estimate rests on.
 _ASKED = 8
 # Processor seconds of what follows the last stage, the page: of any run, and of each image.
@@ -173,13 +175,12 @@ class Within:
 
     def choose(self) -> Choice:
         """The best settings that there is time for, or else the quickest."""
-        left = self._limit.left
         speed = self._pace.speed()
-        for settings in reversed(self._ladder):
-            seconds = self._seconds(self._work(settings), speed)
-            if seconds <= left:
-                break
-        return Choice(settings, self._limit.seconds, self._limit.elapsed + seconds)
+        seconds = {settings: self._seconds(self._work(settings), speed) for settings in self._ladder}
+        elapsed = self._limit.elapsed  # not before: to estimate takes time, too
+        fitting = [settings for settings in self._ladder if elapsed + seconds[settings] <= self._limit.seconds]
+        settings = fitting[-1] if fitting else self._ladder[0]
+        return Choice(settings, self._limit.seconds, elapsed + seconds[settings])
 
     def planned(self) -> tuple[Context, list[Pair], Choice]:
         """What a dry run goes on with: nothing is timed."""
@@ -269,7 +270,7 @@ class Within:
         for rank in range(done, self._most):
             matching += self._rank_work(self._settings.sampling, rank)
             work = matching + self._later_work(rank + 1, self._settings_after(rank))
-            if self._seconds(work, speed) > self._limit.left:
+            if self._seconds(work, speed) > _CAUTION * self._limit.left:
                 return rank
         return self._most
 

@@ -33,8 +33,8 @@ from colmap_sph.stereo.vote import VoteOptions, vote_depth
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
-# Processor seconds per megapixel of the image: per pair that votes; and of the normals of one kind of maps, for each
-# pixel of the radius of their windows.
+# Processor seconds per megapixel of the image: per pair that votes; and of the normals of one kind of maps, for
+# each pixel of the radius of their windows.
 _SECONDS = 0.052
 _NORMALS_SECONDS = 0.04
 # Estimates reach so many pixels beyond the region that maps are cut to: what windows at its border look at.
