@@ -12,8 +12,9 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
-from colmap_sph.pipeline.reconstruct import choose_pairs, with_good_images
+from colmap_sph.pipeline.reconstruct import with_good_images
 from colmap_sph.pipeline.report import Silent, StageEstimate
+from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.project.project import Project
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_0.jpg"]

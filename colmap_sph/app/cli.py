@@ -2,6 +2,7 @@
 
 import logging
 import sys
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,6 +28,7 @@ from colmap_sph.app.spelling import flag_of
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError, reason_of
 from colmap_sph.evaluation import format_clouds, format_depth_maps
+from colmap_sph.pipeline.forecast.time_limit import process_start
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.workers import is_memory_error
 from colmap_sph.project.workspace import Workspace
@@ -50,12 +52,13 @@ Command = RunCommand | DemoCommand | EvaluateCommand | ReportCommand | ViewComma
 def main(arguments: list[str] | None = None) -> int:
     """Entry point of the `colmap_sph` command; returns the exit code."""
     terminal = Terminal()
+    started = process_start() if arguments is None else time.monotonic()
     arguments = sys.argv[1:] if arguments is None else arguments
     # OpenCV and its readers print names of files as they are; what is wrong with a file, our own messages say.
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
     with warnings_shown(terminal):
         try:
-            return _answer(arguments, terminal)
+            return _answer(arguments, terminal, started)
         except Exception as error:
             told = _in_words(error)
             if told is None:
@@ -79,7 +82,7 @@ def _in_words(error: BaseException) -> ColmapSphError | None:
     return None
 
 
-def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
+def _answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int:
     if arguments and arguments[0] in ("--version", "-V"):
         print_result(f"colmap_sph {colmap_sph.__version__}")
         return 0
@@ -99,7 +102,7 @@ def _answer(arguments: Sequence[str], terminal: Terminal) -> int:
 
     try:
         with stop_on_signals(last_words):
-            code = _do(command, arguments, terminal, events)
+            code = _do(command, arguments, terminal, events, started)
     except Interrupted as stop:
         _print_interrupted(command, terminal)
         events.end(stop.exit_code, "interrupted")
@@ -153,13 +156,13 @@ def _parsed(arguments: Sequence[str]) -> Command:
     return command
 
 
-def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: Events) -> int:
+def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: Events, started: float) -> int:
     try:
         Path.cwd()
     except OSError as error:
         raise InputError(f"The current folder cannot be used ({reason_of(error)}); change to another.") from error
     if isinstance(command, RunCommand):
-        return run_command(command, terminal, arguments, events)
+        return run_command(command, terminal, arguments, events, started)
     if isinstance(command, DemoCommand):
         return demo_command(command, terminal, arguments)
     if isinstance(command, ReportCommand):

@@ -68,6 +68,7 @@ class Events:
             "plan",
             **{name: getattr(plan, name) for name in names},
             seconds_left=round(plan.seconds, 1),
+            choice=plan.choice,
             memory=round(plan.memory),
             disk=round(plan.disk),
         )

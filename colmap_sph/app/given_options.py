@@ -32,13 +32,27 @@ def all_arguments(typed: Sequence[str], command: type) -> list[str]:
     OptionError
         It leaves nothing to the quality.
     """
-    arguments = in_full(typed)
+    arguments = _with_config(in_full(typed), command)
+    quality = last_value(arguments, "--quality")
+    if quality is not None and last_value(arguments, "--within"):
+        raise OptionError("--within chooses the quality by the time there is; leave out it or --quality.")
+    return [*_of_quality(quality), *arguments]
+
+
+def _with_config(arguments: list[str], command: type) -> list[str]:
     config = last_value(arguments, "--config")
-    if config is not None:
-        if config.lower().endswith(".json") and last_value(arguments, "--quality") is not None:
-            raise OptionError(f"--quality has no effect, as {config} sets all options; leave out one of the two.")
-        arguments = [*arguments_of_file(Path(config), known_options(command)), *arguments]
-    return [*_of_quality(last_value(arguments, "--quality")), *arguments]
+    if config is None:
+        return arguments
+    for flag in ("--quality", "--within"):
+        if config.lower().endswith(".json") and last_value(arguments, flag) is not None:
+            raise OptionError(f"{flag} has no effect, as {config} sets all options; leave out one of the two.")
+    return [*arguments_of_file(Path(config), known_options(command)), *arguments]
+
+
+def given_places(typed: Sequence[str], command: type) -> set[str]:
+    """Places in the records of the options that are given, typed or in a configuration."""
+    flags = {argument.partition("=")[0] for argument in _with_config(in_full(typed), command)}
+    return {option.place for flag, option in known_options(command).items() if flag in flags}
 
 
 def _of_quality(quality: str | None) -> list[str]:

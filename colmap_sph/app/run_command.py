@@ -2,6 +2,7 @@
 
 import io
 import logging
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,12 +18,14 @@ from rich.text import Text
 import colmap_sph
 from colmap_sph.app.display import Display, duration
 from colmap_sph.app.events import Events
+from colmap_sph.app.given_options import given_places
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.option_list import Option, option_groups
 from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.spelling import EVERYDAY
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import shell_word
+from colmap_sph.pipeline.forecast.time_limit import DIALS, TimeLimit, changed_dials, format_time, parse_time
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
 from colmap_sph.pipeline.presets import Quality
@@ -37,6 +40,8 @@ PARTIAL_EXIT_CODE = 5
 """The run finished, but some images of the model have no depth map, or are not in the cloud."""
 
 _MAX_LISTED_IMAGES = 60
+# Times what was asked for.
+_LATE = 1.05
 
 
 @dataclass(frozen=True)
@@ -53,6 +58,9 @@ class RunCommand:
     )
     quality: Quality = "normal"
     """Preview takes a quarter of the time of normal, best about twice as much. Options given beside it win."""
+    within: str = ""
+    """Time to end within, such as 20min or 1h30min, instead of a quality: sampling, partners and refinement are
+    chosen for it as the run goes. Those of them that are given stay as they are."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Only say what is to do, and about how much time, memory and disk it takes. Nothing is written."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -68,28 +76,63 @@ class RunCommand:
 
 
 def run_command(
-    command: RunCommand, terminal: Terminal, arguments: Sequence[str] = (), events: Events | None = None
+    command: RunCommand,
+    terminal: Terminal,
+    arguments: Sequence[str] = (),
+    events: Events | None = None,
+    started: float | None = None,
 ) -> int:
-    """`colmap_sph run`, as it was typed; the last event is the caller's."""
+    """`colmap_sph run`, as it was typed; the last event is the caller's.
+
+    `started` is when the program began, as `time.monotonic` tells; without it, it is now.
+    """
     events = Events(None) if events is None else events
     project = command.project
     options = command.options
     events.begin(arguments, project.root if project.is_named else None, options.num_threads)
-    check_input(project, options)
+    limit = _limit(command, arguments, started)
+    check_input(project, options, limit)
     workspace = Workspace(project.root)
     if command.dry_run:
-        plan = make_plan(project, options, overwrite=command.overwrite)
+        plan = make_plan(project, options, overwrite=command.overwrite, limit=limit)
         events.plan(plan)
         print_plan(plan, workspace, terminal)
         return 0
     with workspace_log(workspace, header(arguments)), _progress(command, terminal, events) as progress:
         logger.info("Options: %s", command)
         report = run_project(
-            project, options, progress=progress, overwrite=command.overwrite, verify=command.verify
+            project,
+            options,
+            progress=progress,
+            overwrite=command.overwrite,
+            verify=command.verify,
+            limit=limit,
         )
     events.note(report)
     print_summary(report, workspace, terminal)
+    if limit is not None:
+        _print_arrival(limit, terminal)
     return PARTIAL_EXIT_CODE if report.skipped_images or report.incomplete else 0
+
+
+def _limit(command: RunCommand, arguments: Sequence[str], started: float | None) -> TimeLimit | None:
+    """The time limit, if there is one; what was typed stays, also where it is the default."""
+    if not command.within:
+        return None
+    typed = given_places(arguments[1:], RunCommand)
+    return TimeLimit(
+        parse_time(command.within),
+        changed_dials(command.options) | typed.intersection(DIALS),
+        time.monotonic() if started is None else started,
+    )
+
+
+def _print_arrival(limit: TimeLimit, terminal: Terminal) -> None:
+    taken = f"{format_time(limit.elapsed)} of {format_time(limit.seconds)}"
+    if limit.elapsed > _LATE * limit.seconds:
+        terminal.say(f"it took {taken}", label="late:", style="yellow")
+    else:
+        terminal.say(f"it took {taken}", label="in time:")
 
 
 @contextmanager
@@ -168,6 +211,8 @@ def print_plan(plan: Plan, workspace: Workspace, terminal: Terminal) -> None:
     ):
         facts.append((what, f"{number - done} to do, {done} done"))
     facts.append(("time", f"about {duration(plan.seconds)}"))
+    if plan.choice:
+        facts.append(("within", plan.choice))
     facts.append(("memory", f"about {decimal(round(plan.memory))}"))
     facts.append(("disk", f"about {decimal(round(plan.disk))} more, of {decimal(plan.free_disk)} free"))
     terminal.facts(facts)
@@ -214,6 +259,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
         facts.append(("values", report.stretched))
     facts.append(("agreement", _agreement(report)))
     facts.append(("pairs", f"{report.pairs} matched ({report.pair_source})"))
+    if report.within:
+        facts.append(("within", report.within))
     if report.polishing:
         facts.append(("poses", report.polishing))
     if report.points:  # there are none where only maps were asked for

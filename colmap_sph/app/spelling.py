@@ -18,6 +18,7 @@ EVERYDAY = (
     "--output",
     "--workspace",
     "--quality",
+    "--within",
     "--max-image-size",
     "--num-pairs",
     "--threads",

@@ -1,11 +1,12 @@
 """A stage's jobs, executed: what is there is left alone, the rest is made by worker threads within the memory."""
 
 import logging
+import time
 from collections.abc import Callable, Hashable
 from typing import TypeVar
 
 from colmap_sph.pipeline.memory import MemoryGate
-from colmap_sph.pipeline.stages.stage import Result, Stage
+from colmap_sph.pipeline.stages.stage import Job, Result, Stage
 from colmap_sph.pipeline.workers import for_all
 from colmap_sph.project.state.background import vouching_in_background
 
@@ -21,7 +22,7 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
     Returns
     -------
     dict
-        Result of each item, in the items' order, without those that failed.
+        Result of each item, in the items' order, without those that failed or were not wanted any more.
 
     Raises
     ------
@@ -33,14 +34,16 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
     kept = stage.kept_memory(gate)
     gate.keep(kept.total(context.options.num_threads))
 
-    def work(item: Item) -> Result:
+    def work(item: Item) -> Result | None:
+        if not stage.is_wanted(item):
+            return None
         job = stage.job(item)
         if job.done is not None:
             return Result(job.key, made=False, facts=job.done)
         if stage.whole:
-            return Result(job.key, made=True, facts=stage.make(job.task), seconds=job.cost.seconds)
+            return _made(stage, job)
         with gate.reserve(job.cost.memory, stage.label(item)):
-            return Result(job.key, made=True, facts=stage.make(job.task), seconds=job.cost.seconds)
+            return _made(stage, job)
 
     with stage.opened(), context.stage(stage.name, len(stage.items)):
         with stage.holding(kept), vouching_in_background():
@@ -55,19 +58,28 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
     return results
 
 
-def _by_threads(work: Callable[[Item], Result], stage: Stage[Item, Task]) -> dict[Item, Result]:
+def _made(stage: Stage[Item, Task], job: Job[Task]) -> Result:
+    start = time.perf_counter()
+    facts = stage.make(job.task)
+    return Result(job.key, True, facts, seconds=job.cost.seconds, taken=time.perf_counter() - start)
+
+
+def _by_threads(work: Callable[[Item], Result | None], stage: Stage[Item, Task]) -> dict[Item, Result]:
     context = stage.context
 
     def advance(result: Result | None) -> None:
         context.progress.advance(0.0 if result is None else result.seconds)
 
-    return for_all(work, stage.items, threads=context.options.num_threads, advance=advance, skip=stage.skip)
+    results = for_all(work, stage.items, threads=context.options.num_threads, advance=advance, skip=stage.skip)
+    return {item: result for item, result in results.items() if result is not None}
 
 
-def _one_by_one(work: Callable[[Item], Result], stage: Stage[Item, Task]) -> dict[Item, Result]:
+def _one_by_one(work: Callable[[Item], Result | None], stage: Stage[Item, Task]) -> dict[Item, Result]:
     """In the calling thread, the only one in which COLMAP's library heeds Ctrl-C."""
     results = {}
     for item in stage.items:
-        results[item] = work(item)
-        stage.context.progress.advance(results[item].seconds)
+        result = work(item)
+        if result is not None:
+            results[item] = result
+            stage.context.progress.advance(result.seconds)
     return results

@@ -11,12 +11,12 @@ from colmap_sph.pipeline.contradictions import check_fusion
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.reconstruct import choose_pairs
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.report_files import make_page
 from colmap_sph.pipeline.stages.fuse_to import FuseToStage
 from colmap_sph.pipeline.stages.fusion_partners import partners_in_fusion
 from colmap_sph.pipeline.stages.fusion_parts import index_in_model
+from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.pipeline.stages.view_maps import MapSources
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed

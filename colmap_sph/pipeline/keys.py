@@ -67,6 +67,10 @@ class Keys:
         self._programs = program_digests()
         self._masks: LoadCache[str | None] = LoadCache(lambda _: 0)
 
+    def of(self, options: RunOptions) -> "Keys":
+        """The same for a run with other options."""
+        return Keys(self._workspace, options, self._images, fresh=self.fresh)
+
     def _image(self, name: str) -> str | None:
         return self._images.get(name)
 

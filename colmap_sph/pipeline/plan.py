@@ -13,6 +13,8 @@ from typing import TypeVar
 
 from colmap_sph.errors import ColmapSphError
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.forecast.time_limit import TimeLimit
+from colmap_sph.pipeline.forecast.within import Within, widest
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions, num_cores
@@ -20,12 +22,11 @@ from colmap_sph.pipeline.polishing import with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import (
     check_input,
-    choose_pairs,
     go_through_stages,
-    wanted_scene,
     with_good_images,
 )
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
 from colmap_sph.project.files import free_space
 from colmap_sph.project.polishing.polished import starting_model
@@ -91,6 +92,8 @@ class Plan:
         Free space where these go, bytes.
     stages : tuple of StagePlan
         Of each stage, in their order; with a sparse model the undistortion before them.
+    choice : str
+        Where a time is asked for: what would be chosen for it, if the machine is as fast as estimated.
     """
 
     undistort: bool
@@ -105,9 +108,12 @@ class Plan:
     disk: float
     free_disk: int
     stages: tuple[StagePlan, ...]
+    choice: str = ""
 
 
-def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False) -> Plan:
+def make_plan(
+    project: Project, options: RunOptions, *, overwrite: bool = False, limit: TimeLimit | None = None
+) -> Plan:
     """Find what `reconstruct.run_project` would do; raises what it would raise before its first stage.
 
     Parameters
@@ -116,12 +122,15 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
     options : RunOptions
     overwrite : bool
         Everything would be done again.
+    limit : TimeLimit, optional
+        The time to end within.
 
     Returns
     -------
     Plan
     """
-    check_input(project, options)
+    check_input(project, options, limit)
+    options = options if limit is None else widest(options, limit)
     survey = Survey()
     foreseen = None
     given = None
@@ -147,7 +156,14 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         logger.warning("Would get another name, as this program did not make it: %s", named(foreign))
     if given is not None and options.polish.is_wanted:
         context = with_polished_poses(context, selection.unique_pairs(), survey, given)
-    go_through_stages(context, selection.unique_pairs(), survey)
+    pairs_to_match = selection.unique_pairs()
+    choice = ""
+    if limit is not None:
+        before = sum(stage.seconds for stage in survey.stages) / _workers(options)
+        within = Within(limit.begun(before), context, selection, goes_on=not overwrite)
+        context, pairs_to_match, chosen = within.planned()
+        choice = chosen.words
+    go_through_stages(context, pairs_to_match, survey)
     stages = survey.stages
     pairs, _, maps, cloud = stages[-4:]
     return Plan(
@@ -158,12 +174,17 @@ def make_plan(project: Project, options: RunOptions, *, overwrite: bool = False)
         images=maps.total,
         images_done=maps.done,
         fuse=cloud.done < cloud.total,
-        seconds=sum(stage.seconds for stage in stages) / min(options.num_threads, num_cores()),
+        seconds=sum(stage.seconds for stage in stages) / _workers(options),
         memory=max(stage.memory for stage in stages),
         disk=sum(stage.disk for stage in stages),
         free_disk=free_space(project.root),
         stages=tuple(stages),
+        choice=choice,
     )
+
+
+def _workers(options: RunOptions) -> int:
+    return min(options.num_threads, num_cores())
 
 
 @dataclass

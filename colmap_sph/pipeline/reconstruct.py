@@ -4,7 +4,6 @@ Stages talk through files in the workspace: disparity maps of pairs, photometric
 deviations, geometric maps, the cloud. What an earlier run finished with the same input is used as it is.
 """
 
-import itertools
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -17,6 +16,8 @@ from colmap_sph.pipeline.context import Context, Until, timed_stage
 from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
+from colmap_sph.pipeline.forecast.time_limit import TimeLimit, time_limit
+from colmap_sph.pipeline.forecast.within import Within, widest
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
@@ -29,23 +30,20 @@ from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel
+from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
-from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.pair_lists import read_patch_match_cfg
 from colmap_sph.project.polishing.polished import restore_given, starting_model
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import damaged_files, discard_results, named, results_of, take_places
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.partners.pairs import PairSelection, select_pairs
 from colmap_sph.stereo.rectification import sampling_of
 
 logger = logging.getLogger(__name__)
@@ -62,6 +60,7 @@ def run(
     progress: Progress | None = None,
     overwrite: bool = False,
     verify: bool = False,
+    within: str | float | None = None,
 ) -> RunReport:
     """From a sparse model, or a dense workspace, to depth maps, normal maps and a fused cloud.
 
@@ -78,6 +77,9 @@ def run(
         keeps its images and model. Files that this program did not make, where it will write, get another name.
     verify : bool
         Look at every byte of earlier results first, and make again what is damaged.
+    within : str or float, optional
+        The time to end within, such as "20min", or seconds: sampling, partners and refinement, as far as the
+        options have them at their defaults, are chosen accordingly, see `Within`.
 
     Returns
     -------
@@ -95,8 +97,10 @@ def run(
     >>> print(report.points, report.coverage)  # doctest: +SKIP
     """
     paths = (None if path is None else Path(path) for path in (model, images, masks, output, workspace))
+    options = options or RunOptions()
+    limit = None if within is None else time_limit(within, options)
     return run_project(
-        Project(*paths), options or RunOptions(), progress=progress, overwrite=overwrite, verify=verify
+        Project(*paths), options, progress=progress, overwrite=overwrite, verify=verify, limit=limit
     )
 
 
@@ -107,6 +111,7 @@ def run_project(
     progress: Progress | None = None,
     overwrite: bool = False,
     verify: bool = False,
+    limit: TimeLimit | None = None,
 ) -> RunReport:
     """Do what `run` does, for what is in one record.
 
@@ -116,8 +121,10 @@ def run_project(
     options : RunOptions
     progress, overwrite, verify
         See `run`.
+    limit : TimeLimit, optional
+        The time to end within.
     """
-    check_input(project, options)
+    check_input(project, options, limit)
     program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
     report = RunReport(command=command_of(project, options))
@@ -128,7 +135,13 @@ def run_project(
             if overwrite:
                 discard_results(dense)
             return reconstruct(
-                dense, options, progress=progress, report=report, overwrite=overwrite, verify=verify
+                dense,
+                options,
+                progress=progress,
+                report=report,
+                overwrite=overwrite,
+                verify=verify,
+                limit=limit,
             )
     with claimed(dense):
         preparation = Preparation(
@@ -148,12 +161,15 @@ def run_project(
             given=given,
             overwrite=overwrite,
             verify=verify,
+            limit=limit,
         )
 
 
-def check_input(project: Project, options: RunOptions) -> None:
+def check_input(project: Project, options: RunOptions, limit: TimeLimit | None = None) -> None:
     """Raise `ColmapSphError` for what is wrong before anything is touched."""
     options.check()
+    if limit is not None:
+        limit.check(options)
     project.check()
     check_links(Workspace(project.root), is_given=project.workspace is not None)
     if project.model is None and options.undistortion != UndistortionOptions():
@@ -179,6 +195,7 @@ def reconstruct(
     until: Until = "cloud",
     pair_list: Path | None = None,
     needs_all: bool = False,
+    limit: TimeLimit | None = None,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -206,6 +223,8 @@ def reconstruct(
         Which pairs to match, in the format of ``patch-match.cfg`` and instead of the workspace's own.
     needs_all : bool
         Whether an image that is missing or damaged ends the run (`InputError`) before anything is made.
+    limit : TimeLimit, optional
+        The time to end within.
 
     Returns
     -------
@@ -214,6 +233,7 @@ def reconstruct(
     progress = Silent() if progress is None else progress
     report = report or RunReport()
     report.until = until
+    options = options if limit is None else widest(options, limit)
     make_dir(workspace.state_dir)
     with one_opencv_thread():
         is_polishing = given is not None and options.polish.is_wanted
@@ -244,8 +264,11 @@ def reconstruct(
             progress.foresee(foreseen_stages(context, selection.unique_pairs(), first))
             context = with_polished_poses(context, selection.unique_pairs(), execute, given)
         judge_reprojection(report, context.scene)
-        progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
-        go_through_stages(context, selection.unique_pairs(), execute, until=until)
+        if limit is None:
+            progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
+            go_through_stages(context, selection.unique_pairs(), execute, until=until)
+        else:
+            context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), execute)
         judge_agreement(report)
     write_report(context)
     make_page(context)
@@ -293,15 +316,29 @@ def go_through_stages(
     """
     check_numbers(context, pairs)
     matched = executor(MatchStage(context, pairs))
-    measured = {pair: result.facts.row_residual for pair, result in matched.items()}
-    judge_rows(context.report, context.scene, measured)
-    votes = executor(VoteStage(context, matched))
+    votes = _vote(context, matched, executor)
     if until == "photometric":
         report_photometric(context, votes)
         return
     maps = executor(ConfirmStage(context, matched, votes))
     if until == "cloud":
         executor(fuse_stage(context, keys_of(matched), maps))
+
+
+def go_through_stages_within(within: Within, executor: Executor) -> Context:
+    """Go through all stages in the time that there is; return the context with the options that were chosen."""
+    context, matched = within.match(executor)
+    votes = _vote(context, matched, executor)
+    context = within.refined(context, matched, votes)
+    maps = executor(ConfirmStage(context, matched, votes))
+    executor(fuse_stage(context, keys_of(matched), maps))
+    return context
+
+
+def _vote(context: Context, matched: Mapping[Pair, Result], executor: Executor) -> dict[str, Result]:
+    measured = {pair: result.facts.row_residual for pair, result in matched.items()}
+    judge_rows(context.report, context.scene, measured)
+    return executor(VoteStage(context, matched))
 
 
 def with_good_images(
@@ -343,39 +380,3 @@ def _report_detail(context: Context, details: Mapping[str, float]) -> None:
     context.report.detail = round(detail, 3)
     context.report.sampling = round(sampling, 3)
     logger.info("Images hold %.2f of their pixels' detail: pairs are sampled at %.2f", detail, sampling)
-
-
-def choose_pairs(
-    workspace: Workspace | None,
-    scene: Scene,
-    options: RunOptions,
-    database: Path | None,
-    pair_list: Path | None = None,
-) -> PairSelection:
-    """Select the pairs of a scene, as the user's ``patch-match.cfg`` says where there is one.
-
-    Parameters
-    ----------
-    workspace : Workspace or None
-        None: it is not there yet, and so no such file.
-    scene : Scene
-    options : RunOptions
-    database, pair_list : Path, optional
-        See `reconstruct`.
-
-    Returns
-    -------
-    PairSelection
-    """
-    path = pair_list
-    if path is None and workspace is not None and workspace.patch_match_cfg_path.exists():
-        path = workspace.patch_match_cfg_path
-    among = scene.index_of if options.region else None  # images elsewhere are named in vain
-    written = None if path is None else read_patch_match_cfg(path, among)
-    matches = None if database is None or scene.has_tracks else read_verified_matches(database)
-    return select_pairs(scene, options.pairs, explicit=written, matches=matches)
-
-
-def wanted_scene(scene: Scene, selection: PairSelection) -> Scene:
-    """Return the scene without the views that are not asked for."""
-    return scene.only({*selection.partners, *itertools.chain(*selection.unique_pairs())})

@@ -80,6 +80,8 @@ class RunReport:
         that could not be read. The next run makes them again.
     stretched : str
         Which values became black and white in images of more than 8 bits, where these were changed.
+    within : str
+        Where a time was asked for: which, and what was chosen for it.
     detail : float or None
         Samples per pixel that hold what the images show, on average, see `image_detail`.
     sampling : float or None
@@ -144,6 +146,7 @@ class RunReport:
     skipped_images: dict[str, str] = field(default_factory=dict)
     incomplete: dict[str, str] = field(default_factory=dict)
     stretched: str = ""
+    within: str = ""
     detail: float | None = None
     sampling: float | None = None
     pair_source: str = ""

@@ -97,6 +97,11 @@ class Workspace:
         return self.state_dir / "undistortion.json"
 
     @property
+    def within_path(self) -> Path:
+        """What was chosen for a time."""
+        return self.state_dir / "within.json"
+
+    @property
     def given_model_dir(self) -> Path:
         """The model of the undistorted images as it was given, where `sparse` holds a polished one."""
         return self.state_dir / "given"

@@ -58,24 +58,30 @@ def foreseen_stages(
     )
     if until == "photometric":
         stages = stages[:-1]
-    estimates = [_estimate(stage) for stage in stages]
+    estimates = [estimate(stage) for stage in stages]
     if until == "cloud":
-        parts, each = foreseen_fusion(context)
-        estimates.append(StageEstimate(FuseStage.name, parts, parts * each, each))
+        estimates.append(estimated_fusion(context))
     return estimates
 
 
-def _estimate(stage: Stage[Any, Any]) -> StageEstimate:
-    jobs = list(_some_jobs(stage))
+def estimated_fusion(context: Context) -> StageEstimate:
+    """Estimate what the last stage will take."""
+    parts, each = foreseen_fusion(context)
+    return StageEstimate(FuseStage.name, parts, parts * each, each)
+
+
+def estimate(stage: Stage[Any, Any], asked: int = _ASKED) -> StageEstimate:
+    """Estimate what a stage will take from so many of its items."""
+    jobs = list(_some_jobs(stage, asked))
     to_make = [job.cost.seconds for job in jobs if job.done is None]
     each = sum(to_make) / max(len(to_make), 1)
     share = len(to_make) / max(len(jobs), 1)
     return StageEstimate(stage.name, len(stage.items), share * each * len(stage.items), each)
 
 
-def _some_jobs(stage: Stage[Any, Any]) -> Iterator[Job[Any]]:
+def _some_jobs(stage: Stage[Any, Any], asked: int) -> Iterator[Job[Any]]:
     number = len(stage.items)
-    asked = min(number, _ASKED)
+    asked = min(number, asked)
     for index in range(asked):
         try:
             yield stage.job(stage.items[index * number // asked])

@@ -15,7 +15,7 @@ from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
-from colmap_sph.pipeline.stages.vote import NORMALS_SECONDS
+from colmap_sph.pipeline.stages.vote import normals_seconds
 from colmap_sph.project.images.reading import bytes_to_reduce, read_whole_grey
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.scene import View
@@ -132,6 +132,12 @@ def _image(file: EstimateFile) -> NDArray[np.uint8]:
     return _images.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
 
 
+def confirm_seconds(partners: int, normals: NormalOptions, refinement: RefinementOptions) -> float:
+    """Processor seconds per megapixel of an image that has so many partners."""
+    seconds = normals_seconds(normals) + _CONFIRM_SECONDS * partners
+    return seconds + _REFINE_SECONDS * refinement.images_used(partners)
+
+
 class ConfirmStage(Stage[str, ConfirmTask]):
     """Confirms and refines the depth of every image with a vote."""
 
@@ -188,8 +194,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         pixels = self._pixels(name)
         partners = self._partners(name)
         refinement = self.context.options.refinement
-        seconds = NORMALS_SECONDS + _CONFIRM_SECONDS * len(partners)
-        seconds += _REFINE_SECONDS * refinement.images_used(len(partners))
+        seconds = confirm_seconds(len(partners), self.context.options.normals, refinement)
         memory = _CONFIRM_BYTES * pixels
         if refinement.rounds:
             memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + _IMAGE_BYTES * sum(map(self._pixels, partners))

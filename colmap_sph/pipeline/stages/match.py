@@ -43,8 +43,9 @@ logger = logging.getLogger(__name__)
 # one at so many rectified pixels per pixel.
 _PRECISE_POSES = 0.35
 _TRIAL_SAMPLING = 0.4
-# Processor seconds per megapixel of both rectified images.
+# Processor seconds per megapixel of both rectified images, and of a pair beside that.
 _SECONDS = 0.2
+_PAIR_SECONDS = 0.03
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …
@@ -175,7 +176,7 @@ class MatchStage(Stage[Pair, MatchTask]):
         reading = max(_READ_BYTES * pixels, bytes_to_reduce(left, right))
         both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
-            seconds=_SECONDS * both_pixels / 1e6 * (1 + trial**2 * (trial < 1)),
+            seconds=_PAIR_SECONDS + _SECONDS * both_pixels / 1e6 * (1 + trial**2 * (trial < 1)),
             memory=max(_MATCH_BYTES * left_pixels, reading + _RECTIFIED_BYTES * left_pixels),
             disk=_FILE_BYTES * left_pixels,
             scratch=scratch_bytes(left_pixels, context.options.matching),

@@ -68,12 +68,27 @@ class Job(Generic[Task]):
 
 @dataclass(frozen=True)
 class Result:
-    """Outcome of one item: its key, whether this run made it, what is known of it, and what it was to cost."""
+    """Outcome of one item.
+
+    Attributes
+    ----------
+    key : str
+        See `Job`.
+    made : bool
+        Whether this run made it.
+    facts : Facts
+        What is known of it.
+    seconds : float
+        Processor seconds that making it was to cost.
+    taken : float
+        Seconds that it took the worker.
+    """
 
     key: str
     made: bool
     facts: Facts
     seconds: float = 0.0
+    taken: float = 0.0
 
 
 class Stage(ABC, Generic[Item, Task]):
@@ -102,6 +117,10 @@ class Stage(ABC, Generic[Item, Task]):
     @abstractmethod
     def make(task: Task) -> Facts:
         """Make one result: a plain function of its task, for any thread, process or machine."""
+
+    def is_wanted(self, item: Item) -> bool:
+        """Whether there is still time for an item; asked by the worker that is to begin it, in their order."""
+        return True
 
     def label(self, item: Item) -> str:
         """What an item is called in messages: itself, where it is a name."""

@@ -35,9 +35,10 @@ from colmap_sph.stereo.vote import VoteOptions, vote_depth
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
-# Processor seconds per megapixel of the image: per pair that votes, and of the normals of one kind of maps.
+# Processor seconds per megapixel of the image: per pair that votes; and of the normals of one kind of maps, for
+# each pixel of the radius of their windows.
 _SECONDS = 0.052
-NORMALS_SECONDS = 0.16
+_NORMALS_SECONDS = 0.04
 # Estimates reach so many pixels beyond the region that maps are cut to: what windows at its border look at.
 REGION_MARGIN = 24
 # Bytes on disk per pixel: of the estimate.
@@ -115,6 +116,16 @@ def report_photometric(context: "Context", votes: Mapping[str, Result]) -> None:
         raise NoResultError("No image has a depth map: no two of its pairs agree on any depth.")
 
 
+def normals_seconds(options: NormalOptions) -> float:
+    """Processor seconds per megapixel to fit normals."""
+    return _NORMALS_SECONDS * options.radius
+
+
+def vote_seconds(pairs: int, normals: NormalOptions) -> float:
+    """Processor seconds per megapixel of an image on whose depth so many pairs vote."""
+    return normals_seconds(normals) + _SECONDS * pairs
+
+
 class VoteStage(Stage[str, VoteTask]):
     """Votes on the depth of every image of the scene. Its results have the keys of the votes."""
 
@@ -169,7 +180,7 @@ class VoteStage(Stage[str, VoteTask]):
 
     def _cost(self, view: View, pixels: int, files: tuple[Path, ...], is_voted: bool) -> Cost:
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
-        seconds = NORMALS_SECONDS + (0 if is_voted else _SECONDS * len(files))
+        seconds = vote_seconds(0 if is_voted else len(files), self.context.options.normals)
         disk = MAP_BYTES * view.num_pixels + (0 if is_voted else _ESTIMATE_BYTES * pixels)
         maps = MAP_BYTES * (view.num_pixels - pixels)
         return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities + maps, disk)
