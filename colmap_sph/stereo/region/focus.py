@@ -39,7 +39,7 @@ class Focus:
     region : Region
         What results are cut to.
     box : (2, 3) float64 ndarray
-        Where its surfaces are, with some room around: what images need to show.
+        Where its surfaces are, with some room around, along the region's axes: what images need to show.
     """
 
     region: Region
@@ -47,7 +47,7 @@ class Focus:
 
     def outline(self, view: View) -> NDArray[np.float64]:
         """Of what of a view of the reduced scene may show the region, see `outline_on`."""
-        outline = outline_on(view, self.box)
+        outline = outline_on(_turned(view, self.region), self.box)
         assert outline is not None
         return outline
 
@@ -78,34 +78,42 @@ def focused(scene: Scene, region: Region, least_points: int, called: str) -> tup
     """
     origin = scene.origin + scene.anchor
     region = region.moved(-origin)
-    points = scene.points[np.isfinite(scene.points).all(axis=1)]
-    if not len(points):
+    is_finite = np.isfinite(scene.points).all(axis=1)
+    if not is_finite.any():
         raise InputError(
             f"{called} needs sparse points, by which the images of a region are found, and the model has none; "
             "triangulate some (colmap point_triangulator), or leave out --region."
         )
-    low, high = np.percentile(points, _PERCENTILES, axis=0)
+    points = region.along(scene.points)
+    low, high = np.percentile(points[is_finite], _PERCENTILES, axis=0)
     beyond = _BEYOND * (high - low)
     inside_scene = np.stack([np.maximum(region.box[0], low - beyond), np.minimum(region.box[1], high + beyond)])
-    near = np.zeros(len(scene.points), bool)
+    near = np.zeros(len(points), bool)
     size = 0.0
     if (inside_scene[0] <= inside_scene[1]).all():
         size = float(np.linalg.norm(inside_scene[1] - inside_scene[0]))
-        near = _near(region, scene.points, size)
+        near = _near(region, points, size)
     if not near.any():
-        corners = (f"{x:.6g} {y:.6g} {z:.6g}" for x, y, z in (low + origin, high + origin))
+        reach = np.percentile(scene.points[is_finite], _PERCENTILES, axis=0) + origin
+        corners = (f"{x:.6g} {y:.6g} {z:.6g}" for x, y, z in reach)
         raise InputError(
             f"{called} misses the scene, whose sparse points reach from {' to '.join(corners)}; give a region in "
             "the model's coordinates that holds some of them."
         )
-    low, high = np.percentile(scene.points[near], _PERCENTILES, axis=0)
+    low, high = np.percentile(points[near], _PERCENTILES, axis=0)
     above = _ABOVE * (high - low) + _ABOVE_FLAT * size
     box = np.stack([np.maximum(inside_scene[0], low - above), np.minimum(inside_scene[1], high + above)])
-    return _with_points(scene, near, box, least_points), Focus(region, box)
+    focus = Focus(region, box)
+    return _with_points(scene, near, focus, least_points), focus
+
+
+def _turned(view: View, region: Region) -> View:
+    """The view in a world frame whose axes are a region's."""
+    return view if region.axes is None else replace(view, R=view.R @ region.axes.T)
 
 
 def _near(region: Region, points: NDArray[np.float64], size: float) -> NDArray[np.bool_]:
-    """Which points lie in a region of some size or near it."""
+    """Which points, along its axes, lie in a region of some size or near it."""
     distances = _distances(region, points, size)
     enough = size
     if len(points) > _ENOUGH_POINTS:
@@ -114,7 +122,7 @@ def _near(region: Region, points: NDArray[np.float64], size: float) -> NDArray[n
 
 
 def _distances(region: Region, points: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """(n,) distances of points from a region; infinite where they are not finite, or larger than `most`."""
+    """(n,) distances of points along a region's axes from it; infinite for no point, and beyond `most`."""
     with np.errstate(invalid="ignore"):
         beside = np.maximum(np.maximum(region.box[0] - points, points - region.box[1]), 0)
     distances: NDArray[np.float64] = np.linalg.norm(beside, axis=1)
@@ -145,7 +153,7 @@ def _distances_from(polygons: Polygons, places: NDArray[np.float64], most: float
     return np.asarray(distances[rows, columns], dtype=np.float64)
 
 
-def _with_points(scene: Scene, kept: NDArray[np.bool_], box: NDArray[np.float64], least_points: int) -> Scene:
+def _with_points(scene: Scene, kept: NDArray[np.bool_], focus: Focus, least_points: int) -> Scene:
     """The scene with some of its points alone, and the views that show enough of them."""
     points = scene.points[kept]
     new_rows = np.cumsum(kept) - 1
@@ -153,6 +161,6 @@ def _with_points(scene: Scene, kept: NDArray[np.bool_], box: NDArray[np.float64]
     for view in scene.views:
         observed = view.point_indices[kept[view.point_indices]]
         number = len(observed) if scene.has_tracks else np.count_nonzero(sees(view, points))
-        if number >= least_points and outline_on(view, box) is not None:
+        if number >= least_points and outline_on(_turned(view, focus.region), focus.box) is not None:
             views.append(replace(view, point_indices=new_rows[observed]))
     return replace(scene, views=tuple(views), points=points)
