@@ -160,7 +160,8 @@ def print_plan(plan: Plan, workspace: Workspace, terminal: Terminal) -> None:
         To which nothing was written.
     terminal : Terminal
     """
-    facts = [("undistort", "to do" if plan.undistort else "done")]
+    facts = [("region", plan.region)] if plan.region else []
+    facts.append(("undistort", "to do" if plan.undistort else "done"))
     for what, number, done in (
         ("pairs", plan.pairs, plan.pairs_done),
         ("images", plan.images, plan.images_done),
@@ -207,6 +208,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     terminal.table("Depth maps", ["image", "coverage", "agreement"], rows, caption)
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
     facts = [("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")]
+    if report.region:
+        facts.append(("region", report.region))
     if report.stretched:
         facts.append(("values", report.stretched))
     facts.append(("agreement", _agreement(report)))

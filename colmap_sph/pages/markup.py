@@ -128,6 +128,8 @@ def _facts(content: Content, run: RunFacts) -> list[tuple[str, str, str]]:
     ]
     if run.polishing:
         facts.append(("poses", run.polishing, "What polishing came to"))
+    if run.region:
+        facts.append(("region", run.region, "Of the scene, drawn by --region auto"))
     if run.stretched:
         facts.append(("values", run.stretched, "What became black and white"))
     return facts

@@ -31,6 +31,7 @@ class RunFacts(msgspec.Struct, frozen=True):
     images: Count = 0
     skipped_images: dict[str, str] = {}
     incomplete: dict[str, str] = {}
+    region: str = ""
     stretched: str = ""
     pair_source: str = ""
     pairs: Count = 0

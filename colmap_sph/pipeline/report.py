@@ -78,6 +78,8 @@ class RunReport:
     incomplete : dict
         Image name → what its results, or the cloud, had to do without for a reason that may pass, such as a file
         that could not be read. The next run makes them again.
+    region : str
+        Where it was to be drawn: what was, and what it holds.
     stretched : str
         Which values became black and white in images of more than 8 bits, where these were changed.
     detail : float or None
@@ -134,6 +136,7 @@ class RunReport:
     images: int = 0
     skipped_images: dict[str, str] = field(default_factory=dict)
     incomplete: dict[str, str] = field(default_factory=dict)
+    region: str = ""
     stretched: str = ""
     detail: float | None = None
     sampling: float | None = None
