@@ -194,7 +194,8 @@ def test_snakemake_with_models_of_all_kinds(tmp_path: Path, stub: Path) -> None:
     add_model(root, "one/sparse/0", 0)
     add_model(root, "one/sparse/1", 5)
     add_model(root, f"{HOSTILE} {{x}}/sparse/0", 4, f"No pair of {HOSTILE} overlaps.")
-    bad = add_model(root, "two/deep/sparse/0", 2, "The model is damaged; mend it.")
+    deep = "/".join(["ein sehr langer Name für eine Befliegung"] * 5)
+    bad = add_model(root, f"{deep}/sparse/0", 2, "The model is damaged; mend it.")
     settings = ("dense_options=--num-pairs 3", "dense_memory_mb=900", "dense_threads=1")
     done = snakemake(root, *settings)
     assert done.returncode == 1, done.stderr
@@ -204,7 +205,7 @@ def test_snakemake_with_models_of_all_kinds(tmp_path: Path, stub: Path) -> None:
             (f"{HOSTILE} {{x}}/sparse/0", f"{HOSTILE} {{x}}/dense"),
             ("one/sparse/0", "one/dense"),
             ("one/sparse/1", "one/dense-1"),
-            ("two/deep/sparse/0", "two/deep/dense"),
+            (f"{deep}/sparse/0", f"{deep}/dense"),
         )
     }
     assert sorted(stub.read_text().splitlines()) == sorted(calls)
@@ -212,17 +213,17 @@ def test_snakemake_with_models_of_all_kinds(tmp_path: Path, stub: Path) -> None:
     expected = {
         "one/sparse/0": ["done", *numbers, ""],
         "one/sparse/1": ["incomplete", *numbers, "c.jpg: it is missing"],
-        "two/deep/sparse/0": ["FAILED (2)", "", "", "", "", "The model is damaged; mend it."],
+        f"{deep}/sparse/0": ["FAILED (2)", "", "", "", "", "The model is damaged; mend it."],
         f"{HOSTILE} {{x}}/sparse/0": ["FAILED (4)", "", "", "", "", f"No pair of {HOSTILE} overlaps."],
     }
     assert table_of(root) == expected
     assert '<a href="./one/dense-1/colmap_sph/report.json">' in (root / "colmap_sph_batch.html").read_text()
     stub.unlink()
-    (bad.parent.parent / "sparse/0/do").write_text("0\n")
+    (bad / "do").write_text("0\n")
     done = snakemake(root, *settings)
     assert done.returncode == 1, done.stderr
     assert set(stub.read_text().splitlines()) == {call for call in calls if "/one/" not in call}
-    assert table_of(root) == {**expected, "two/deep/sparse/0": ["done", *numbers, ""]}
+    assert table_of(root) == {**expected, f"{deep}/sparse/0": ["done", *numbers, ""]}
 
 
 @needs_snakemake
@@ -247,6 +248,12 @@ def test_snakemake_from_images_to_clouds(
     report = json.loads((root / "good/dense/colmap_sph/report.json").read_text())
     assert table["good/sparse/0"][1:3] == [str(report["images"]), str(report["points"])]
     assert report["images"] == 4 and report["overall_agreement"] > 0.7
+    # One image less: models and cloud are made again.
+    shutil.rmtree(root / "blank")
+    (root / "good/images/N_1_1.jpg").unlink()
+    done = snakemake(root, *settings)
+    assert done.returncode == 0, done.stderr
+    assert table_of(root)["good/sparse/0"][:2] == ["done", "3"]
 
 
 @needs_snakemake
