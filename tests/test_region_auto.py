@@ -276,17 +276,26 @@ def test_images_of_a_turned_box():
 # ---- a run ----------------------------------------------------------------------------------------------------
 
 
-def test_a_run_says_what_it_drew_and_repeats_it(project: Path, capsys):
+def test_a_run_says_what_it_drew_and_repeats_it(project: Path, capsys, monkeypatch):
     """Dry run, run and report say the same box; with it as --region all is up to date."""
+    drawn_of: list[Scene] = []
+
+    def counted(scene: Scene) -> Region:
+        drawn_of.append(scene)
+        return core_of(scene)
+
     keep_images(project, ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"])
     model = project / "sparse/0"
     plan = make_plan(Project(model=model), RunOptions(region="auto"))
+    monkeypatch.setattr("colmap_sph.pipeline.context.core_of", counted)
     assert cli.main(["run", "--model", str(model), "--region", "auto"]) == 0
+    assert len(drawn_of) == 1  # of the given model; what the region leaves of it might have another core
     said = "".join(capsys.readouterr()).split()
     report = json.loads((project / "dense/colmap_sph/report.json").read_text())
     assert report["region"] == plan.region
     assert " ".join(report["region"].split()) in " ".join(said)
     drawn = report["options"]["region"]
+    assert drawn in (project / "dense/colmap_sph/report.html").read_text()
     numbers = re.match(rf"{drawn} was drawn, with ([\d,]+) of ([\d,]+) sparse points", report["region"])
     assert numbers is not None
     inside = is_inside(read_region(drawn), read_scene(model).points)

@@ -128,8 +128,6 @@ def _facts(content: Content, run: RunFacts) -> list[tuple[str, str, str]]:
     ]
     if run.polishing:
         facts.append(("poses", run.polishing, "What polishing came to"))
-    if run.region:
-        facts.append(("region", run.region, "Of the scene, drawn by --region auto"))
     if run.stretched:
         facts.append(("values", run.stretched, "What became black and white"))
     return facts
@@ -182,4 +180,4 @@ def _run(run: RunFacts) -> dict[str, Any]:
         for name, seconds in run.seconds.items()
     ]
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
-    return {"stages": stages, "command": run.command, "versions": versions}
+    return {"stages": stages, "command": run.command, "region": run.region, "versions": versions}

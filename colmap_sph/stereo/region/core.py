@@ -38,7 +38,7 @@ _NO_DISTANCE = 1e-9
 # The box reaches from the one to the other percentile of the core's points, and beyond by this share of its
 # longest side.
 _PERCENTILES = (0.5, 99.5)
-_BEYOND = 0.05
+_BEYOND = 0.1
 # A turned box is drawn where it is smaller than one along the model's axes by this factor.
 _WORTH_TURNING = 0.8
 
