@@ -157,6 +157,25 @@ def test_map_coordinates_have_their_z_up():
     assert (is_inside(again, scene.points + scene.origin) == is_inside(whole, scene.points + scene.origin)).all()
 
 
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_any_unit_will_do(scale):
+    scene, inside, outside = object_before_background(np.random.default_rng(5))
+    region = read_region(as_given(core_of(moved(scene, np.eye(3), np.zeros(3), scale))))
+    found = is_inside(region, scale * scene.points)
+    assert found[inside].mean() > 0.99 and not found[outside].any()
+
+
+def test_points_in_a_cameras_centre_and_at_no_place_do_not_matter():
+    scene, inside, outside = object_before_background(np.random.default_rng(5))
+    far = np.flatnonzero(outside)[:40]
+    points = scene.points.copy()
+    points[far[:20]] = scene.views[0].center + 1e-200
+    points[far[20:]] = np.nan
+    region = core_of(replace(scene, points=points))
+    assert is_inside(region, scene.points)[inside].mean() > 0.99
+    assert not is_inside(region, scene.points)[outside].any()
+
+
 # ---- how well points are placed -------------------------------------------------------------------------------
 
 
@@ -184,6 +203,11 @@ def in_one_place() -> Scene:
     return scene_of([camera((0, 0, 0), (np.sin(a), np.cos(a), 0)) for a in np.linspace(0, 6, 12)], points)
 
 
+def at_one_point() -> Scene:
+    views = [camera((x, 0, 5), (0, 0, 0)) for x in (-1, 0, 1)]
+    return scene_of(views, np.zeros((100, 3)))
+
+
 def all_around() -> Scene:
     """Cameras side by side look out at what lies at all distances, from one to ten thousand."""
     rng = np.random.default_rng(1)
@@ -201,6 +225,7 @@ def all_around() -> Scene:
     [
         (in_one_place(), "cameras stand in one place"),
         (all_around(), "nothing that stands out"),
+        (at_one_point(), "all sparse points in one place"),
         (replace(in_one_place(), points=np.zeros((0, 3)), views=()), "the model has 0"),
     ],
 )

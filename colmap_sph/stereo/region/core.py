@@ -76,6 +76,8 @@ def core_of(scene: Scene) -> Region:
         )
     limit = _WORSE * typical
     region = _box_around(scene, sights.points[seen & (deviations <= limit)])
+    if not np.ptp(region.box, axis=0).any():
+        raise InputError("--region auto finds all sparse points in one place; give a box as --region, or none.")
     share = float(weights[is_inside(region, sights.points)].sum() / weights.sum())
     is_around = (deviations > limit / _AROUND) & (deviations < limit * _AROUND)
     around = float(weights[is_around].sum() / weights.sum())
@@ -124,11 +126,13 @@ def precision(
         measures it with a pixel's; infinite where all rays are nearly one line.
     """
     known = np.zeros((len(points), 3, 3))
-    for view, rows in zip(views, in_view, strict=True):
-        rays = points[rows] - view.center
-        distances = np.linalg.norm(rays, axis=1)[:, None, None]
-        rays = (rays / distances[:, 0])[:, :, None]
-        known[rows] += (np.eye(3) - rays * rays.transpose(0, 2, 1)) * (view.K[0, 0] / distances) ** 2
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        for view, rows in zip(views, in_view, strict=True):
+            rays = points[rows] - view.center
+            distances = np.linalg.norm(rays, axis=1)[:, None, None]
+            rays = rays[:, :, None] / distances
+            known[rows] += (np.eye(3) - rays * rays.transpose(0, 2, 1)) * (view.K[0, 0] / distances) ** 2
+    known[~np.isfinite(known).all(axis=(1, 2))] = 0  # in a camera's centre
     least, _, most = np.linalg.eigvalsh(known).T
     is_known = least > _NO_DISTANCE * most
     return np.where(is_known, 1 / np.sqrt(np.where(is_known, least, 1)), np.inf)
