@@ -111,6 +111,19 @@ def facade(rng: np.random.Generator) -> tuple[Scene, np.ndarray, np.ndarray]:
     return scene_of(views, np.concatenate([wall, hills])), is_wall, ~is_wall
 
 
+def block_with_details(number: int, rng: np.random.Generator) -> tuple[Scene, np.ndarray, np.ndarray]:
+    """Vertical images of a block without any horizon, and some from the ground, a twelfth as far from a monument.
+
+    All of it inside.
+    """
+    views = [camera((x, y, 100), (x, y, 0)) for x in range(0, 241, 40) for y in range(0, 161, 40)]
+    angles = np.linspace(0, 2 * np.pi, number, endpoint=False)
+    views += [camera((120 + 8 * np.cos(a), 80 + 8 * np.sin(a), 2), (120, 80, 2)) for a in angles]
+    ground = rng.uniform((-60, -60, -1), (300, 220, 8), (4000, 3))
+    points = np.concatenate([ground, rng.uniform((117, 77, 0), (123, 83, 5), (2000, 3))])
+    return scene_of(views, points), np.ones(6000, bool), np.zeros(6000, bool)
+
+
 SCENES = [block_with_horizon, object_before_background, street, facade]
 
 
@@ -133,6 +146,12 @@ def test_the_core_is_inside_and_the_background_outside(make, has_tracks, is_turn
     assert found[outside].mean() < 0.01
     part, _ = focused(scene, region, 15, "--region")
     assert len(part.views) > 0.9 * len(scene.views)
+
+
+@pytest.mark.parametrize("number", [10, 50])
+def test_some_details_do_not_cost_the_block(number):
+    scene, inside, _ = block_with_details(number, np.random.default_rng(5))
+    assert is_inside(core_of(scene), scene.points)[inside].mean() > 0.99
 
 
 def test_a_turned_box_stands_upright():
@@ -225,6 +244,7 @@ def all_around() -> Scene:
     [
         (in_one_place(), "cameras stand in one place"),
         (all_around(), "nothing that stands out"),
+        (block_with_details(140, np.random.default_rng(5))[0], "20% of the images look elsewhere"),
         (at_one_point(), "all sparse points in one place"),
         (replace(in_one_place(), points=np.zeros((0, 3)), views=()), "the model has 0"),
     ],

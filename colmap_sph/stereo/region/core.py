@@ -5,7 +5,7 @@ object or a façade, is seen by few images, coarsely, and under small angles. Al
 of a point for a pixel of noise, which grows with the square of the distance.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,17 +22,21 @@ _MOST_SIGHTS = 40_000_000
 _SOME_POINTS = (2_000, 20_000)
 # With fewer points than this there is nothing to draw a box around.
 _FEWEST_POINTS = 50
-# Typical is the precision that the better quarter of what images look at has; a few times worse still belongs to
-# the core: that is twice the distance.
+# Of an image that precision is typical which the better quarter of what it looks at has; of all images, that which
+# the better three quarters of them have: where some come close to a detail, the others count. A few times worse
+# still belongs to the core: that is twice the distance.
 _TYPICAL = 0.25
+_OF_IMAGES = 0.75
 _WORSE = 4.0
 # An image is looked at in so many rows and columns of parts.
 _PARTS = 16
 # The core stands out where it is the larger part of what images look at, or where less than this lies around its
-# limit, within a factor.
+# limit, within a factor; and where few images look elsewhere, with less than that of what they look at in the box.
 _LEAST_SHARE = 0.5
 _MOST_AROUND = 0.05
 _AROUND = 2.0
+_MOST_ELSEWHERE = 0.1
+_ELSEWHERE = 0.1
 # Where all rays to a point are nearly one line, so much less is known along it than across: it has no distance.
 _NO_DISTANCE = 1e-9
 # The box reaches from the one to the other percentile of the core's points, and beyond by this share of its
@@ -61,32 +65,45 @@ def core_of(scene: Scene) -> Region:
         There is no such box: no points, cameras in one place, or nothing that stands out.
     """
     sights = _sights(scene)
-    weights = _looked_at(scene, sights)
-    seen = weights > 0
-    if seen.sum() < _FEWEST_POINTS:
+    looks = list(_looks(scene, sights))
+    seen = np.unique(np.concatenate([look.rows for look in looks])) if looks else np.empty(0, np.int64)
+    if len(seen) < _FEWEST_POINTS:
         raise InputError(
-            f"--region auto needs sparse points that images see, and the model has {seen.sum()}; triangulate more "
+            f"--region auto needs sparse points that images see, and the model has {len(seen)}; triangulate more "
             "(colmap point_triangulator), or give a box as --region."
         )
     deviations = precision(scene.views, sights.points, sights.in_view)
-    typical = _quantile(deviations[seen], weights[seen], _TYPICAL)
-    if not np.isfinite(typical):
+    typical = np.sort([_quantile(deviations[look.rows], look.weights, _TYPICAL) for look in looks])
+    limit = _WORSE * float(typical[int(_OF_IMAGES * (len(looks) - 1))])
+    if not np.isfinite(limit):
         raise InputError(
             "--region auto finds no distances, as the cameras stand in one place; give a box as --region, or none."
         )
-    limit = _WORSE * typical
-    region = _box_around(scene, sights.points[seen & (deviations <= limit)])
+    region = _box_around(scene, sights.points[seen][deviations[seen] <= limit])
     if not np.ptp(region.box, axis=0).any():
         raise InputError("--region auto finds all sparse points in one place; give a box as --region, or none.")
-    share = float(weights[is_inside(region, sights.points)].sum() / weights.sum())
     is_around = (deviations > limit / _AROUND) & (deviations < limit * _AROUND)
-    around = float(weights[is_around].sum() / weights.sum())
-    if share < _LEAST_SHARE and around > _MOST_AROUND:
-        raise InputError(
-            f"--region auto finds nothing that stands out: what images place best is {share:.0%} of what they "
-            "look at, and goes over into the rest; give a box as --region, or none."
-        )
+    _check_that_it_stands_out(looks, is_inside(region, sights.points), is_around)
     return region
+
+
+def _check_that_it_stands_out(
+    looks: "Sequence[_Look]", inside: NDArray[np.bool_], is_around: NDArray[np.bool_]
+) -> None:
+    """Refuse a box that cuts through what images look at, or that many do not look at."""
+    shares = np.array([look.share(inside) for look in looks])
+    around = np.mean([look.share(is_around) for look in looks])
+    if shares.mean() < _LEAST_SHARE and around > _MOST_AROUND:
+        raise InputError(
+            f"--region auto finds nothing that stands out: what images place best is {shares.mean():.0%} of what "
+            "they look at, and goes over into the rest; give a box as --region, or none."
+        )
+    elsewhere = np.mean(shares < _ELSEWHERE)
+    if elsewhere > _MOST_ELSEWHERE:
+        raise InputError(
+            f"--region auto finds no common core: {elsewhere:.0%} of the images look elsewhere than the others; "
+            "give a box as --region, or none."
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,14 +155,25 @@ def precision(
     return np.where(is_known, 1 / np.sqrt(np.where(is_known, least, 1)), np.inf)
 
 
-def _looked_at(scene: Scene, sights: _Sights) -> NDArray[np.float64]:
-    """(n,) shares of points in what images look at: each image counts once, its middle most, its corners not.
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """What an image looks at: rows of `_Sights.points`, and the weight of each; they sum up to 1."""
+
+    rows: NDArray[np.int64]
+    weights: NDArray[np.float64]
+
+    def share(self, chosen: NDArray[np.bool_]) -> float:
+        """Of what it looks at, how much some points are."""
+        return float(self.weights[chosen[self.rows]].sum())
+
+
+def _looks(scene: Scene, sights: _Sights) -> Iterator[_Look]:
+    """What each image looks at that sees any point: its middle most, and its corners not at all.
 
     A part of an image counts as much as another, however many points it has.
     """
     position = np.full(len(scene.points), -1)
     position[sights.rows] = np.arange(len(sights.rows))
-    weights = np.zeros(len(sights.rows))
     for view, in_view in zip(scene.views, sights.in_view, strict=True):
         rows = np.flatnonzero(in_view)
         if scene.has_tracks:  # what is hidden is not looked at
@@ -155,10 +183,9 @@ def _looked_at(scene: Scene, sights: _Sights) -> NDArray[np.float64]:
         column, row = (pixels / size * _PARTS).astype(int).T
         part = row * _PARTS + column
         from_middle = np.linalg.norm((pixels - size / 2) / np.linalg.norm(size / 2), axis=1)
-        weight = (1 - from_middle) ** 2 / np.bincount(part, minlength=1)[part]
-        if weight.any():
-            weights[rows] += weight / weight.sum() / len(scene.views)
-    return weights
+        weights = (1 - from_middle) ** 2 / np.bincount(part, minlength=1)[part]
+        if weights.any():
+            yield _Look(rows, weights / weights.sum())
 
 
 def _quantile(values: NDArray[np.float64], weights: NDArray[np.float64], share: float) -> float:
