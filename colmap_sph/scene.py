@@ -36,15 +36,23 @@ class Region:
         Least and largest x, y and z, model units; may be infinite.
     polygons : tuple of tuple of (n, 2) float64 ndarray
         In x and y. A point lies inside where it lies in one of them; all of the box counts where there are none.
+    axes : (3, 3) float64 ndarray, optional
+        Along whose rows, a rotation, x, y and z of box and polygons are counted; None: as in the world frame.
     """
 
     box: NDArray[np.float64]
     polygons: Polygons = ()
+    axes: NDArray[np.float64] | None = None
 
     def moved(self, shift: NDArray[np.float64]) -> "Region":
-        """The region elsewhere."""
-        polygons = tuple(tuple(ring + shift[:2] for ring in rings) for rings in self.polygons)
-        return Region(self.box + shift, polygons)
+        """The region elsewhere, by a shift in the world frame."""
+        along = self.along(shift)
+        polygons = tuple(tuple(ring + along[:2] for ring in rings) for rings in self.polygons)
+        return Region(self.box + along, polygons, self.axes)
+
+    def along(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(…, 3) points of the world frame as box and polygons count them."""
+        return points if self.axes is None else points @ self.axes.T
 
 
 @dataclass(frozen=True, eq=False)

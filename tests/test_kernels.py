@@ -641,9 +641,9 @@ def run_upsample(offset, max_step, shape):
     return fine
 
 
-def run_windows(least, most, predicted, *limits):
+def run_windows(least, most, predicted, depth, clearance, own_clearance):
     base = np.full(predicted.shape, 5, dtype=np.int32)
-    _native.search_windows(least, most, predicted, *limits, base)
+    _native.search_windows(least, most, predicted, depth, clearance, own_clearance, base)
     return base
 
 
@@ -684,14 +684,14 @@ def test_search_windows_are_the_oracles(shape, reach, limits, seed):
     rng = np.random.default_rng(seed)
     predicted = rng.integers(-20000, 20000, shape)
     middle = rng.integers(-20000, 20000, coarse(shape)) / 512
-    least, most = (np.float32(middle + reach * sign * rng.random(middle.shape)) for sign in (-1, 1))
-    given_ = least, most, predicted.astype(np.int32), *limits
-    np.testing.assert_array_equal(run_windows(*given_), oracle.search_windows(*given_))
+    least, most = ((middle + reach * sign * rng.random(middle.shape)).astype(np.float32) for sign in (-1, 1))
+    bounds = least, most, predicted.astype(np.int32)
+    np.testing.assert_array_equal(run_windows(*bounds, *limits), oracle.search_windows(*bounds, *limits))
 
 
 def test_windows_hold_what_fits():
     """By as much as the clearance, in the middle of the window where there is nothing else."""
-    least, most = np.float32([[-3, -3, -20]]), np.float32([[2, 5, 20]])
+    least, most = (np.array([row], np.float32) for row in ([-3, -3, -20], [2, 5, 20]))
     base = run_windows(least, most, np.zeros((2, 6), np.int32), 32, 4, 6)
     # -6 to 4, -6 to 10 and -40 to 40 pixels; at most 12 fit on either side of the middle.
     np.testing.assert_array_equal(base, np.repeat([[-16, -16, -16]], 2, axis=1).repeat(2, axis=0))

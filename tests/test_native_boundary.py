@@ -653,8 +653,8 @@ def test_bounds_of_search_windows_are_kept():
 
 def test_windows_about_numbers_out_of_this_world():
     values = arguments("search_windows")
-    for least, most in itertools.product(np.float32([np.nan, np.inf, -np.inf, 3e38, -3e38]), repeat=2):
-        values["least"], values["most"] = (np.full((H, W), value) for value in (least, most))
+    for least, most in itertools.product([np.nan, np.inf, -np.inf, 3e38, -3e38], repeat=2):
+        values["least"], values["most"] = (np.full((H, W), value, np.float32) for value in (least, most))
         values["predicted"][:] = np.random.default_rng(0).choice([-(2**31), 0, 2**31 - 1], (2 * H - 1, 2 * W))
         call("search_windows", values)
         assert (np.abs(values["out base"] + 16) <= 10).all()

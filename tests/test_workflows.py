@@ -7,8 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import keep_images
+from projects import write_picture
+
+from colmap_sph.synthetic import DemoBlock
 
 WORKFLOWS = Path(__file__).parents[1] / "workflows"
 HOSTILE = "a <script>alert(1)</script>&\"'"
@@ -42,6 +46,17 @@ def stub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
     monkeypatch.setenv("CALLS", str(tmp_path / "calls"))
     return tmp_path / "calls"
+
+
+@pytest.fixture
+def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """This program on the PATH."""
+    path = tmp_path / "bin/colmap_sph"
+    path.parent.mkdir()
+    path.write_text(f'#!/bin/sh\nexec "{sys.executable}" -P -m colmap_sph "$@"\n')
+    path.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{path.parent}:{os.environ['PATH']}")
+    return path
 
 
 def add_model(root: Path, name: str, code: int, message: str = "") -> Path:
@@ -128,7 +143,7 @@ def test_an_array_of_slurm(tmp_path: Path, stub: Path, monkeypatch: pytest.Monke
 
 
 def test_batch_and_summary_of_real_projects(
-    project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+    project: Path, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch, program: Path
 ) -> None:
     """Two models of one project, of which one is damaged; the summary of a list finds the same afterwards."""
     root = tmp_path_factory.mktemp("survey")
@@ -137,10 +152,6 @@ def test_batch_and_summary_of_real_projects(
     shutil.copytree(project / "images", root / "p/images")
     shutil.copytree(root / "p/sparse/0", root / "p/sparse/1")
     (root / "p/sparse/1/points3D.bin").write_bytes(b"")
-    programs = tmp_path_factory.mktemp("bin")
-    (programs / "colmap_sph").write_text(f'#!/bin/sh\nexec "{sys.executable}" -P -m colmap_sph "$@"\n')
-    (programs / "colmap_sph").chmod(0o755)
-    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
     done = called(WORKFLOWS / "batch.sh", root, "--num-pairs", "2", "--threads", "2")
     assert done.returncode == 1, done.stderr
     header, good, bad = (line.split("\t") for line in (root / "colmap_sph_batch.tsv").read_text().splitlines())
@@ -154,6 +165,106 @@ def test_batch_and_summary_of_real_projects(
     assert again[:2] == [header, good]
     assert again[2][1] == "not run"
     assert '<a href="./p/dense/colmap_sph/report' in (root / "list.html").read_text()
+    monkeypatch.setenv("SLURM_ARRAY_TASK_ID", "1")
+    done = called(WORKFLOWS / "slurm_array.sh", "models.txt", "--num-pairs", "2", cwd=root)
+    assert (done.returncode, done.stdout.splitlines()[-1]) == (0, f"{root}/p/sparse/0: complete"), done.stderr
+
+
+# ---- Snakemake ------------------------------------------------------------------------------------------------
+
+
+SNAKEMAKE = shutil.which("snakemake", path=f"{Path(sys.executable).parent}:{os.environ['PATH']}")
+needs_snakemake = pytest.mark.skipif(SNAKEMAKE is None, reason="snakemake is not installed")
+
+
+def snakemake(root: Path, *settings: str) -> subprocess.CompletedProcess[str]:
+    command = [SNAKEMAKE, "--snakefile", WORKFLOWS / "Snakefile", "--directory", root, "--cores", "2"]
+    return called(*command, "--keep-going", "--config", *settings)
+
+
+def table_of(root: Path) -> dict[str, list[str]]:
+    rows = [line.split("\t") for line in (root / "colmap_sph_batch.tsv").read_text().splitlines()]
+    return {row[0]: row[1:] for row in rows[1:]}
+
+
+@needs_snakemake
+def test_snakemake_with_models_of_all_kinds(tmp_path: Path, stub: Path) -> None:
+    """All are tried; afterwards only those that failed are."""
+    root = tmp_path / "survey"
+    add_model(root, "one/sparse/0", 0)
+    add_model(root, "one/sparse/1", 5)
+    add_model(root, f"{HOSTILE} {{x}}/sparse/0", 4, f"No pair of {HOSTILE} overlaps.")
+    deep = "/".join(["ein sehr langer Name für eine Befliegung"] * 5)
+    bad = add_model(root, f"{deep}/sparse/0", 2, "The model is damaged; mend it.")
+    settings = ("dense_options=--num-pairs 3", "dense_memory_mb=900", "dense_threads=1")
+    done = snakemake(root, *settings)
+    assert done.returncode == 1, done.stderr
+    calls = {
+        f"run --model {root}/{name} --output {root}/{dense} --threads 1 --memory 900MB --num-pairs 3"
+        for name, dense in (
+            (f"{HOSTILE} {{x}}/sparse/0", f"{HOSTILE} {{x}}/dense"),
+            ("one/sparse/0", "one/dense"),
+            ("one/sparse/1", "one/dense-1"),
+            (f"{deep}/sparse/0", f"{deep}/dense"),
+        )
+    }
+    assert sorted(stub.read_text().splitlines()) == sorted(calls)
+    numbers = ["2", "1234", "75.0%", "12"]
+    expected = {
+        "one/sparse/0": ["done", *numbers, ""],
+        "one/sparse/1": ["incomplete", *numbers, "c.jpg: it is missing"],
+        f"{deep}/sparse/0": ["FAILED (2)", "", "", "", "", "The model is damaged; mend it."],
+        f"{HOSTILE} {{x}}/sparse/0": ["FAILED (4)", "", "", "", "", f"No pair of {HOSTILE} overlaps."],
+    }
+    assert table_of(root) == expected
+    assert '<a href="./one/dense-1/colmap_sph/report.json">' in (root / "colmap_sph_batch.html").read_text()
+    stub.unlink()
+    (bad / "do").write_text("0\n")
+    done = snakemake(root, *settings)
+    assert done.returncode == 1, done.stderr
+    assert set(stub.read_text().splitlines()) == {call for call in calls if "/one/" not in call}
+    assert table_of(root) == {**expected, f"{deep}/sparse/0": ["done", *numbers, ""]}
+
+
+@needs_snakemake
+@pytest.mark.skipif(shutil.which("colmap") is None, reason="colmap is not installed")
+def test_snakemake_from_images_to_clouds(
+    block: DemoBlock, tmp_path_factory: pytest.TempPathFactory, program: Path
+) -> None:
+    """COLMAP's structure from motion first; what it cannot do costs its project alone."""
+    root = tmp_path_factory.mktemp("survey")
+    for name in ("N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"):
+        (root / "good/images").mkdir(parents=True, exist_ok=True)
+        shutil.copy(block.images_dir / name, root / "good/images")
+    (root / "blank/images").mkdir(parents=True)
+    for name in ("a.png", "b.png"):
+        write_picture(root / "blank/images" / name, np.zeros((60, 80, 3), np.uint8))
+    settings = ("feature_options=--ImageReader.single_camera 1", "dense_options=--num-pairs 2")
+    done = snakemake(root, *settings)
+    assert done.returncode == 1, done.stderr
+    table = table_of(root)
+    assert table["blank/images"][0] == "FAILED (models)"
+    assert table["good/sparse/0"][0] == "done"
+    report = json.loads((root / "good/dense/colmap_sph/report.json").read_text())
+    assert table["good/sparse/0"][1:3] == [str(report["images"]), str(report["points"])]
+    assert report["images"] == 4 and report["overall_agreement"] > 0.7
+    # One image less: models and cloud are made again.
+    shutil.rmtree(root / "blank")
+    (root / "good/images/N_1_1.jpg").unlink()
+    done = snakemake(root, *settings)
+    assert done.returncode == 0, done.stderr
+    assert table_of(root)["good/sparse/0"][:2] == ["done", "3"]
+
+
+@needs_snakemake
+@pytest.mark.parametrize(
+    ("setting", "reason"),
+    [("matcher=x", "matcher must be"), ("matcher=spatial", "No folder below")],
+)
+def test_snakemake_refuses_in_a_sentence(tmp_path: Path, stub: Path, setting: str, reason: str) -> None:
+    done = snakemake(tmp_path, setting)
+    assert done.returncode == 1
+    assert reason in done.stderr and "Traceback" not in done.stderr
 
 
 @pytest.mark.parametrize(

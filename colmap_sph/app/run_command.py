@@ -203,7 +203,8 @@ def print_plan(plan: Plan, workspace: Workspace, terminal: Terminal) -> None:
         To which nothing was written.
     terminal : Terminal
     """
-    facts = [("undistort", "to do" if plan.undistort else "done")]
+    facts = [("region", plan.region)] if plan.region else []
+    facts.append(("undistort", "to do" if plan.undistort else "done"))
     for what, number, done in (
         ("pairs", plan.pairs, plan.pairs_done),
         ("images", plan.images, plan.images_done),
@@ -255,6 +256,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     if report.region is not None:
         left = f"; {len(report.out_of_region)} left out that see too little of it" if report.out_of_region else ""
         facts.append(("region", f"in {len(report.coverage)} images, of whose pixels in it coverage is{left}"))
+    if report.drawn_region:
+        facts.append(("drawn", report.drawn_region))
     if report.stretched:
         facts.append(("values", report.stretched))
     facts.append(("agreement", _agreement(report)))

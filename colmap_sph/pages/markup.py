@@ -208,4 +208,4 @@ def _run(run: RunFacts) -> dict[str, Any]:
         for name, seconds in run.seconds.items()
     ]
     versions = ", ".join(f"{name} {version}" for name, version in run.versions.items())
-    return {"stages": stages, "command": run.command, "versions": versions}
+    return {"stages": stages, "command": run.command, "drawn_region": run.drawn_region, "versions": versions}

@@ -12,7 +12,7 @@ from colmap_sph.pages.samples import MapSamples
 from colmap_sph.scene import Region, View, pixel_transfer
 from colmap_sph.stereo.region.inside import is_inside
 from colmap_sph.stereo.region.shown import filled
-from colmap_sph.stereo.region.window import outline_on
+from colmap_sph.stereo.region.window import outline_on, turned
 
 # Between two samples depth may change by more than among those around.
 _SLACK = 0.02
@@ -111,7 +111,7 @@ def find_reasons(
 def _shows(region: Region, view: View, samples: MapSamples, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """(h, w): does the sample show a region? Where no depth of the view is known, it may."""
     columns, rows = (grid.ravel() for grid in np.meshgrid(samples.columns, samples.rows))
-    outline = outline_on(view, region.box)
+    outline = outline_on(turned(view, region), region.box)
     if outline is None:
         return np.zeros(depth.shape, bool)
     # A convex outline: inside is on the same side of each of its edges.

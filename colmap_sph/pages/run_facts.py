@@ -34,11 +34,12 @@ class RegionFacts(msgspec.Struct, frozen=True):
 
     box: tuple[Corner, Corner]
     polygons: Annotated[list[Polygon], Meta(max_length=_MOST_CORNERS)] = []
+    axes: tuple[Corner, Corner, Corner] | None = None
 
     def as_region(self) -> Region:
         """The same in the words of the scene."""
         polygons = tuple(tuple(np.array(ring) for ring in rings) for rings in self.polygons)
-        return Region(np.array(self.box), polygons)
+        return Region(np.array(self.box), polygons, None if self.axes is None else np.array(self.axes))
 
 
 class RunFacts(msgspec.Struct, frozen=True):
@@ -50,6 +51,7 @@ class RunFacts(msgspec.Struct, frozen=True):
     images: Count = 0
     skipped_images: dict[str, str] = {}
     incomplete: dict[str, str] = {}
+    drawn_region: str = ""
     stretched: str = ""
     pair_source: str = ""
     pairs: Count = 0

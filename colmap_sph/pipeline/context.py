@@ -16,7 +16,7 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.maps import MapFiles
-from colmap_sph.project.region_file import read_region
+from colmap_sph.project.region_file import AUTO, as_given, read_region
 from colmap_sph.project.state.array_file import SUFFIX
 from colmap_sph.project.state.ownership import Place, cloud_place, map_place
 from colmap_sph.project.workspace import MapKind, Workspace
@@ -24,7 +24,9 @@ from colmap_sph.scene import Region, Scene
 from colmap_sph.stereo.agreement import SparseTracks
 from colmap_sph.stereo.extent import outline_of
 from colmap_sph.stereo.partners.stations import Stations
+from colmap_sph.stereo.region.core import core_of
 from colmap_sph.stereo.region.focus import Focus, focused, region_of
+from colmap_sph.stereo.region.inside import is_inside
 from colmap_sph.stereo.region.window import Window
 
 logger = logging.getLogger(__name__)
@@ -69,8 +71,10 @@ class Context:
     def in_region(self) -> "Context":
         """The same with what of the scene shows the region that the options ask for, if they do; it is reported.
 
-        Raises `InputError` where nothing does.
+        Where one is to be drawn, they then ask for what was drawn. Raises `InputError` where nothing shows it.
         """
+        if self.options.region == AUTO:
+            return self._with_drawn_region().in_region()
         given = self.options.region
         if not given:
             return self
@@ -81,6 +85,7 @@ class Context:
         self.report.region = {
             "box": near.box.tolist(),
             "polygons": [[ring.tolist() for ring in rings] for rings in near.polygons],
+            "axes": None if near.axes is None else near.axes.tolist(),
         }
         for name, number in too_few.items():
             self.report.out_of_region[name] = (
@@ -89,6 +94,17 @@ class Context:
             )
             logger.info("%s left out: %s", name, self.report.out_of_region[name])
         return replace(self, scene=scene, focus=focus)
+
+    def _with_drawn_region(self) -> "Context":
+        origin = self.scene.origin + self.scene.anchor
+        drawn = as_given(core_of(self.scene).moved(origin))
+        inside = is_inside(read_region(drawn), self.scene.points + origin)
+        self.report.drawn_region = (
+            f"{drawn} was drawn, with {inside.sum():,} of {len(inside):,} sparse points in it; give it as "
+            "--region to repeat or to change it"
+        )
+        logger.info("Region: %s", self.report.drawn_region)
+        return replace(self, options=replace(self.options, region=drawn))
 
     @property
     def region(self) -> Region | None:

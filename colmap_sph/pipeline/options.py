@@ -7,7 +7,7 @@ from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.control_groups import processors
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.project.polishing import PolishOptions
-from colmap_sph.project.region_file import read_region
+from colmap_sph.project.region_file import AUTO, read_region
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.stereo.confirm import ConfirmOptions
 from colmap_sph.stereo.fusion import FusionOptions
@@ -36,7 +36,8 @@ class RunOptions:
     """Memory the run may use, such as "6GiB"; empty: a safe share of what is free."""
     region: str = ""
     """Part of the scene that is wanted, in the model's coordinates: a box x0,y0,z0,x1,y1,z1, a file of one as for
-    COLMAP, or polygons in GeoJSON. Images elsewhere are left out; maps and cloud end at its border."""
+    COLMAP, or polygons in GeoJSON; or auto: what the images look at, without the background far behind. Images
+    elsewhere are left out; maps and cloud end at its border."""
     undistortion: UndistortionOptions = field(default_factory=UndistortionOptions)
     pairs: PairOptions = field(default_factory=PairOptions)
     rectification: RectificationOptions = field(default_factory=RectificationOptions)
@@ -53,7 +54,7 @@ class RunOptions:
         if not 0 <= self.threads <= 1024:
             raise OptionError(f"threads must lie in 0..1024, not {self.threads}.", "threads")
         parse_memory(self.memory)
-        if self.region:
+        if self.region and self.region != AUTO:
             read_region(self.region)
         if self.region and self.polish.is_wanted:
             raise OptionError(

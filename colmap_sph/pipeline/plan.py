@@ -25,6 +25,7 @@ from colmap_sph.pipeline.reconstruct import (
     go_through_stages,
     with_good_images,
 )
+from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
@@ -90,6 +91,8 @@ class Plan:
         Estimated largest memory in use, and space for files to be made, in bytes.
     free_disk : int
         Free space where these go, bytes.
+    region : str
+        See `RunReport`.
     stages : tuple of StagePlan
         Of each stage, in their order; with a sparse model the undistortion before them.
     choice : str
@@ -107,6 +110,7 @@ class Plan:
     memory: float
     disk: float
     free_disk: int
+    region: str
     stages: tuple[StagePlan, ...]
     choice: str = ""
 
@@ -132,13 +136,15 @@ def make_plan(
     check_input(project, options, limit)
     options = options if limit is None else widest(options, limit)
     survey = Survey()
+    report = RunReport()
     foreseen = None
     given = None
     to_make: set[str] = set()
     if project.model is None:
         dense = open_workspace(project)
     else:
-        preparation = Preparation(project, options, overwrite=overwrite, is_plan=True)
+        preparation = Preparation(project, options, overwrite=overwrite, is_plan=True, report=report)
+        options = preparation.options
         dense = preparation.workspace
         undistorted = preparation.undistort(survey, preparation.check(survey))
         to_make = {name for name, result in undistorted.items() if result.made}
@@ -148,7 +154,9 @@ def make_plan(
     scene = anchored(read_scene(folder) if foreseen is None else foreseen)
     keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
     to_come = scene.index_of if foreseen is not None else to_make
-    context = with_good_images(Context(dense, scene, options, keys).in_region(), survey, to_come=to_come)
+    context = Context(dense, scene, options, keys, report=report).in_region()
+    options = context.options
+    context = with_good_images(context, survey, to_come=to_come)
     selection = choose_pairs(dense if foreseen is None else None, context.scene, options, project.database())
     context = replace(context, scene=wanted_scene(context.scene, selection))
     foreign = foreign_files(context.places, overwrite=overwrite)
@@ -178,6 +186,7 @@ def make_plan(
         memory=max(stage.memory for stage in stages),
         disk=sum(stage.disk for stage in stages),
         free_disk=free_space(project.root),
+        region=report.drawn_region,
         stages=tuple(stages),
         choice=choice,
     )

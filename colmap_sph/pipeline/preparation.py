@@ -85,6 +85,8 @@ class Preparation:
     Attributes
     ----------
     workspace : Workspace
+    options : RunOptions
+        As given, but for a region that was to be drawn: they have what was.
     names : tuple of str
         Sorted names of the registered images of the original model, where a region is asked for of those that show
         it.
@@ -110,32 +112,35 @@ class Preparation:
         self.workspace = Workspace(project.root)
         self._originals = read_originals(project)
         self._originals.check_outside(self.workspace)
-        self._options = options
+        self.options = options
+        self._report = report or RunReport()
         self._overwrite = overwrite
         self._verify = verify
         self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
-        self.names = self._names(report or RunReport())
+        self.names = self._names()
         originals = self._originals
         if originals.mask_dir is not None:
             check_masks(originals.mask_dir, cameras_of_images(originals.model), originals.image_dir)
         self._context = Context(
             self.workspace,
             NO_SCENE,
-            options,
+            self.options,
             Keys(self.workspace, options, fresh=overwrite and is_plan),
             progress or Silent(),
-            report or RunReport(),
+            self._report,
         )
 
-    def _names(self, report: RunReport) -> tuple[str, ...]:
+    def _names(self) -> tuple[str, ...]:
         names = tuple(image_names(self._originals.model))
-        if not self._options.region:
+        if not self.options.region:
             return names
-        scene = anchored(foreseen_scene(self._originals, names, self._options.undistortion))
-        keys = Keys(self.workspace, self._options)
-        whole = Context(self.workspace, scene, self._options, keys, report=report)
-        return tuple(view.name for view in whole.in_region().scene.views)
+        scene = anchored(foreseen_scene(self._originals, names, self.options.undistortion))
+        keys = Keys(self.workspace, self.options)
+        whole = Context(self.workspace, scene, self.options, keys, report=self._report)
+        part = whole.in_region()
+        self.options = part.options
+        return tuple(view.name for view in part.scene.views)
 
     def run(self, executor: "Executor") -> None:
         """Make the workspace.
@@ -162,7 +167,7 @@ class Preparation:
         found = self._found
         missing = [name for name in images if self._overwrite or not self.workspace.image_path(name).exists()]
         if missing:  # a workspace that is there needs no more space
-            check_space(self._originals, missing, self.workspace.root, self._options.undistortion)
+            check_space(self._originals, missing, self.workspace.root, self.options.undistortion)
         if found is not None and found.version == 1:
             if names_in_model(self.workspace) != sorted(images):  # it will be replaced, and may be the user's
                 set_model_aside(self.workspace, found)
@@ -216,13 +221,13 @@ class Preparation:
         is_replaced = self._found is None or self._overwrite
         if not is_replaced and is_users_model(self.workspace):
             return f"{self.workspace.sparse_dir} was changed since this program made it"
-        return reason_to_keep(self._originals.model, self._options.polish.poses)
+        return reason_to_keep(self._originals.model, self.options.polish.poses)
 
     def scene(self, results: Mapping[str, Result]) -> Scene | None:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
         if not self._overwrite and self._is_model_there(sorted(results)):
             return None
-        return foreseen_scene(self._originals, results, self._options.undistortion)
+        return foreseen_scene(self._originals, results, self.options.undistortion)
 
     def _is_model_there(self, names: Sequence[str]) -> bool:
         """Whether the workspace has the model of these images, or one that the user has changed."""
@@ -240,7 +245,7 @@ class Preparation:
 
     def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
         """Undistort the model in a process of its own; return the folder where it is."""
-        task = ModelToUndistort(self._originals.model_dir, tuple(names), self._options.undistortion, scratch)
+        task = ModelToUndistort(self._originals.model_dir, tuple(names), self.options.undistortion, scratch)
         child = ChildProcess(scratch)
         try:
             child.call(undistort_model, task, f"the model in {self.workspace.root}")

@@ -153,7 +153,7 @@ def run_project(
             restore_given(dense)
         return reconstruct(
             dense,
-            options,
+            preparation.options,
             expected=preparation.names,
             progress=progress,
             report=report,
@@ -241,6 +241,7 @@ def reconstruct(
         # Images that this program undistorted are no larger.
         scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report).in_region()
+        options = context.options
         for name in sorted({*expected} - scene.index_of.keys()):
             if name not in report.skipped_images:
                 report.skipped_images[name] = "the model has no possible pose or calibration of it"

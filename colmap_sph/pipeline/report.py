@@ -78,6 +78,8 @@ class RunReport:
     incomplete : dict
         Image name → what its results, or the cloud, had to do without for a reason that may pass, such as a file
         that could not be read. The next run makes them again.
+    drawn_region : str
+        Where a region was to be drawn: what was, and what it holds.
     stretched : str
         Which values became black and white in images of more than 8 bits, where these were changed.
     within : str
@@ -106,7 +108,8 @@ class RunReport:
     until : {"cloud", "geometric", "photometric"}
         The last results that were asked for.
     region : dict or None
-        Where a region was asked for: the ``box`` of its surfaces, and ``polygons`` in it, model coordinates.
+        Where a region was asked for: the ``box`` of its surfaces, ``polygons`` in it, and
+        the ``axes`` along which these are counted, rows of a rotation, or null; model coordinates.
     in_region : dict
         Image name → share of its pixels that show the region; empty without one.
     out_of_region : dict
@@ -145,6 +148,7 @@ class RunReport:
     images: int = 0
     skipped_images: dict[str, str] = field(default_factory=dict)
     incomplete: dict[str, str] = field(default_factory=dict)
+    drawn_region: str = ""
     stretched: str = ""
     within: str = ""
     detail: float | None = None
@@ -158,7 +162,7 @@ class RunReport:
     row_residual: float | None = None
     row_residuals: dict[str, float] = field(default_factory=dict)
     until: str = "cloud"
-    region: dict[str, list[Any]] | None = None
+    region: dict[str, list[Any] | None] | None = None
     in_region: dict[str, float] = field(default_factory=dict)
     out_of_region: dict[str, str] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)

@@ -18,6 +18,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import versions
 from colmap_sph.project.files import atomic_file, remove
 from colmap_sph.project.project import Project
+from colmap_sph.project.region_file import AUTO
 
 logger = logging.getLogger(__name__)
 
@@ -38,7 +39,7 @@ def command_of(project: Project, options: RunOptions) -> str:
         path = getattr(project, each.name)
         if path is not None:
             words += [f"--{each.name}", str(Path(path).absolute())]
-    if options.region and Path(options.region).exists():
+    if options.region not in ("", AUTO) and Path(options.region).exists():
         options = replace(options, region=str(Path(options.region).absolute()))
     words += _changed(asdict(options), asdict(RunOptions()), "--")
     return " ".join(map(shell_word, words))

@@ -1,21 +1,28 @@
-"""What a user gives as a region → the region: a box, COLMAP's file of one, or polygons in a file of GeoJSON."""
+"""What a user gives as a region → the region: a box, a file of one, or polygons in a file of GeoJSON; and back."""
 
 import json
-from collections.abc import Iterator
+import math
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from colmap_sph.errors import InputError, OptionError, reason_of
 from colmap_sph.project.files import read_small
 from colmap_sph.scene import Region
 
+AUTO = "auto"
+"""As a region: the program draws it, see `drawn_region`."""
+
 _MAX_BYTES = 8 << 20
 _MAX_CORNERS = 20_000
 # Larger than any coordinate in a map, in any unit.
 _MOST = 1e12
+# A rotation's four numbers are as those of a unit quaternion to this much.
+_NEARLY_UNIT = 0.01
 _GEOMETRIES = ("Polygon", "MultiPolygon", "GeometryCollection", "Feature", "FeatureCollection")
 
 
@@ -25,7 +32,9 @@ def read_region(given: str) -> Region:
     Parameters
     ----------
     given : str
-        ``x0,y0,z0,x1,y1,z1``, or the path of a file: six such numbers, or GeoJSON.
+        ``x0,y0,z0,x1,y1,z1``: least and largest coordinates; ``cx,cy,cz,sx,sy,sz,qw,qx,qy,qz``: the middle of a
+        box, its sides, and the rotation from the model to the box as COLMAP writes rotations; or the path of a
+        file, of six or ten such numbers, or GeoJSON.
 
     Returns
     -------
@@ -43,6 +52,12 @@ def read_region(given: str) -> Region:
     --------
     >>> read_region("0,0,-1,20,10,8").box.tolist()
     [[0.0, 0.0, -1.0], [20.0, 10.0, 8.0]]
+
+    A box turned by 90° about z: 20 long in y, 10 wide in x.
+
+    >>> turned = read_region("5,10,0,20,10,8,0.70711,0,0,0.70711")
+    >>> turned.along(np.array([5.0, 19, 0])).round(3), turned.box[0].round(3)
+    (array([-19.,   5.,   0.]), array([-20.,   0.,  -4.]))
     """
     path = Path(given)
     words = given.split(",")
@@ -50,7 +65,8 @@ def read_region(given: str) -> Region:
         region = _box(words)
         if region is None:
             raise OptionError(
-                f"--region must be a box x0,y0,z0,x1,y1,z1 with the least x, y and z first, not {given!r}.",
+                f"--region must be a box x0,y0,z0,x1,y1,z1 with the least x, y and z first, or a turned one "
+                f"cx,cy,cz,sx,sy,sz,qw,qx,qy,qz, not {given!r}.",
                 "region",
             )
         return region
@@ -61,14 +77,15 @@ def read_region(given: str) -> Region:
     if region is None:
         raise InputError(
             f"The region {path} holds neither polygons in GeoJSON nor the least x y z and the largest x y z of a "
-            "box; mend it."
+            "box, or the ten numbers of a turned one; mend it."
         )
     return region
 
 
 def read_box_file(path: Path, option: str) -> Region:
     """Read COLMAP's file of a bounding box: six numbers, least x, y and z, and most; `InputError` for all else."""
-    region = _box(_content(path, option).split())
+    words = _content(path, option).split()
+    region = _box(words) if len(words) == 6 else None
     if region is None:
         raise InputError(
             f"The bounding box {path} does not hold the least x y z and the largest x y z of a box; mend it."
@@ -92,11 +109,52 @@ def _is_number(word: str) -> bool:
 
 
 def _box(words: list[str]) -> Region | None:
-    if len(words) != 6 or not all(map(_is_number, words)):
+    if len(words) not in (6, 10) or not all(map(_is_number, words)):
         return None
-    numbers = np.array([float(word) for word in words]).reshape(2, 3)
-    is_box = not np.isnan(numbers).any() and (numbers[0] < numbers[1]).all()
-    return Region(numbers) if is_box else None
+    numbers = np.array([float(word) for word in words])
+    if len(words) == 10:
+        return _turned_box(numbers[:3], numbers[3:6], numbers[6:])
+    box = numbers.reshape(2, 3)
+    is_box = not np.isnan(box).any() and (box[0] < box[1]).all()
+    return Region(box) if is_box else None
+
+
+def _turned_box(
+    middle: NDArray[np.float64], sides: NDArray[np.float64], quaternion: NDArray[np.float64]
+) -> Region | None:
+    is_box = np.isfinite(middle).all() and (sides > 0).all()
+    if not is_box or not abs(np.linalg.norm(quaternion) - 1) < _NEARLY_UNIT:
+        return None
+    axes = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
+    return Region(axes @ middle + np.array([-0.5, 0.5])[:, None] * sides, axes=axes)
+
+
+def as_given(region: Region) -> str:
+    """What a user may give to get a finite box, or one a little larger, in as few digits as will do.
+
+    Examples
+    --------
+    >>> as_given(Region(np.array([[-1.23456, 0, 10], [8, 1234.5678, 20]])))
+    '-1.24,0,10,8,1234.57,20'
+    >>> print(as_given(read_region("5,10,0,20,10,8,0.70711,0,0,0.70711")))
+    5,10,0,20.01,10.01,8.01,0.7071068,0,0,0.7071068
+    """
+    sides = np.diff(region.box, axis=0)[0]
+    step = 10.0 ** (math.floor(math.log10(sides.min())) - 2)
+    if region.axes is None:
+        return _numbers([*np.floor(region.box[0] / step) * step, *np.ceil(region.box[1] / step) * step], step)
+    middle = region.axes.T @ region.box.mean(axis=0)
+    quaternion = np.roll(Rotation.from_matrix(region.axes).as_quat(canonical=True), 1)
+    turn = _numbers(quaternion, 1e-7)
+    sides = np.ceil(sides / step + 1) * step  # rounding may move the middle
+    return f"{_numbers(np.round(middle / step) * step, step)},{_numbers(sides, step)},{turn}"
+
+
+def _numbers(values: Iterable[float], step: float) -> str:
+    """Values that are multiples of a power of ten."""
+    decimals = max(-round(math.log10(step)), 0)
+    texts = [f"{value:.{decimals}f}" for value in values]
+    return ",".join(text.rstrip("0").rstrip(".") if decimals else text for text in texts)
 
 
 def _of_geojson(path: Path, content: str) -> Region:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.scene import Polygons, Region, Scene, View
 from colmap_sph.stereo.partners.frusta import sees
-from colmap_sph.stereo.region.window import outline_on
+from colmap_sph.stereo.region.window import outline_on, turned
 
 # The scene reaches from the one to the other percentile of its points, and beyond by this share of it: beyond are
 # outliers.
@@ -39,7 +39,7 @@ class Focus:
     region : Region
         What results are cut to.
     box : (2, 3) float64 ndarray
-        Where its surfaces are, with some room around: what images need to show.
+        Where its surfaces are, with some room around, along the region's axes: what images need to show.
     """
 
     region: Region
@@ -48,11 +48,11 @@ class Focus:
     @property
     def near(self) -> Region:
         """What of the region may hold a surface, finite: a pixel shows the region where it shows this."""
-        return Region(self.box, self.region.polygons)
+        return replace(self.region, box=self.box)
 
     def outline(self, view: View) -> NDArray[np.float64]:
         """Of what of a view of the reduced scene may show the region, see `outline_on`."""
-        outline = outline_on(view, self.box)
+        outline = outline_on(turned(view, self.region), self.box)
         assert outline is not None
         return outline
 
@@ -90,35 +90,38 @@ def focused(scene: Scene, region: Region, least_points: int, called: str) -> tup
     """
     origin = scene.origin + scene.anchor
     region = region.moved(-origin)
-    points = scene.points[np.isfinite(scene.points).all(axis=1)]
-    if not len(points):
+    is_finite = np.isfinite(scene.points).all(axis=1)
+    if not is_finite.any():
         raise InputError(
             f"{called} needs sparse points, by which the images of a region are found, and the model has none; "
             "triangulate some (colmap point_triangulator), or leave out --region."
         )
-    low, high = np.percentile(points, _PERCENTILES, axis=0)
+    points = region.along(scene.points)
+    low, high = np.percentile(points[is_finite], _PERCENTILES, axis=0)
     beyond = _BEYOND * (high - low)
     inside_scene = np.stack([np.maximum(region.box[0], low - beyond), np.minimum(region.box[1], high + beyond)])
-    near = np.zeros(len(scene.points), bool)
+    near = np.zeros(len(points), bool)
     size = 0.0
     if (inside_scene[0] <= inside_scene[1]).all():
         size = float(np.linalg.norm(inside_scene[1] - inside_scene[0]))
-        near = _near(region, scene.points, size)
+        near = _near(region, points, size)
     if not near.any():
-        corners = (f"{x:.6g} {y:.6g} {z:.6g}" for x, y, z in (low + origin, high + origin))
+        reach = np.percentile(scene.points[is_finite], _PERCENTILES, axis=0) + origin
+        corners = (f"{x:.6g} {y:.6g} {z:.6g}" for x, y, z in reach)
         raise InputError(
             f"{called} misses the scene, whose sparse points reach from {' to '.join(corners)}; give a region in "
             "the model's coordinates that holds some of them."
         )
-    low, high = np.percentile(scene.points[near], _PERCENTILES, axis=0)
+    low, high = np.percentile(points[near], _PERCENTILES, axis=0)
     above = _ABOVE * (high - low) + _ABOVE_FLAT * size
     box = np.stack([np.maximum(inside_scene[0], low - above), np.minimum(inside_scene[1], high + above)])
-    part, too_few = _with_points(scene, near, box, least_points)
-    return part, Focus(region, box), too_few
+    focus = Focus(region, box)
+    part, too_few = _with_points(scene, near, focus, least_points)
+    return part, focus, too_few
 
 
 def _near(region: Region, points: NDArray[np.float64], size: float) -> NDArray[np.bool_]:
-    """Which points lie in a region of some size or near it."""
+    """Which points, along its axes, lie in a region of some size or near it."""
     distances = _distances(region, points, size)
     enough = size
     if len(points) > _ENOUGH_POINTS:
@@ -127,7 +130,7 @@ def _near(region: Region, points: NDArray[np.float64], size: float) -> NDArray[n
 
 
 def _distances(region: Region, points: NDArray[np.float64], most: float) -> NDArray[np.float64]:
-    """(n,) distances of points from a region; infinite where they are not finite, or larger than `most`."""
+    """(n,) distances of points along a region's axes from it; infinite for no point, and beyond `most`."""
     with np.errstate(invalid="ignore"):
         beside = np.maximum(np.maximum(region.box[0] - points, points - region.box[1]), 0)
     distances: NDArray[np.float64] = np.linalg.norm(beside, axis=1)
@@ -159,7 +162,7 @@ def _distances_from(polygons: Polygons, places: NDArray[np.float64], most: float
 
 
 def _with_points(
-    scene: Scene, kept: NDArray[np.bool_], box: NDArray[np.float64], least_points: int
+    scene: Scene, kept: NDArray[np.bool_], focus: Focus, least_points: int
 ) -> tuple[Scene, dict[str, int]]:
     """The scene with some of its points and the views that show enough of them; and which views show fewer."""
     points = scene.points[kept]
@@ -169,7 +172,7 @@ def _with_points(
     for view in scene.views:
         observed = view.point_indices[kept[view.point_indices]]
         number = len(observed) if scene.has_tracks else np.count_nonzero(sees(view, points))
-        if not number or outline_on(view, box) is None:
+        if not number or outline_on(turned(view, focus.region), focus.box) is None:
             continue
         if number >= least_points:
             views.append(replace(view, point_indices=new_rows[observed]))

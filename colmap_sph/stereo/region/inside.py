@@ -24,6 +24,7 @@ def is_inside(region: Region, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     >>> is_inside(Region(box, ((outline, hole),)), points).tolist()
     [True, False, False]
     """
+    points = region.along(points)
     inside = np.asarray(((points >= region.box[0]) & (points <= region.box[1])).all(axis=1))
     if region.polygons:
         rows = np.flatnonzero(inside)

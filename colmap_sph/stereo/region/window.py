@@ -1,12 +1,13 @@
 """View and box → the part of the view's image that may show what lies in the box: its outline, and a window."""
 
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.scene import View
+from colmap_sph.scene import Region, View
 from colmap_sph.stereo.partners.frusta import sees
 
 # Rays along each side of an image, and points along each side of a box.
@@ -58,6 +59,11 @@ class Window(NamedTuple):
         whole = np.zeros((view.height, view.width, *pixels.shape[2:]), pixels.dtype)
         whole[self.top : self.bottom, self.left : self.right] = pixels
         return whole
+
+
+def turned(view: View, region: Region) -> View:
+    """The view in a world frame whose axes are a region's."""
+    return view if region.axes is None else replace(view, R=view.R @ region.axes.T)
 
 
 def outline_on(view: View, box: NDArray[np.float64]) -> NDArray[np.float64] | None:
