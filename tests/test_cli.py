@@ -81,6 +81,7 @@ EVERYDAY = [
     "output",
     "workspace",
     "quality",
+    "within",
     "max-image-size",
     "num-pairs",
     "threads",

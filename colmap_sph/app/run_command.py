@@ -59,13 +59,12 @@ class RunCommand:
     quality: Quality = "normal"
     """Preview takes a quarter of the time of normal, best about twice as much. Options given beside it win."""
     within: str = ""
-    """Time to end within, such as 20min or 1h30min, instead of a quality: sampling, partners and refinement are
-    chosen for it as the run goes. Those of them that are given stay as they are."""
+    """Time to end within, such as 20min: it chooses sampling, partners and refinement."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Only say what is to do, and about how much time, memory and disk it takes. Nothing is written."""
+    """Write nothing: say what is to do, and about how much time, memory and disk it takes."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Do everything again, also what an earlier run in this workspace has finished. Maps and clouds that other
-    programs made are kept under another name."""
+    """Do everything again, also what an earlier run has finished. Maps and clouds that other programs made are
+    kept under another name."""
     verify: tyro.conf.FlagCreatePairsOff[bool] = False
     """Look at every byte of earlier results first, and make again what is damaged."""
     config: Path | None = None
