@@ -10,4 +10,9 @@
 
 #define ALWAYS_INLINE static inline __attribute__((always_inline))
 
+/* The nearest of 0 to end - 1. */
+ALWAYS_INLINE ptrdiff_t within(ptrdiff_t value, ptrdiff_t end) {
+    return value < 0 ? 0 : value < end ? value : end - 1;
+}
+
 #endif

@@ -15,8 +15,8 @@ static int check_source_width(int width) {
     return check(width >= 0, "the width must not be negative") && check_width(width);
 }
 
-static int check_depth(const sizes *size) {
-    return check(size->D > 0 && size->D <= MAX_DEPTH && size->D % DEPTH_STEP == 0,
+static int check_depth(ptrdiff_t depth) {
+    return check(depth > 0 && depth <= MAX_DEPTH && depth % DEPTH_STEP == 0,
                  "the number of disparities must be a multiple of 32, at most 1024");
 }
 
@@ -88,7 +88,7 @@ ARGUMENTS(matching_cost, MATCHING_COST);
 
 static int check_matching_cost(const void *arguments) {
     const matching_cost_arguments *a = arguments;
-    return check_depth(&a->size) && check_widths(&a->size);
+    return check_depth(a->size.D) && check_widths(&a->size);
 }
 
 static int run_matching_cost(void *arguments) {
@@ -113,7 +113,7 @@ ARGUMENTS(aggregation, AGGREGATION);
 
 static int check_aggregation(const void *arguments) {
     const aggregation_arguments *a = arguments;
-    return check_depth(&a->size) && check_widths(&a->size) && check_penalties(a->p1, a->p2, a->max_slant);
+    return check_depth(a->size.D) && check_widths(&a->size) && check_penalties(a->p1, a->p2, a->max_slant);
 }
 
 static int run_aggregation(void *arguments) {
@@ -141,7 +141,7 @@ ARGUMENTS(selection, SELECTION);
 
 static int check_selection(const void *arguments) {
     const selection_arguments *a = arguments;
-    return check_depth(&a->size) && check_widths(&a->size) && check_source_width(a->source_width) &&
+    return check_depth(a->size.D) && check_widths(&a->size) && check_source_width(a->source_width) &&
            check_left_right(a->max_difference, a->max_excess);
 }
 
@@ -175,7 +175,7 @@ ARGUMENTS(match, MATCH);
 
 static int check_match(const void *arguments) {
     const match_arguments *a = arguments;
-    return check_depth(&a->size) && check_widths(&a->size) && check_source_width(a->source_width) &&
+    return check_depth(a->size.D) && check_widths(&a->size) && check_source_width(a->source_width) &&
            check(a->size.BAND > 0 && (a->size.W == 0 || a->size.BAND % a->size.W == 0),
                  "scratch must have the size (2, pixels of one row or more, disparities)") &&
            check_penalties(a->p1, a->p2, a->max_slant) && check_left_right(a->max_difference, a->max_excess);
@@ -330,9 +330,7 @@ ARGUMENTS(search_windows, SEARCH_WINDOWS);
 
 static int check_search_windows(const void *arguments) {
     const search_windows_arguments *a = arguments;
-    return check_finer(&a->size) &&
-           check(a->depth > 0 && a->depth <= MAX_DEPTH && a->depth % DEPTH_STEP == 0,
-                 "the number of disparities must be a multiple of 32, at most 1024") &&
+    return check_finer(&a->size) && check_depth(a->depth) &&
            check(a->clearance >= 0 && a->clearance <= a->depth / 2 && a->own_clearance >= 0 &&
                      a->own_clearance <= a->depth / 2,
                  "a clearance must lie between 0 and half the number of disparities");

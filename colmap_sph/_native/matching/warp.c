@@ -1,10 +1,6 @@
 /* Images warped by predicted offsets, row by row; see `warp` in matching.h. */
 #include "matching/matching.h"
 
-ALWAYS_INLINE ptrdiff_t within(ptrdiff_t value, ptrdiff_t end) {
-    return value < 0 ? 0 : value < end ? value : end - 1;
-}
-
 void warp(const float *source, const uint8_t *valid, const int32_t *prediction, ptrdiff_t margin, match_size size,
           float *warped, uint8_t *warped_valid, int32_t *columns) {
     for (ptrdiff_t y = 0; y < size.height; y++) {

@@ -3,10 +3,6 @@
 
 #include "matching/matching.h"
 
-ALWAYS_INLINE ptrdiff_t within(ptrdiff_t value, ptrdiff_t end) {
-    return value < 0 ? 0 : value < end ? value : end - 1;
-}
-
 /* The 3 x 3 offsets around a pixel; beyond the sides, the outermost. */
 typedef struct {
     int64_t at[3][3];
