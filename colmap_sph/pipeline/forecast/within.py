@@ -40,9 +40,7 @@ _MOST_PROBES = 4
 # Processor seconds per megapixel of an image that is read for the first time.
 _READ_SECONDS = 0.02
 # Share of what is left that further partners may count on: where the rest takes longer, refinement must not pay.
-# Before a vote, and after it, when it is known how long one takes.
-_CAUTION = 0.9
-_LATER_CAUTION = 0.95
+_CAUTION = 0.95
 # Pairs that each sampling's estimate rests on.
 _ASKED = 8
 # Processor seconds of what follows the last stage, the page: of any run, and of each image.
@@ -99,6 +97,8 @@ class Within:
         if "pairs.num_pairs" in kept:
             self._ranks = [[pair for rank in self._ranks for pair in rank]]
         self._kept = kept
+        size = context.options.undistortion.max_image_size
+        self._reduced_to = None if SIZE in kept or size == -1 else size
         ladder = choices(context.options, kept)
         self._ladder = not_beyond(context.workspace, limit.seconds, kept, ladder) if goes_on else ladder
         self._settings = self._chosen = self._ladder[0]
@@ -177,7 +177,7 @@ class Within:
         elapsed = self._limit.elapsed  # not before: to estimate takes time, too
         fitting = [settings for settings in self._ladder if elapsed + seconds[settings] <= self._limit.seconds]
         settings = fitting[-1] if fitting else self._ladder[0]
-        return Choice(settings, self._limit.seconds, elapsed + seconds[settings])
+        return Choice(settings, self._limit.seconds, elapsed + seconds[settings], self._reduced_to is not None)
 
     def _whole_seconds(self, settings: Settings) -> float:
         count = self._count(settings)
@@ -309,11 +309,10 @@ class Within:
 
     def _affordable(self) -> int:
         """How many ranks there is time for in all."""
-        left = self._limit.left * (_LATER_CAUTION if self._later_pace.is_known else _CAUTION)
         for rank in range(self._done, self._most):
             matching = self._matching_work(self._settings, self._done, rank + 1)
             later = self._later_work(rank + 1, self._settings_after(rank))
-            if self._seconds(matching, later) > left:
+            if self._seconds(matching, later) > _CAUTION * self._limit.left:
                 return rank
         return self._most
 
@@ -352,8 +351,7 @@ class Within:
         if report.sampling is not None:
             usual = self._context.options.rectification.sampling
             report.sampling = round(report.sampling * context.options.rectification.sampling / usual, 3)
-        size = context.options.undistortion.max_image_size
-        reduced = "" if SIZE in self._kept or size == -1 else f"--max-image-size {size} "
+        reduced = "" if self._reduced_to is None else f"--max-image-size {self._reduced_to} "
         report.within = f"{format_time(self._limit.seconds)}: {reduced}{self._settings.flags}"
         logger.info("Within %s; the same again without a limit: %s", report.within, report.command)
 
