@@ -12,6 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.pipeline.digests import digest
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
@@ -62,6 +63,20 @@ class Context:
     report: RunReport = field(default_factory=RunReport)
     details: Mapping[str, float] = field(default_factory=dict)
     focus: Focus | None = None
+
+    @cached_property
+    def scene_key(self) -> str:
+        """Digest of all that stages look at in the scene and in the region, and of what is known of the images."""
+        views = self.scene.views
+        return digest(
+            [(view.name, view.image_id, view.width, view.height, view.full_size) for view in views],
+            [np.array([getattr(view, name) for view in views]) for name in ("K", "R", "t", "reprojection_error")],
+            [view.point_indices for view in views],
+            self.scene.points,
+            self.focus,
+            [self.details.get(view.name) for view in views],
+            self.keys.contents([view.name for view in views]),
+        )
 
     @cached_property
     def stations(self) -> Stations:

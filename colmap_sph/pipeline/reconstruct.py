@@ -23,7 +23,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.report_files import command_of, make_page, write_report
+from colmap_sph.pipeline.report_files import command_of, keep_or_make_page, write_report
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
@@ -149,12 +149,15 @@ def run_project(
         )
         preparation.run(execute)
         given = preparation.given_model()
+        options = preparation.options
+        names = preparation.names
+        del preparation  # the model takes much memory
         if given.reason_to_keep or not options.polish.is_wanted:
             restore_given(dense)
         return reconstruct(
             dense,
-            preparation.options,
-            expected=preparation.names,
+            options,
+            expected=names,
             progress=progress,
             report=report,
             database=project.database(),
@@ -253,7 +256,10 @@ def reconstruct(
             raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
-            selection = choose_pairs(workspace, scene, options, database, pair_list)
+            key = context.keys.stage("selection", context.scene_key)
+            selection = choose_pairs(
+                workspace, scene, options, database, pair_list, scene_key=key, keep=True
+            )
             report.pair_source = selection.source
             progress.advance()
         context = replace(context, scene=wanted_scene(scene, selection))
@@ -272,7 +278,7 @@ def reconstruct(
             context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), execute)
         judge_agreement(report)
     write_report(context)
-    make_page(context)
+    keep_or_make_page(context)
     refuse_disagreement(report)
     if until == "cloud" and not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")

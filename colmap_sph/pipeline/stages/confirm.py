@@ -10,11 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
-from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, keys_of
 from colmap_sph.pipeline.stages.vote import normals_seconds
 from colmap_sph.project.images.reading import bytes_to_reduce, read_whole_grey
 from colmap_sph.project.masks import read_view_mask
@@ -138,10 +139,11 @@ def confirm_seconds(partners: int, normals: NormalOptions, refinement: Refinemen
     return seconds + _REFINE_SECONDS * refinement.images_used(partners)
 
 
-class ConfirmStage(Stage[str, ConfirmTask]):
+class ConfirmStage(RememberingStage[str, ConfirmTask]):
     """Confirms and refines the depth of every image with a vote."""
 
     name = "confirm depth"
+    remembered_as = "geometric"
     make = staticmethod(make_geometric_maps)
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result], votes: Mapping[str, Result]) -> None:
@@ -150,14 +152,29 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         self._voted = {name: result.facts.coverage for name, result in votes.items()}
         self._residuals = residuals_of(matched)
         self._all_partners = partners_of(matched)
-        self._tracks = context.sparse_tracks  # found once, and not by every worker at a time
 
-    def job(self, item: str) -> Job[ConfirmTask]:
-        """See `Stage.job`."""
+    def input_key(self) -> str:
+        """See `RememberingStage`."""
+        context = self.context
+        options = context.options
+        given = (options.pairs, options.rectification, options.confirm, options.normals, options.refinement)
+        matched = sorted((*pair, residual) for pair, residual in self._residuals.items())
+        return context.keys.stage("geometric", context.scene_key, given, matched, self._vote_keys)
+
+    def files(self, item: str) -> list[str]:
+        """See `RememberingStage`."""
+        return self.context.map_files(item, "geometric").paths
+
+    def is_there(self, item: str, key: str) -> bool:
+        """See `RememberingStage`."""
+        return self.context.map_files(item, "geometric").facts(key) is not None
+
+    def ask(self, item: str) -> Job[ConfirmTask]:
+        """See `RememberingStage`."""
         options = self.context.options
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
-        sights = self._tracks.sights(item).between(options.rectification.depths)
+        sights = self.context.sparse_tracks.sights(item).between(options.rectification.depths)
         residuals = [self._residuals[as_pair(item, name)] for name in partners]
         cut = self.context.cut(item)
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights, cut)
@@ -220,6 +237,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""
+        self.remember(results)
         report = self.context.report
         names = [view.name for view in self.context.scene.views]
         report.coverage = {name: results[name].facts.coverage if name in results else 0.0 for name in names}

@@ -7,10 +7,12 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
+from colmap_sph.pipeline.known.remembering import done
 from colmap_sph.pipeline.memory import format_memory, resident
 from colmap_sph.pipeline.stages.cloud import (
     begin_cloud,
@@ -21,9 +23,11 @@ from colmap_sph.pipeline.stages.cloud import (
     vouch_for_cloud,
 )
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.fusion_partners import partners_in_fusion
+from colmap_sph.pipeline.stages.fusion_partners import PartnersInFusion
 from colmap_sph.pipeline.stages.fusion_parts import (
     CLOUD_BYTES,
+    FuseTask,
+    Partners,
     PartsStage,
     index_in_model,
     seconds_per_megapixel,
@@ -114,19 +118,31 @@ class FuseStage(PartsStage):
     """Fuses the maps of every image with any depth into its part of the cloud, and joins these."""
 
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
-        items = list(maps)
-        partners = partners_in_fusion(context, pair_keys, items)
-        indices = index_in_model(context)
-        # All at once: where maps turn out to be damaged, their records say other things meanwhile.
-        sources = {name: _sources_of(context, name, indices[name]) for name in items}
-        super().__init__(context, items, partners, sources)
-        self._key = context.keys.cloud({name: maps[name].key for name in maps}, partners, context.scene)
+        super().__init__(context, list(maps))
+        self._pair_keys = pair_keys
+        self._key = _key_of_cloud(context, pair_keys, maps)
         self._known = known_cloud(context, self._key)
         self._is_there = self._known is not None
 
-    def _done(self) -> Facts | None:
-        """All parts are done where the cloud is."""
-        return None if self._known is None else Facts()
+    @cached_property
+    def partners(self) -> Partners:
+        """See `PartsStage`."""
+        return PartnersInFusion(self.context, self._pair_keys, self.items)
+
+    @cached_property
+    def sources(self) -> Mapping[str, MapSources]:
+        """See `PartsStage`."""
+        indices = index_in_model(self.context)
+        # All at once: where maps turn out to be damaged, their records say other things meanwhile.
+        return {name: _sources_of(self.context, name, indices[name]) for name in self.items}
+
+    def is_missing(self, item: str) -> bool:
+        """See `Stage.is_missing`."""
+        return self._known is None
+
+    def job(self, item: str) -> Job[FuseTask]:
+        """See `Stage.job`: all parts are done where the cloud is."""
+        return super().job(item) if self._known is None else done(self._key, Facts())
 
     @contextmanager
     def opened(self) -> Iterator[None]:
@@ -137,6 +153,7 @@ class FuseStage(PartsStage):
             return
         check_places(self.context.workspace)
         warn_of_masks(self.context)
+        assert self.partners and self.sources  # found once, and not by every worker at a time
         with scratch_folder(self._scratch):
             yield
 
@@ -159,7 +176,7 @@ class FuseStage(PartsStage):
         among = {}
         for name in results:
             kept = [
-                (other, number) for other, number in zip(*self._partners[name], strict=True) if other in results
+                (other, number) for other, number in zip(*self.partners[name], strict=True) if other in results
             ]
             among[name] = ([other for other, _ in kept], [number for _, number in kept])
         return among
@@ -182,6 +199,12 @@ class FuseStage(PartsStage):
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
         """One cloud."""
         return int(not self._is_there), int(self._is_there)
+
+
+def _key_of_cloud(context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> str:
+    """The pairs and the model tell who looks where, and who stands beside whom."""
+    pairs = (sorted(pair_keys), context.options.pairs.min_triangulation_angle)
+    return context.keys.cloud({name: result.key for name, result in maps.items()}, pairs, context.scene)
 
 
 def _sources_of(context: "Context", name: str, index: int) -> MapSources:
@@ -213,9 +236,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         self._views = [context.scene.view(name) for name in self._names]
         # Without tracks COLMAP would find no images that overlap.
         self._partners = None if context.scene.has_tracks else partners_of(pair_keys)
-        self._key = context.keys.cloud(
-            {name: maps[name].key for name in maps}, self._partners or {}, context.scene
-        )
+        self._key = _key_of_cloud(context, pair_keys, maps)
         self._known = known_cloud(context, self._key)
 
     def job(self, item: str) -> Job[ColmapFuseTask]:

@@ -42,9 +42,21 @@ class FuseToStage(PartsStage):
         output: CloudOutput,
         region: Region | None = None,
     ) -> None:
-        super().__init__(context, list(sources), partners, sources)
+        super().__init__(context, list(sources))
+        self._partners = partners
+        self._sources = sources
         self.region = region
         self._output = output
+
+    @property
+    def partners(self) -> Partners:
+        """See `PartsStage`."""
+        return self._partners
+
+    @property
+    def sources(self) -> Mapping[str, MapSources]:
+        """See `PartsStage`."""
+        return self._sources
 
     @contextmanager
     def opened(self) -> Iterator[None]:

@@ -1,5 +1,6 @@
 """Maps of a view and of those that overlap it → its part of the cloud: what every way to make a cloud shares."""
 
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.memory import MemoryGate
 
 Partners = Mapping[str, tuple[list[str], list[int]]]
-"""For each image to fuse those that it is looked up in, and their stations; see `partners_in_fusion`."""
+"""For each image to fuse those that it is looked up in, and their stations; see `PartnersInFusion`."""
 
 CLOUD_BYTES = 12.0
 """Bytes on disk per pixel, of the cloud."""
@@ -93,55 +94,46 @@ def seconds_per_megapixel(partners: int) -> float:
 
 
 class PartsStage(Stage[str, FuseTask]):
-    """Fuses the maps of every image into its part of a cloud.
-
-    Parameters
-    ----------
-    context : Context
-    items : sequence of str
-        Names of the images.
-    partners : mapping
-        See `Partners`.
-    sources : mapping of str to MapSources
-        Where what is fused of each image lies.
-    """
+    """Fuses the maps of every image, by its name, into its part of a cloud."""
 
     name = "fuse"
     make = staticmethod(make_cloud_part)
     region: Region | None = None
     """Where points are wanted, see `FuseTask`."""
 
-    def __init__(
-        self, context: "Context", items: Sequence[str], partners: Partners, sources: Mapping[str, MapSources]
-    ) -> None:
+    def __init__(self, context: "Context", items: Sequence[str]) -> None:
         super().__init__(context, items)
-        self._partners = partners
-        self._sources = sources
         self._scratch = context.workspace.fusion_scratch_dir
         self._key = ""
 
-    def _done(self) -> Facts | None:
-        """What is known of a part where it need not be made."""
-        return None
+    @property
+    @abstractmethod
+    def partners(self) -> Partners:
+        """Of each image."""
+
+    @property
+    @abstractmethod
+    def sources(self) -> Mapping[str, MapSources]:
+        """Where what is fused of each image lies."""
 
     def job(self, item: str) -> Job[FuseTask]:
         """See `Stage.job`."""
         scene = self.context.scene
         pixels = scene.view(item).num_pixels
-        partners, stations = self._partners[item]
+        partners, stations = self.partners[item]
         seconds = seconds_per_megapixel(len(partners))
         memory = _FUSE_BYTES * pixels + bytes_to_reduce(*map(scene.view, [item, *partners]))
         cost = Cost(seconds * pixels / 1e6, memory, CLOUD_BYTES * pixels)
         task = FuseTask(
-            self._sources[item],
-            tuple(self._sources[partner] for partner in partners),
+            self.sources[item],
+            tuple(self.sources[partner] for partner in partners),
             tuple(stations),
             self.context.options.fusion,
             scene.anchor,
             self._stem(item),
             self.region,
         )
-        return Job(self._key, self._done(), cost, task)
+        return Job(self._key, None, cost, task)
 
     def _stem(self, name: str) -> Path:
         return self._scratch / f"{self.context.scene.view(name).image_id}"

@@ -4,6 +4,7 @@ A file is ours where a record says so. Arrays in files of our own are ours by th
 """
 
 import logging
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -37,7 +38,7 @@ class Place:
     @property
     def foreign(self) -> list[Path]:
         """Files that are there, though no record knows of them."""
-        return altered_files(None, self.files) if read_record(self.record) is None else []
+        return [] if os.path.lexists(self.record) else altered_files(None, self.files)
 
 
 def map_place(workspace: Workspace, name: str, kind: MapKind) -> Place:
