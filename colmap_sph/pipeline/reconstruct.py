@@ -9,7 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, Until, timed_stage
@@ -47,6 +47,8 @@ from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectification import sampling_of
 
 logger = logging.getLogger(__name__)
+
+Item = TypeVar("Item", str, Pair)
 
 
 def run(
@@ -322,12 +324,12 @@ def go_through_stages(
         The last results to make.
     """
     check_numbers(context, pairs)
-    matched = executor(MatchStage(context, pairs))
+    matched = _by_name(executor(MatchStage(context, context.order.sorted_pairs(pairs))))
     votes = _vote(context, matched, executor)
     if until == "photometric":
         report_photometric(context, votes)
         return
-    maps = executor(ConfirmStage(context, matched, votes))
+    maps = _by_name(executor(ConfirmStage(context, matched, votes)))
     if until == "cloud":
         executor(fuse_stage(context, keys_of(matched), maps))
 
@@ -337,7 +339,7 @@ def go_through_stages_within(within: Within, executor: Executor) -> Context:
     context, matched = within.match(executor)
     votes = _vote(context, matched, executor)
     context = within.refined(context, matched, votes)
-    maps = executor(ConfirmStage(context, matched, votes))
+    maps = _by_name(executor(ConfirmStage(context, matched, votes)))
     executor(fuse_stage(context, keys_of(matched), maps))
     return context
 
@@ -345,7 +347,12 @@ def go_through_stages_within(within: Within, executor: Executor) -> Context:
 def _vote(context: Context, matched: Mapping[Pair, Result], executor: Executor) -> dict[str, Result]:
     measured = {pair: result.facts.row_residual for pair, result in matched.items()}
     judge_rows(context.report, context.scene, measured)
-    return executor(VoteStage(context, matched))
+    return _by_name(executor(VoteStage(context, matched)))
+
+
+def _by_name(results: Mapping[Item, Result]) -> dict[Item, Result]:
+    """Results in the order of their items' names, whatever the order in which they were worked on."""
+    return {item: results[item] for item in sorted(results)}
 
 
 def with_good_images(

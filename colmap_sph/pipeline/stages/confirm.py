@@ -42,15 +42,16 @@ _REFINE_SECONDS = 0.065
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
 _CONFIRM_BYTES = 40.0
 _REFINE_BYTES = 55.0
-# Per pixel: of an image and of an estimate in a cache; and bytes of a cache: more is no faster.
+# Per pixel: of an image and of an estimate in the cache.
 _IMAGE_BYTES = 1
 _ESTIMATE_BYTES = 9
-_CACHE_BYTES = 512 << 20
 # Caches take what the costliest image leaves, with some room to spare.
 _ROOM = 1.2
 
-_images: LoadCache[NDArray[np.uint8]] = LoadCache(lambda image: image.nbytes)
-_estimates: LoadCache[DepthEstimate] = LoadCache(lambda estimate: _ESTIMATE_BYTES * estimate.depth.size)
+# Images of views, and estimates of their depth.
+_loaded: LoadCache[NDArray[np.uint8] | DepthEstimate] = LoadCache(
+    lambda loaded: _ESTIMATE_BYTES * loaded.depth.size if isinstance(loaded, DepthEstimate) else loaded.nbytes
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,13 +125,18 @@ def _usual(residuals: Sequence[float]) -> float:
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
-    return _estimates.get(file_stamp(file.estimate), lambda: read_estimate(file.estimate, file.view))
+    key = f"estimate {file_stamp(file.estimate)}"
+    estimate = _loaded.get(key, lambda: read_estimate(file.estimate, file.view))
+    assert isinstance(estimate, DepthEstimate)
+    return estimate
 
 
 def _image(file: EstimateFile) -> NDArray[np.uint8]:
     size = (file.whole.width, file.whole.height)
-    key = f"{file_stamp(file.image)} {size} {file.window}"
-    return _images.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
+    key = f"image {file_stamp(file.image)} {size} {file.window}"
+    image = _loaded.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
+    assert not isinstance(image, DepthEstimate)
+    return image
 
 
 def confirm_seconds(partners: int, normals: NormalOptions, refinement: RefinementOptions) -> float:
@@ -147,7 +153,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
     make = staticmethod(make_geometric_maps)
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result], votes: Mapping[str, Result]) -> None:
-        super().__init__(context, [view.name for view in context.scene.views if view.name in votes])
+        super().__init__(context, context.order.sorted(votes))
         self._vote_keys = keys_of(votes)
         self._voted = {name: result.facts.coverage for name, result in votes.items()}
         self._residuals = residuals_of(matched)
@@ -225,14 +231,15 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """See `Stage.kept_memory`."""
         most = max((self._cost(name).memory for name in self.items), default=0.0)
-        cache = int(min(_CACHE_BYTES, gate.spare(_ROOM * most) / 2))
         filled = (_IMAGE_BYTES + _ESTIMATE_BYTES) * sum(map(self._pixels, self.items))
-        return Kept(cache=cache, caches=2, filled=filled)
+        # Half of what is spare goes to more workers at a time.
+        cache = int(min(filled, gate.spare(_ROOM * most) / 2))
+        return Kept(cache=cache, caches=1, filled=filled)
 
     @contextmanager
     def holding(self, kept: Kept) -> Iterator[None]:
         """See `Stage.holding`."""
-        with _images.holding(kept.cache), _estimates.holding(kept.cache):
+        with _loaded.holding(kept.cache):
             yield
 
     def close(self, results: Mapping[str, Result]) -> None:

@@ -42,7 +42,6 @@ from colmap_sph.project.cloud_files import (
     move_cloud_into_place,
 )
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
-from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions
@@ -147,19 +146,20 @@ class FuseStage(PartsStage):
     @contextmanager
     def opened(self) -> Iterator[None]:
         """Where the cloud must be made, its parts are there until this ends."""
-        list_fused_images(self.context, self.items)
+        list_fused_images(self.context, self._names)
         if self._known is not None:
             yield
             return
         check_places(self.context.workspace)
         warn_of_masks(self.context)
-        assert self.partners and self.sources  # found once, and not by every worker at a time
-        with scratch_folder(self._scratch):
+        assert self.sources.keys() == set(self._names)
+        with self.in_scratch():
             yield
 
     def close(self, results: Mapping[str, Result]) -> None:
         """Join the parts to the cloud."""
         context = self.context
+        results = self.in_order(results)
         if self._known is None:
             if not results:
                 raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")

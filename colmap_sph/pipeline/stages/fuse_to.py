@@ -12,7 +12,7 @@ from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.pipeline.stages.view_maps import MapSources
 from colmap_sph.project.cloud_files import join_parts
 from colmap_sph.project.cloud_output import CloudOutput
-from colmap_sph.project.files import real_path, scratch_folder
+from colmap_sph.project.files import real_path
 from colmap_sph.project.state.records import begin
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Region
@@ -62,12 +62,13 @@ class FuseToStage(PartsStage):
     def opened(self) -> Iterator[None]:
         """The parts of the cloud are there until this ends."""
         warn_of_masks(self.context)
-        with scratch_folder(self._scratch):
+        with self.in_scratch():
             yield
 
     def close(self, results: Mapping[str, Result]) -> None:
         """Join the parts to the cloud."""
         context = self.context
+        results = self.in_order(results)
         if not results:
             raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
         points = sum(result.facts.points for result in results.values())

@@ -1,9 +1,11 @@
 """Maps of a view and of those that overlap it → its part of the cloud: what every way to make a cloud shares."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +18,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.cloud_files import write_part
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.images.reading import bytes_to_reduce
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.scene import Region
@@ -46,7 +49,8 @@ _maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 class FuseTask:
     """A view to fuse, those that overlap it, what to add to its points, and the path of its part less suffixes.
 
-    Of a `region`, in the scene's frame, only the points inside are made.
+    Of a `region`, in the scene's frame, only the points inside are made. `needed` says when the maps of the view and
+    of each partner are needed next, see `LoadCache.get`.
     """
 
     reference: MapSources
@@ -56,32 +60,37 @@ class FuseTask:
     offset: NDArray[np.float64]
     stem: Path
     region: Region | None = None
+    needed: tuple[float, ...] = ()
 
 
 def make_cloud_part(task: FuseTask) -> Facts:
     """Fuse a view; writes the points of the cloud which it sees better than any other."""
-    reference = _view_maps(task.reference)
+    needed = task.needed or (0.0,) * (1 + len(task.partners))
+    reference = _view_maps(task.reference, needed[0])
     if task.region is not None:
         inside = pixels_inside(reference.view, reference.depth, task.region)
         reference = replace(reference, depth=np.where(inside, reference.depth, np.float32(0)))
     unread: dict[str, str] = {}
-    partners = _partner_maps(task.partners, unread)
+    partners = _partner_maps(task.partners, needed[1:], unread)
     bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
     return Facts(points=write_part(task.stem, bands), unread=unread)
 
 
-def _view_maps(sources: MapSources) -> ViewMaps:
+def _view_maps(sources: MapSources, needed: float) -> ViewMaps:
     files = (sources.depth, sources.normals, sources.image, sources.mask)
     stamps = [file_stamp(file) for file in files if file is not None]
     size = (sources.view.width, sources.view.height)
-    return _maps.get(f"{sources.index} {size} {stamps}", lambda: read_view_maps(sources))
+    return _maps.get(f"{sources.index} {size} {stamps}", lambda: read_view_maps(sources), needed)
 
 
-def _partner_maps(partners: Sequence[MapSources], unread: dict[str, str]) -> Iterator[ViewMaps | None]:
+def _partner_maps(
+    partners: Sequence[MapSources], needed: Sequence[float], unread: dict[str, str]
+) -> Iterator[ViewMaps | None]:
     """Maps of the partners; None for one whose maps cannot be read, and the reason in `unread`."""
-    for sources in partners:
+    for sources, when in zip(partners, needed, strict=True):
+        maps: ViewMaps | None
         try:
-            maps = _view_maps(sources)
+            maps = _view_maps(sources, when)
         except InputError as error:
             unread[sources.view.name] = str(error)
             maps = None
@@ -94,15 +103,24 @@ def seconds_per_megapixel(partners: int) -> float:
 
 
 class PartsStage(Stage[str, FuseTask]):
-    """Fuses the maps of every image, by its name, into its part of a cloud."""
+    """Fuses the maps of every image into its part of a cloud.
+
+    Parameters
+    ----------
+    context : Context
+    names : sequence of str
+        Of the images, in the order in which their parts are joined.
+    """
 
     name = "fuse"
     make = staticmethod(make_cloud_part)
     region: Region | None = None
     """Where points are wanted, see `FuseTask`."""
 
-    def __init__(self, context: "Context", items: Sequence[str]) -> None:
-        super().__init__(context, items)
+    def __init__(self, context: "Context", names: Sequence[str]) -> None:
+        super().__init__(context, context.order.sorted(names))
+        self._names = names
+        self._is_open = False
         self._scratch = context.workspace.fusion_scratch_dir
         self._key = ""
 
@@ -110,6 +128,17 @@ class PartsStage(Stage[str, FuseTask]):
     @abstractmethod
     def partners(self) -> Partners:
         """Of each image."""
+
+    @cached_property
+    def needed(self) -> dict[str, tuple[float, ...]]:
+        """When the maps of each image and of its partners are needed next, as numbers of items."""
+        needed = {}
+        next_of: dict[str, float] = {}
+        for number, item in reversed(list(enumerate(self.items))):
+            names = [item, *self.partners[item][0]]
+            needed[item] = tuple(next_of.get(name, math.inf) for name in names)
+            next_of |= dict.fromkeys(names, float(number))
+        return needed
 
     @property
     @abstractmethod
@@ -132,14 +161,26 @@ class PartsStage(Stage[str, FuseTask]):
             scene.anchor,
             self._stem(item),
             self.region,
+            self.needed[item] if self._is_open else (),
         )
         return Job(self._key, None, cost, task)
 
     def _stem(self, name: str) -> Path:
         return self._scratch / f"{self.context.scene.view(name).image_id}"
 
+    def in_order(self, results: Mapping[str, Result]) -> dict[str, Result]:
+        """Results in the order in which they are joined, and not in which they were made."""
+        return {name: results[name] for name in self._names if name in results}
+
     def _stems(self, results: Mapping[str, Result]) -> list[Path]:
         return [self._stem(name) for name in results]
+
+    @contextmanager
+    def in_scratch(self) -> Iterator[None]:
+        """Parts are made in a folder that is there until this ends."""
+        self._is_open = bool(self.needed)  # found once, and not by every worker at a time
+        with scratch_folder(self._scratch):
+            yield
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """See `Stage.kept_memory`."""

@@ -22,7 +22,7 @@ from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
-from colmap_sph.project.state.ownership import remove_array_files
+from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs
 from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.census import RectifiedImage
@@ -264,8 +264,10 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
     @contextmanager
     def opened(self) -> Iterator[None]:
         """See `Stage.opened`."""
-        make_dir(self.context.workspace.pairs_dir)
+        for folder in sorted({self.context.pair_path(*pair).parent for pair in self.items}):
+            make_dir(folder)
         remove_array_files(self.context.workspace, OLD_SUFFIX)
+        remove_flat_pairs(self.context.workspace)
         yield
 
     @contextmanager

@@ -135,7 +135,7 @@ class VoteStage(RememberingStage[str, VoteTask]):
     make = staticmethod(make_photometric_maps)
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result]) -> None:
-        super().__init__(context, [view.name for view in context.scene.views])
+        super().__init__(context, context.order.sorted(context.scene.index_of))
         self._pair_keys = keys_of(matched)
         self._residuals = residuals_of(matched)
         self._partners = partners_of(matched)

@@ -178,6 +178,13 @@ def remove_array_files(workspace: Workspace, *suffixes: str) -> None:
             remove(path)
 
 
+def remove_flat_pairs(workspace: Workspace) -> None:
+    """Remove disparity maps of an earlier version, which had all of them in one folder."""
+    for path in sorted(workspace.pairs_dir.glob(f"*{SUFFIX}")):
+        if is_array_file(path):
+            remove(path)
+
+
 def remove_recorded(workspace: Workspace) -> list[Path]:
     """Remove maps, cloud and intermediate results of ours, and their records.
 
@@ -194,6 +201,7 @@ def remove_recorded(workspace: Workspace) -> list[Path]:
     altered = _remove(recorded_places(workspace))
     remove_array_files(workspace, SUFFIX, OLD_SUFFIX)
     remove_local_workspace(workspace)
+    remove(workspace.known_dir)
     remove_empty_folders(workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir)
     return altered
 
