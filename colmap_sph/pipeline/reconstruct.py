@@ -259,9 +259,7 @@ def reconstruct(
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
             key = context.keys.stage("selection", context.scene_key)
-            selection = choose_pairs(
-                workspace, scene, options, database, pair_list, scene_key=key, keep=True
-            )
+            selection = choose_pairs(workspace, scene, options, database, pair_list, scene_key=key, keep=True)
             report.pair_source = selection.source
             progress.advance()
         context = replace(context, scene=wanted_scene(scene, selection))

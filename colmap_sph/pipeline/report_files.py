@@ -68,7 +68,7 @@ def _content(context: Context) -> dict[str, Any]:
 
 
 def keep_or_make_page(context: Context) -> None:
-    """Make the page of a run that is done, unless it made nothing, and its page would say what is there already."""
+    """Make the page of a run that is done, unless nothing was made and the page that is there says the same."""
     workspace = context.workspace
     key = _page_key(context)
     path = workspace.known_dir / "page.json"

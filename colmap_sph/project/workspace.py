@@ -58,6 +58,11 @@ class Workspace:
         return self.root / "fused.ply.vis"
 
     @property
+    def tiles_dir(self) -> Path:
+        """The cloud, where it is in tiles."""
+        return self.root / "fused_tiles"
+
+    @property
     def cloud_paths(self) -> tuple[Path, Path]:
         """The two files of the cloud."""
         return self.fused_path, self.visibility_path
@@ -146,6 +151,11 @@ class Workspace:
     def cloud_record_path(self) -> Path:
         """Record that vouches for the cloud; its name is none of an image's."""
         return self.state_dir / "cloud.json"
+
+    @property
+    def tiles_record_path(self) -> Path:
+        """Record that vouches for the index of a cloud in tiles."""
+        return self.state_dir / "tiles.json"
 
     @property
     def fusion_cfg_record_path(self) -> Path:

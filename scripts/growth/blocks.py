@@ -96,7 +96,7 @@ def _observed(
     found = []
     for down in range(-_REACH, _REACH + 1):
         for right in range(-_REACH, _REACH + 1):
-            column, strip = (nearest + [right, down]).T
+            column, strip = (nearest + np.array([right, down])).T
             there = (column >= 0) & (strip >= 0) & (column < index_at.shape[1]) & (strip < index_at.shape[0])
             rows = np.flatnonzero(there)
             image = index_at[strip[rows], column[rows]]
@@ -130,13 +130,9 @@ def _write_images(block: Block, folder: Path) -> None:
     right = (columns - WIDTH / 2) * _ALTITUDE / _FOCAL * scale
     down = (rows - HEIGHT / 2) * _ALTITUDE / _FOCAL * scale
     for index, centre in enumerate(block.centres):
-        at = [right + scale * centre[0], down - scale * centre[1]]
-        crop = cv2.remap(
-            texture,
-            *(np.mod(each, _TEXTURE_SIDE).astype(np.float32) for each in at),
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_WRAP,
-        )
+        x = np.mod(right + scale * centre[0], _TEXTURE_SIDE).astype(np.float32)
+        y = np.mod(down - scale * centre[1], _TEXTURE_SIDE).astype(np.float32)
+        crop = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
         cv2.imwrite(str(folder / block.name(index)), crop, [cv2.IMWRITE_JPEG_QUALITY, 95])
 
 
@@ -187,9 +183,7 @@ def _write_points(block: Block, path: Path) -> None:
     order = np.argsort(block.point, kind="stable")
     elements = elements[order]
     start = np.searchsorted(block.point[order], np.arange(len(block.points) + 1))
-    head = np.dtype(
-        [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
-    )
+    head = np.dtype([("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")])
     heads = np.zeros(len(block.points), head)
     heads["id"] = np.arange(len(block.points)) + 1
     heads["xyz"] = block.points

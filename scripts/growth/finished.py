@@ -1,7 +1,7 @@
 """A dense workspace → the same with all results of a run in it, none of which was worked out.
 
-All stages run as they are, with their keys and files; but disparity maps are empty and depth maps flat. A run finds
-everything there and up to date, in a workspace that took minutes to make and not hours.
+All stages run as they are, with their keys and files; but disparity maps are empty and depth maps flat. A run
+finds everything there and up to date, in a workspace that took minutes to make and not hours.
 
     python -m growth.finished WORKSPACE
 """

@@ -9,7 +9,7 @@ import xxhash
 
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.state.records import read_json
-from colmap_sph.stereo.partners.pairs import Partner, PairSelection, PairSource
+from colmap_sph.stereo.partners.pairs import PairSelection, PairSource, Partner
 
 _MAX_BYTES = 1 << 31
 

@@ -41,6 +41,7 @@ from colmap_sph.project.cloud_files import (
     link_workspace,
     move_cloud_into_place,
 )
+from colmap_sph.project.cloud_tiles import Part, publish_tiles, write_tiles
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace, mask_path
@@ -118,6 +119,7 @@ class FuseStage(PartsStage):
 
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
         super().__init__(context, list(maps))
+        self.with_visibility = context.options.fusion.visibility
         self._pair_keys = pair_keys
         self._key = _key_of_cloud(context, pair_keys, maps)
         self._known = known_cloud(context, self._key)
@@ -164,9 +166,10 @@ class FuseStage(PartsStage):
             if not results:
                 raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
             points = sum(result.facts.points for result in results.values())
-            self._put_together(self._stems(results), points)
+            tiles = self._put_together(results, points)
             facts = facts_of_cloud(context, list(results), points, self._partners_among(results))
-            self._known = replace(facts, of_images=tuple(result.facts.points for result in results.values()))
+            of_images = tuple(result.facts.points for result in results.values())
+            self._known = replace(facts, of_images=of_images, tiles=tiles)
             is_complete = not self._report_unread(results) and len(results) == len(self.items)
             vouch_for_cloud(context, self._key, self._known, list(results), is_complete=is_complete)
         report_cloud(context, self._known, list(results))
@@ -181,20 +184,38 @@ class FuseStage(PartsStage):
             among[name] = ([other for other, _ in kept], [number for _, number in kept])
         return among
 
-    def _put_together(self, stems: list[Path], points: int) -> None:
-        """Make the cloud of its parts, and move it to its place."""
+    def _put_together(self, results: Mapping[str, Result], points: int) -> int:
+        """Make the cloud of its parts, and move it to its place; return the number of its tiles, 0: one file."""
         workspace = self.context.workspace
-        origin = self.context.scene.origin
+        most = self.context.options.fusion.max_points_per_file
         try:
-            join_parts(stems, self._scratch, points)
-            if origin.any():
-                link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
-            begin_cloud(self.context)  # not before: it may take hours, in which the one that is there is whole
-            move_cloud_into_place(self._scratch, workspace, origin)
+            if 0 < most < points:
+                return self._put_together_tiles(results, most)
+            self._put_together_file(self._stems(results), points)
         except (OSError, RuntimeError) as error:
             raise OutputError(
                 f"{workspace.fused_path} cannot be written ({reason_of(error)}); check space and permissions."
             ) from error
+        return 0
+
+    def _put_together_file(self, stems: list[Path], points: int) -> None:
+        workspace = self.context.workspace
+        origin = self.context.scene.origin
+        join_parts(stems, self._scratch, points, with_visibility=self.context.options.fusion.visibility)
+        if origin.any():
+            link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
+        begin_cloud(self.context)  # not before: it may take hours, in which the one that is there is whole
+        move_cloud_into_place(self._scratch, workspace, origin)
+
+    def _put_together_tiles(self, results: Mapping[str, Result], most: int) -> int:
+        context = self.context
+        made = self._scratch / "tiles"
+        in_place = context.order.sorted(results)  # so that tiles are of neighbouring images
+        parts = [Part(self._stem(name), results[name].facts.points) for name in in_place]
+        with_visibility = context.options.fusion.visibility
+        index = write_tiles(parts, made, most, context.scene.origin, with_visibility=with_visibility)
+        publish_tiles(made, context.workspace)
+        return len(index.tiles)
 
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
         """One cloud."""

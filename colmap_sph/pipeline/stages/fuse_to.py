@@ -12,6 +12,7 @@ from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.pipeline.stages.view_maps import MapSources
 from colmap_sph.project.cloud_files import join_parts
 from colmap_sph.project.cloud_output import CloudOutput
+from colmap_sph.project.cloud_tiles import retire_tiles
 from colmap_sph.project.files import real_path
 from colmap_sph.project.state.records import begin
 from colmap_sph.project.workspace import Workspace
@@ -93,5 +94,6 @@ class FuseToStage(PartsStage):
             begin(context.cloud_place.record, context.cloud_place.files)
             for path in context.cloud_place.files[2:]:
                 Path(path).unlink(missing_ok=True)
+            retire_tiles(context.workspace)
         made = Workspace(self._scratch)
         self._output.write(made, context.workspace.sparse_dir, context.scene.origin)

@@ -41,9 +41,7 @@ class PartnersInFusion(Mapping[str, tuple[list[str], list[int]]]):
     def __getitem__(self, name: str) -> tuple[list[str], list[int]]:
         if name not in self._found:
             overlapping = self._overlap.of(name, _CANDIDATES * self._most)
-            others = [
-                o for o in dict.fromkeys([*overlapping, *self._matched.get(name, [])]) if o in self._names
-            ]
+            others = [o for o in dict.fromkeys([*overlapping, *self._matched.get(name, [])]) if o in self._names]
             self._found[name] = _some_of_each_station(self._stations, name, others, self._most)
         return self._found[name]
 

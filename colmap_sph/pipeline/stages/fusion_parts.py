@@ -49,8 +49,8 @@ _maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 class FuseTask:
     """A view to fuse, those that overlap it, what to add to its points, and the path of its part less suffixes.
 
-    Of a `region`, in the scene's frame, only the points inside are made. `needed` says when the maps of the view and
-    of each partner are needed next, see `LoadCache.get`.
+    Of a `region`, in the scene's frame, only the points inside are made. `needed` says when the maps of the view
+    and of each partner are needed next, see `LoadCache.get`.
     """
 
     reference: MapSources
@@ -61,6 +61,7 @@ class FuseTask:
     stem: Path
     region: Region | None = None
     needed: tuple[float, ...] = ()
+    with_visibility: bool = True
 
 
 def make_cloud_part(task: FuseTask) -> Facts:
@@ -73,7 +74,8 @@ def make_cloud_part(task: FuseTask) -> Facts:
     unread: dict[str, str] = {}
     partners = _partner_maps(task.partners, needed[1:], unread)
     bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
-    return Facts(points=write_part(task.stem, bands), unread=unread)
+    points = write_part(task.stem, bands, with_visibility=task.with_visibility)
+    return Facts(points=points, unread=unread)
 
 
 def _view_maps(sources: MapSources, needed: float) -> ViewMaps:
@@ -116,6 +118,9 @@ class PartsStage(Stage[str, FuseTask]):
     make = staticmethod(make_cloud_part)
     region: Region | None = None
     """Where points are wanted, see `FuseTask`."""
+
+    with_visibility = True
+    """Whether it shall be known which images see each point."""
 
     def __init__(self, context: "Context", names: Sequence[str]) -> None:
         super().__init__(context, context.order.sorted(names))
@@ -162,6 +167,7 @@ class PartsStage(Stage[str, FuseTask]):
             self._stem(item),
             self.region,
             self.needed[item] if self._is_open else (),
+            self.with_visibility,
         )
         return Job(self._key, None, cost, task)
 

@@ -1,4 +1,4 @@
-"""Observations and points of a binary model as arrays: COLMAP's library gives them one by one, at a microsecond each.
+"""Observations and points of a binary model as arrays; COLMAP's library gives them one by one, in microseconds.
 
 The files must have been read by `read_binary_model` before, which refuses what is damaged.
 """

@@ -122,9 +122,7 @@ class Covisibility:
         return entry[place >= 0], place[place >= 0]
 
 
-def _percentiles(
-    values: NDArray[np.float64], group: NDArray[np.int64], groups: int
-) -> NDArray[np.float64]:
+def _percentiles(values: NDArray[np.float64], group: NDArray[np.int64], groups: int) -> NDArray[np.float64]:
     """The percentile of the values of each group, which lie together, as NumPy has it; NaN of an empty one."""
     values = values[np.lexsort((values, group))]
     counts = np.bincount(group, minlength=groups)
