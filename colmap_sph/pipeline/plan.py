@@ -1,8 +1,9 @@
 """What a run would do and need, found without writing anything: ``colmap_sph run --dry-run``.
 
 The same stages are asked that a run executes. Which pairs and images are to do is exact, but for pairs that fail
-while they are matched. Time, memory and disk are sums of what the jobs say that they cost; the constants stand in
-the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
+while they are matched, and, of more than a thousand of which nothing is there, for those that cannot be done: some
+of these are asked, and stand for all. Time, memory and disk are sums of what the jobs say that they cost; the
+constants stand in the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
 """
 
 import logging

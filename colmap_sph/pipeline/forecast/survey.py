@@ -26,6 +26,9 @@ from colmap_sph.stereo.partners.pairs import PairSelection
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
 
+# Of the items of a stage that are to be made, so many or somewhat fewer are asked what that takes.
+_ASKED = 1000
+_TO_MAKE = Result("", made=True, facts=Facts(coverage=1.0))
 # Bytes that the interpreter and the libraries have in use.
 _BASE_MEMORY = 200e6
 
@@ -75,11 +78,20 @@ class Survey:
         return sum(stage.seconds for stage in self.stages) / self.workers
 
     def __call__(self, stage: Stage[Item, Task], /) -> dict[Item, Result]:
-        """Foresee the result of each item; all images that are to do are taken to get some depth."""
+        """Foresee the result of each item; all images that are to do are taken to get some depth.
+
+        Of items whose results are not there, an even part is asked, where they are very many; the others are
+        taken to be like these.
+        """
         self.workers = min(stage.context.options.num_threads, num_cores())
-        results: dict[Item, Result] = {}
-        costs: list[Cost] = []
+        missing = [item for item in stage.items if stage.is_missing(item)]
+        asked = set(missing[:: -(-len(missing) // _ASKED) or 1])
+        results: dict[Item, Result] = {item: _TO_MAKE for item in missing if item not in asked}
+        scale = len(missing) / max(len(asked), 1)
+        costs: list[tuple[Cost, float]] = []
         for item in stage.items:
+            if item in results:
+                continue
             try:
                 job = stage.job(item)
             except ColmapSphError as error:
@@ -88,8 +100,9 @@ class Survey:
             if job.done is not None:
                 results[item] = Result(job.key, made=False, facts=job.done)
             else:
-                results[item] = Result(job.key, made=True, facts=Facts(coverage=1.0))
-                costs.append(job.cost)
+                results[item] = Result(job.key, made=True, facts=_TO_MAKE.facts)
+                costs.append((job.cost, scale if item in asked else 1.0))
+        results = {item: results[item] for item in stage.items if item in results}
         stage.tell_problems()
         made, there = stage.count(results)
         self.stages.append(
@@ -97,9 +110,9 @@ class Survey:
                 stage.name,
                 made + there,
                 there,
-                sum(cost.seconds for cost in costs),
-                _memory_of(stage, costs),
-                sum(cost.disk for cost in costs),
+                sum(cost.seconds * times for cost, times in costs),
+                _memory_of(stage, [cost for cost, _ in costs]),
+                sum(cost.disk * times for cost, times in costs),
             )
         )
         return results
@@ -176,6 +189,7 @@ def foresee(
         Context(dense, scene, options, keys, report=report).in_region(), survey, to_come=to_come
     )
     there = None if foreseen is not None else dense
-    selection = choose_pairs(there, context.scene, context.options, project.database())
+    key = context.keys.stage("selection", context.scene_key)
+    selection = choose_pairs(there, context.scene, context.options, project.database(), scene_key=key)
     context = replace(context, scene=wanted_scene(context.scene, selection))
     return Foreseen(context, selection, given, frozenset(to_make))
