@@ -71,7 +71,7 @@ def keep_or_make_page(context: Context) -> None:
     """Make the page of a run that is done, unless nothing was made and the page that is there says the same."""
     workspace = context.workspace
     key = _page_key(context)
-    path = workspace.known_dir / "page.json"
+    path = workspace.known_path("page")
     if not any(context.report.made.values()):
         known = read_json(path, _KnownPage)
         if known is not None and known == _KnownPage(key, stamp_of_files([str(workspace.page_path)])):

@@ -4,12 +4,13 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Literal, get_args
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.files import make_dir
 
 MapKind = Literal["photometric", "geometric"]
+Known = Literal["selection", "pairs", "photometric", "geometric", "page"]
 
 # Folders are made one inside the other, and a path has an end.
 _MAX_FOLDERS = 200
@@ -131,6 +132,15 @@ class Workspace:
     def known_dir(self) -> Path:
         """What is known of results, so that it need not be found out again."""
         return self.state_dir / "known"
+
+    def known_path(self, of: Known) -> Path:
+        """What is known of results of a kind, of the pairs that were chosen, or of the page."""
+        return self.known_dir / f"{of}.json"
+
+    @property
+    def known_paths(self) -> list[Path]:
+        """All of these; need not exist."""
+        return [self.known_path(of) for of in get_args(Known)]
 
     @cached_property
     def pairs_dir(self) -> Path:

@@ -4,6 +4,7 @@ Their images are crops of one texture, so that they can be matched; poses, point
 are in the order of the flight, there and back, as cameras number them.
 """
 
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -193,3 +194,8 @@ def _write_points(block: Block, path: Path) -> None:
         file.write(np.uint64(len(block.points)).tobytes())
         for index in range(len(block.points)):
             file.write(heads[index].tobytes() + elements[start[index] : start[index + 1]].tobytes())
+
+
+if __name__ == "__main__":
+    _, _target, _images, _observations = sys.argv
+    write_workspace(make_block(int(_images), int(_observations)), Path(_target))

@@ -4,12 +4,12 @@ import os
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from colmap_sph.pipeline.known.table import Known, ResultTable, stamp_of_files
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Item, Job, Result, Stage, Task
+from colmap_sph.project.workspace import Known as WhatIsKnown
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -20,8 +20,8 @@ _NO_COST = Cost(0.0, 0.0, 0.0)
 class RememberingStage(Stage[Item, Task]):
     """A stage whose `job` looks up what is known, and asks only for the rest."""
 
-    remembered_as: ClassVar[str] = ""
-    """Name of the file in which its results are remembered; empty where they are not."""
+    remembered_as: ClassVar[WhatIsKnown | None] = None
+    """Of what it remembers results, see `Workspace.known_path`; None: it does not."""
 
     def __init__(self, context: "Context", items: Sequence[Item]) -> None:
         super().__init__(context, items)
@@ -45,10 +45,9 @@ class RememberingStage(Stage[Item, Task]):
 
     @cached_property
     def _table(self) -> ResultTable | None:
-        if not self.remembered_as or self.context.keys.fresh:
+        if self.remembered_as is None or self.context.keys.fresh:
             return None
-        folder: Path = self.context.workspace.known_dir
-        return ResultTable(folder / f"{self.remembered_as}.json", self.input_key())
+        return ResultTable(self.context.workspace.known_path(self.remembered_as), self.input_key())
 
     def job(self, item: Item) -> Job[Task]:
         """See `Stage.job`."""

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
 from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs
+from colmap_sph.project.workspace import Known
 from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.census import RectifiedImage
@@ -158,7 +159,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
     """Matches pairs of image names."""
 
     name = "match pairs"
-    remembered_as = "pairs"
+    remembered_as: ClassVar[Known | None] = "pairs"
     make = staticmethod(make_disparity_map)
 
     def __init__(self, context: "Context", pairs: Sequence[Pair]) -> None:

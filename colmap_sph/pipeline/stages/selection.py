@@ -47,7 +47,7 @@ def choose_pairs(
     among = scene.index_of if options.region else None  # images elsewhere are named in vain
     written = None if pair_list is None else read_patch_match_cfg(pair_list, among)
     matches = None if database is None or scene.has_tracks else read_verified_matches(database)
-    path = None if workspace is None or not scene_key else workspace.known_dir / "selection.json"
+    path = None if workspace is None or not scene_key else workspace.known_path("selection")
     key = "" if path is None else digest(scene_key, options.pairs, written, matches)
     known = None if path is None else read_selection(path, key)
     if known is not None:

@@ -210,8 +210,10 @@ def remove_recorded(workspace: Workspace) -> list[Path]:
     altered = _remove(recorded_places(workspace))
     remove_array_files(workspace, SUFFIX, OLD_SUFFIX)
     remove_local_workspace(workspace)
-    remove(workspace.known_dir)
-    remove_empty_folders(workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir)
+    for path in workspace.known_paths:
+        remove(path)
+    folders = (workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir, workspace.known_dir)
+    remove_empty_folders(*folders)
     return altered
 
 
