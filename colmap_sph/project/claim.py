@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from colmap_sph.errors import OutputError
-from colmap_sph.project.files import make_dir, remove_temporary_files
+from colmap_sph.project.files import make_dir, remove, remove_temporary_files
 from colmap_sph.project.workspace import Workspace
 
 
@@ -115,6 +115,8 @@ def _lock(descriptor: int, workspace: Workspace) -> None:
 
 
 def _remove_leftovers(workspace: Workspace) -> None:
+    # First: with it other machines that still work for a run that was killed lose the right to write here.
+    remove(workspace.token_path)
     shutil.rmtree(workspace.fusion_scratch_dir, ignore_errors=True)
     for folder in (workspace.stereo_dir, workspace.state_dir):
         remove_temporary_files(folder)

@@ -43,10 +43,9 @@ def write_part(stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.ui
         A file cannot be written.
     """
     count = 0
-    # One alone is an atomic file, whose temporary name is that of the thread.
     with (
         atomic_file(stem.with_suffix(".points"), sync=False) as cloud,
-        stem.with_suffix(".vis").open("wb") as visible,
+        atomic_file(stem.with_suffix(".vis"), sync=False) as visible,
     ):
         for points, visibility in bands:
             cloud.write(points.data)

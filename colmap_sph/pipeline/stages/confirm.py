@@ -1,7 +1,6 @@
 """Third stage: every image's depth is confirmed by its partners' and refined on their images: geometric maps."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -143,6 +142,12 @@ class ConfirmStage(Stage[str, ConfirmTask]):
 
     name = "confirm depth"
     make = staticmethod(make_geometric_maps)
+    caches = (_images, _estimates)
+
+    @staticmethod
+    def found(task: ConfirmTask) -> Facts | None:
+        """See `Stage.found`."""
+        return task.maps.facts(task.key)
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result], votes: Mapping[str, Result]) -> None:
         super().__init__(context, [view.name for view in context.scene.views if view.name in votes])
@@ -178,7 +183,7 @@ class ConfirmStage(Stage[str, ConfirmTask]):
             maps,
             key,
         )
-        return Job(key, maps.facts(key), self._cost(item), task)
+        return Job(key, self.found(task), self._cost(item), task)
 
     def _partners(self, name: str) -> list[str]:
         return [other for other in self._all_partners.get(name, []) if other in self._vote_keys]
@@ -211,12 +216,6 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         cache = int(min(_CACHE_BYTES, gate.spare(_ROOM * most) / 2))
         filled = (_IMAGE_BYTES + _ESTIMATE_BYTES) * sum(map(self._pixels, self.items))
         return Kept(cache=cache, caches=2, filled=filled)
-
-    @contextmanager
-    def holding(self, kept: Kept) -> Iterator[None]:
-        """See `Stage.holding`."""
-        with _images.holding(kept.cache), _estimates.holding(kept.cache):
-            yield
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""

@@ -1,7 +1,6 @@
 """Maps of a view and of those that overlap it → its part of the cloud: what every way to make a cloud shares."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -108,6 +107,7 @@ class PartsStage(Stage[str, FuseTask]):
 
     name = "fuse"
     make = staticmethod(make_cloud_part)
+    caches = (_maps,)
     region: Region | None = None
     """Where points are wanted, see `FuseTask`."""
 
@@ -155,12 +155,6 @@ class PartsStage(Stage[str, FuseTask]):
         filled = _MAPS_BYTES * sum(pixels)
         spare = gate.spare(2 * _FUSE_BYTES * max(pixels, default=0)) / 2
         return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
-
-    @contextmanager
-    def holding(self, kept: Kept) -> Iterator[None]:
-        """See `Stage.holding`."""
-        with _maps.holding(kept.cache):
-            yield
 
     def _report_unread(self, results: Mapping[str, Result]) -> bool:
         """Report images whose maps could not be read while others were fused; whether there are any."""

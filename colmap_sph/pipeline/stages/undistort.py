@@ -5,8 +5,8 @@ import os
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,14 @@ from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.cameras import plain_camera
-from colmap_sph.project.files import make_dir, remove, scratch_folder, set_aside, whole_digest
+from colmap_sph.project.files import (
+    make_dir,
+    process_name,
+    remove,
+    scratch_folder,
+    set_aside,
+    whole_digest,
+)
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
@@ -70,20 +77,24 @@ class UndistortTask:
 
 def make_undistorted_image(task: UndistortTask) -> Facts:
     """Undistort an image and its mask; writes both into the workspace."""
-    image = task.image
+    # A process that was lost may still be at work on the same image.
+    folder = task.image.folder / process_name()
+    image = replace(task.image, folder=folder, mask_folder=folder / "masks")
     make_dir(image.mask_folder)
     try:
         if image.is_colmaps:
-            _child(image.folder.parent).call(undistort, image, str(task.target))
+            _child(task.image.folder.parent).call(undistort, image, str(task.target))
         else:
             undistort(image)
-        _publish(task)
+        _publish(replace(task, image=image))
     except OSError as error:
         raise OutputError(
             f"{task.target} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
     finally:
-        shutil.rmtree(image.folder, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # another process has not ended there
+            task.image.folder.rmdir()
     return Facts()
 
 
@@ -124,6 +135,15 @@ def _child(folder: Path) -> ChildProcess:
     return child
 
 
+def end_child() -> None:
+    """End the process for COLMAP of the current thread."""
+    child: ChildProcess | None = getattr(_thread, "child", None)
+    if child is not None:
+        _children.remove(child)
+        child.close()
+        _thread.child = None
+
+
 class UndistortStage(Stage[str, UndistortTask]):
     """Undistorts images of a sparse model.
 
@@ -141,6 +161,7 @@ class UndistortStage(Stage[str, UndistortTask]):
 
     name = "undistort"
     make = staticmethod(make_undistorted_image)
+    end_thread = staticmethod(end_child)
 
     def __init__(
         self,
