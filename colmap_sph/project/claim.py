@@ -30,7 +30,7 @@ def claimed(workspace: Workspace) -> Iterator[None]:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         _lock(descriptor, workspace)
-        _remove_leftovers(workspace)
+        remove_leftovers(workspace)
         yield
     finally:
         os.close(descriptor)
@@ -114,7 +114,8 @@ def _lock(descriptor: int, workspace: Workspace) -> None:
         pass
 
 
-def _remove_leftovers(workspace: Workspace) -> None:
+def remove_leftovers(workspace: Workspace) -> None:
+    """Remove what processes that were killed left behind in a workspace that is held."""
     # First: with it other machines that still work for a run that was killed lose the right to write here.
     remove(workspace.token_path)
     shutil.rmtree(workspace.fusion_scratch_dir, ignore_errors=True)

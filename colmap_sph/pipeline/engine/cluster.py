@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Hashable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,6 +27,7 @@ from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import Kept, Result, Stage
+from colmap_sph.project.claim import remove_leftovers
 from colmap_sph.project.files import atomic_file, read_small, remove
 from colmap_sph.project.workspace import Workspace
 
@@ -64,6 +65,8 @@ def on_cluster(scheduler: str, workspace: Workspace) -> Iterator["Cluster"]:
         cluster = Cluster(client, run)
         try:
             yield cluster
+            if cluster.has_lost_workers():
+                remove_leftovers(workspace)
         finally:
             # First: without it workers begin nothing more.
             with suppress(OSError):
@@ -87,6 +90,7 @@ class Cluster:
         self._number = 0
         self._threads: dict[str, int] = {}
         self._looked = 0.0
+        self._is_one_lost = False
         self._is_announced = False
 
     def __call__(self, stage: Stage[Item, Task], /) -> dict[Item, Result]:
@@ -115,12 +119,18 @@ class Cluster:
         return sum(self._threads.values())
 
     def _look(self) -> None:
-        before = bool(self._threads)
+        before = self._threads
         with suppress(OSError):  # a scheduler that is gone is told of elsewhere
             self._threads = dict(self._client.nthreads())
+        self._is_one_lost |= not before.keys() <= self._threads.keys()
         if before and not self._threads:
             logger.warning("No worker is left; waiting for one to come back")
         self._looked = time.monotonic()
+
+    def has_lost_workers(self) -> bool:
+        """Whether a worker that was there is not any more."""
+        self._look()
+        return self._is_one_lost
 
     @property
     def neighbours(self) -> dict[str, int]:
@@ -251,6 +261,8 @@ class _Shift:
         self._kept = kept
         self._results: dict[Any, Result] = {}
         self._running: dict[object, _Running] = {}
+        self._suspects: list[Asked[Any, Any]] = []
+        self._culprit: LostWorkersError | None = None
         self._done: queue.Queue[distributed.Future] = queue.Queue()
         self._folders: set[Path] = set()
 
@@ -259,28 +271,32 @@ class _Shift:
         groups = Division(self._stage, self._tell).groups(lambda: self._cluster.threads)
         try:
             is_more = True
-            while is_more or self._running:
+            while is_more or self._running or self._suspects:
                 while is_more and len(self._running) < _WINDOW * max(self._cluster.threads, 1):
                     asked = next(groups, None)
                     is_more = asked is not None
                     if asked is not None:
                         self._submit(asked)
+                if not self._running and self._suspects:
+                    self._submit([self._suspects.pop()], is_alone=True)
                 if self._running:
                     self._take(self._cluster.next_done(self._done))
+            if self._culprit is not None:
+                raise self._culprit
         finally:
             groups.close()
             self._cluster.cancel([each.future for each in self._running.values()])
         look_again(self._folders)
         return {item: self._results[item] for item in self._stage.items if item in self._results}
 
-    def _submit(self, asked: list[Asked[Any, Any]]) -> None:
+    def _submit(self, asked: list[Asked[Any, Any]], *, is_alone: bool = False) -> None:
         pieces = []
         for each in asked:
             assert each.job is not None
             pieces.append(Piece(each.job.task, self._stage.label(each.item), each.job.cost.memory))
             self._folders |= folders_of(each.job.task)
         future = self._cluster.submit(self._stage, self._kept, pieces, self._done)
-        self._running[future.key] = _Running(future, asked)
+        self._running[future.key] = _Running(future, asked, is_alone)
 
     def _take(self, future: distributed.Future) -> None:
         """Take what became of a group."""
@@ -288,7 +304,7 @@ class _Shift:
         try:
             answer: Answer = future.result()
         except KilledWorker as error:
-            self._try_one_by_one(running.asked, error)
+            self._find_culprit(running, error)
             return
         except (distributed.client.FutureCancelledError, OSError) as error:
             raise scheduler_lost() from error
@@ -306,17 +322,24 @@ class _Shift:
             self._results[asked.item] = Result(asked.job.key, True, outcome.facts, seconds, outcome.taken)
             self._stage.context.progress.advance(seconds)
 
-    def _try_one_by_one(self, asked: list[Asked[Any, Any]], error: KilledWorker) -> None:
-        """Find the item at which workers die, or none where they died for other reasons."""
-        if len(asked) == 1:
-            raise LostWorkersError(
+    def _find_culprit(self, running: "_Running", error: KilledWorker) -> None:
+        """Find the item that workers die of: what else was with a worker when it died is suspected, too."""
+        if running.is_alone:
+            culprit = LostWorkersError(
                 f"{error.allowed_failures + 1} workers were lost while they made "
-                f"{self._stage.label(asked[0].item)}, perhaps for lack of memory; give each more of it "
+                f"{self._stage.label(running.asked[0].item)}, perhaps for lack of memory; give each more of it "
                 "(--memory-limit of Dask, or fewer workers on a machine), and run the same command to go on."
-            ) from error
-        logger.warning("Workers were lost again and again at the same %d items: made one by one", len(asked))
-        for each in asked:
-            self._submit([each])
+            )
+            if not self._suspects or self._culprit is not None:
+                raise culprit
+            self._culprit = culprit  # one may be an exception: all others are made before the run ends
+            return
+        logger.warning("Workers were lost again and again at the same %d items: tried again", len(running.asked))
+        if len(running.asked) == 1:
+            self._suspects += running.asked
+        else:
+            for each in running.asked:
+                self._submit([each])
 
     def _tell(self, asked: Asked[Any, Any]) -> None:
         """Take what need not be made, or cannot be."""
@@ -329,7 +352,8 @@ class _Shift:
 
 @dataclass(frozen=True, eq=False)
 class _Running:
-    """A group that is with the workers."""
+    """A group that is with the workers; alone, where nothing else is."""
 
     future: distributed.Future
-    asked: list[Asked[Any, Any]] = field(default_factory=list)
+    asked: list[Asked[Any, Any]]
+    is_alone: bool

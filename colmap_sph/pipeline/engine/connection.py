@@ -11,13 +11,15 @@ from pathlib import Path
 import distributed
 import msgspec
 
+import colmap_sph
 from colmap_sph.errors import InputError, OptionError, reason_of
 from colmap_sph.project.files import read_small
 
 logger = logging.getLogger(__name__)
 
-# Seconds: that a scheduler which has just been started is waited for.
-_START_SECONDS = 20.0
+START_SECONDS = 20.0
+"""That a scheduler which has just been started is waited for."""
+
 _FILE_BYTES = 1 << 20
 _ADDRESS = re.compile(r"(?:[a-z]+://)?[^/\s]+:\d{1,5}")
 
@@ -39,7 +41,7 @@ def is_address(text: str) -> bool:
     return "://" in text or (_ADDRESS.fullmatch(text) is not None and not Path(text).exists())
 
 
-def address_of(text: str, seconds: float = _START_SECONDS) -> str:
+def address_of(text: str, seconds: float) -> str:
     """Address of the scheduler; a file that is not there yet is waited for.
 
     Raises
@@ -69,7 +71,7 @@ def address_of(text: str, seconds: float = _START_SECONDS) -> str:
 
 
 @contextmanager
-def connected(text: str, seconds: float = _START_SECONDS) -> Iterator[distributed.Client]:
+def connected(text: str) -> Iterator[distributed.Client]:
     """A client of the scheduler that --scheduler names.
 
     Raises
@@ -79,10 +81,10 @@ def connected(text: str, seconds: float = _START_SECONDS) -> Iterator[distribute
     InputError
         It is in an environment without this program.
     """
-    address = address_of(text, seconds)
+    address = address_of(text, START_SECONDS)
     _quieten()
     try:
-        client = distributed.Client(address, timeout=seconds, set_as_default=False, name="colmap_sph")
+        client = distributed.Client(address, timeout=START_SECONDS, set_as_default=False, name="colmap_sph")
     except (OSError, ValueError, TypeError) as error:
         raise OptionError(
             f"scheduler: no Dask scheduler answers at {address} ({reason_of(error)}); start it first.", "scheduler"
@@ -100,9 +102,9 @@ def _check_scheduler(client: distributed.Client, address: str) -> None:
         version = client.run_on_scheduler(metadata.version, "colmap_sph")
     except metadata.PackageNotFoundError:
         version = "none"
-    if version != metadata.version("colmap_sph"):
+    if version != colmap_sph.__version__:
         raise InputError(
-            f"The scheduler at {address} runs with colmap_sph {version}, not {metadata.version('colmap_sph')}; "
+            f"The scheduler at {address} runs with colmap_sph {version}, not {colmap_sph.__version__}; "
             "start it and its workers from the same installation as this program."
         )
 
