@@ -66,6 +66,8 @@ class UndistortTask:
         The undistorted image in the workspace, and its mask.
     record : Path
     key : str
+    is_doubted : bool
+        Whether what is there does not count, though its record vouches for it.
     """
 
     image: ImageToUndistort
@@ -73,6 +75,12 @@ class UndistortTask:
     mask_target: Path
     record: Path
     key: str
+    is_doubted: bool = False
+
+    @property
+    def files(self) -> list[Path]:
+        """What will be there."""
+        return [self.target] if self.image.mask is None else [self.target, self.mask_target]
 
 
 def make_undistorted_image(task: UndistortTask) -> Facts:
@@ -163,6 +171,11 @@ class UndistortStage(Stage[str, UndistortTask]):
     make = staticmethod(make_undistorted_image)
     end_thread = staticmethod(end_child)
 
+    @staticmethod
+    def found(task: UndistortTask) -> Facts | None:
+        """See `Stage.found`."""
+        return None if task.is_doubted else vouched_facts(task.record, task.key, task.files, Facts)
+
     def __init__(
         self,
         context: "Context",
@@ -198,15 +211,15 @@ class UndistortStage(Stage[str, UndistortTask]):
         key = context.keys.undistorted(self._digests[item], camera_parts, values, mask)
         target = workspace.image_path(item)
         record = undistorted_place(workspace, item).record
-        files = [target] if mask is None else [target, workspace.made_mask_path(item)]
         task = UndistortTask(
             image,
             target,
             workspace.made_mask_path(item),
             record,
             key,
+            self._verify,
         )
-        known = self._is_as_made(task, files) or self._is_changed_by_user(task, files)
+        known = self._is_as_made(task) or self._is_changed_by_user(task)
         pixels = camera.width * camera.height
         memory = (_BYTES if values is None else _DEEP_BYTES) * pixels
         if image.is_colmaps:
@@ -214,13 +227,14 @@ class UndistortStage(Stage[str, UndistortTask]):
         cost = Cost(_SECONDS * pixels, memory, _FILE_BYTES * pixels)
         return Job(key, Facts() if known else None, cost, task)
 
-    def _is_as_made(self, task: UndistortTask, files: list[Path]) -> bool:
+    def _is_as_made(self, task: UndistortTask) -> bool:
         """Whether image and mask are there as they were made; with `verify` every byte of them is looked at."""
+        files = task.files
         if vouched_facts(task.record, task.key, files, Facts) is None:
             return False
         return not self._verify or whole_digests(task.record, len(files)) == tuple(map(whole_digest, files))
 
-    def _is_changed_by_user(self, task: UndistortTask, files: list[Path]) -> bool:
+    def _is_changed_by_user(self, task: UndistortTask) -> bool:
         """Whether an image was made and then exchanged for another good one, or its mask was: they are used.
 
         Not with `verify`: bit rot may look like that, too.
@@ -229,7 +243,7 @@ class UndistortStage(Stage[str, UndistortTask]):
             return False
         record = read_record(task.record)
         is_made = record is not None and (record.key, record.state) == (task.key, "done")
-        if not is_made or not all(path.is_file() for path in files):
+        if not is_made or not all(path.is_file() for path in task.files):
             return False
         camera = task.image.undistorted_camera
         if image_problem(task.target, camera.width, camera.height) is not None:
