@@ -36,8 +36,9 @@ logger = logging.getLogger(__name__)
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
 
-# Groups that are with the workers, for each of their threads: one that is made, and one that waits.
-_WINDOW = 2
+# Groups that wait while others are made: for so many threads one, and no fewer than these.
+_WAITING_SHARE = 4
+_LEAST_WAITING = 2
 # Seconds after which to look whether workers have come or gone.
 _LOOK_SECONDS = 2.0
 _TOKEN_BYTES = 1000
@@ -272,7 +273,7 @@ class _Shift:
         try:
             is_more = True
             while is_more or self._running or self._suspects:
-                while is_more and len(self._running) < _WINDOW * max(self._cluster.threads, 1):
+                while is_more and len(self._running) < self._window():
                     asked = next(groups, None)
                     is_more = asked is not None
                     if asked is not None:
@@ -288,6 +289,11 @@ class _Shift:
             self._cluster.cancel([each.future for each in self._running.values()])
         look_again(self._folders)
         return {item: self._results[item] for item in self._stage.items if item in self._results}
+
+    def _window(self) -> int:
+        """How many groups may be with the workers."""
+        threads = self._cluster.threads
+        return threads + max(threads // _WAITING_SHARE, _LEAST_WAITING)
 
     def _submit(self, asked: list[Asked[Any, Any]], *, is_alone: bool = False) -> None:
         pieces = []
