@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import distributed
 from distributed.scheduler import KilledWorker
 
-from colmap_sph.errors import InputError, LostWorkersError
+from colmap_sph.errors import InputError, LostWorkersError, reason_of
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.engine import entry
 from colmap_sph.pipeline.engine.connection import connected, dashboard_of
@@ -194,8 +194,8 @@ class Cluster:
                 facts[address] = answer
             elif not isinstance(answer, OSError):
                 raise InputError(
-                    f"The worker at {address} cannot run this program ({type(answer).__name__}: {answer}); "
-                    "start it from the same installation."
+                    f"The worker at {address} cannot run this program ({reason_of(answer)}); start it from the "
+                    "same installation."
                 )
         return facts
 

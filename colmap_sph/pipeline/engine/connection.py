@@ -3,6 +3,7 @@
 import logging
 import re
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import metadata
@@ -84,7 +85,8 @@ def connected(text: str) -> Iterator[distributed.Client]:
     address = address_of(text, START_SECONDS)
     _quieten()
     try:
-        client = distributed.Client(address, timeout=START_SECONDS, set_as_default=False, name="colmap_sph")
+        with warnings.catch_warnings(action="ignore"):  # of versions that differ: our own check tells which matter
+            client = distributed.Client(address, timeout=START_SECONDS, set_as_default=False, name="colmap_sph")
     except (OSError, ValueError, TypeError) as error:
         raise OptionError(
             f"scheduler: no Dask scheduler answers at {address} ({reason_of(error)}); start it first.", "scheduler"
