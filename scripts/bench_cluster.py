@@ -175,7 +175,7 @@ def main() -> int:
     if model is None:
         root = bench.output / "block"
         shutil.rmtree(root, ignore_errors=True)
-        model = make_demo_block(root, BlockOptions(), threads=0).sparse_dir
+        model = make_demo_block(root, BlockOptions(), threads=len(os.sched_getaffinity(0))).sparse_dir
     places = {name: bench.output / name for name in ("one", "cluster", "workers-killed", "driver-killed")}
     for place in places.values():
         shutil.rmtree(place, ignore_errors=True)
