@@ -226,12 +226,12 @@ def counted(monkeypatch):
     """Largest number of images in work at a time."""
     original, lock, counts = parts_module.write_part, threading.Lock(), [0, 0]
 
-    def write(stem, bands):
+    def write(stem, bands, **given):
         with lock:
             counts[0] += 1
             counts[1] = max(counts)
         try:
-            return original(stem, bands)
+            return original(stem, bands, **given)
         finally:
             with lock:
                 counts[0] -= 1

@@ -143,7 +143,7 @@ def test_stages_of_file_operations(scripts_on_path: None) -> None:
 @pytest.mark.parametrize(
     ("moment", "number", "code"),
     [
-        ("colmap_sph/pairs/*.sph", *STOPS[0]),
+        ("colmap_sph/pairs/*/*.sph", *STOPS[0]),
         ("stereo/depth_maps/*.photometric.bin", *STOPS[1]),
         ("stereo/depth_maps/*.geometric.bin", *STOPS[0]),
     ],
@@ -262,7 +262,7 @@ def size_of(dense: Path, *patterns: str) -> int:
 # What fits, as a part of what the stage writes, for each stage in its turn.
 WRITTEN = [
     ("undistort", ["images/*", "sparse/*"]),
-    ("pairs", ["colmap_sph/pairs/*"]),
+    ("pairs", ["colmap_sph/pairs/*/*"]),
     ("photometric maps", ["colmap_sph/photometric/*", "stereo/*/*.photometric.bin"]),
     ("geometric maps", ["stereo/*/*.geometric.bin"]),
     ("cloud", ["fused*"]),

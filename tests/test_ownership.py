@@ -257,8 +257,9 @@ def make_old(dense: Path) -> list[Path]:
         path.write_text(json.dumps(old | {"check": "0" * 32}, indent=1))
     (dense / "colmap_sph/fusion_cfg.json").unlink(missing_ok=True)
     archives = []
-    for path in dense.glob("colmap_sph/p*/*.sph"):
-        archives.append(path.with_suffix(".npz"))
+    for path in [*dense.glob("colmap_sph/photometric/*.sph"), *dense.glob("colmap_sph/pairs/*/*.sph")]:
+        folder = dense / "colmap_sph" / ("pairs" if path.parents[1].name == "pairs" else "photometric")
+        archives.append(folder / f"{path.stem}.npz")
         with archives[-1].open("wb") as file:
             np.savez(file, key="key", codes=np.zeros((3, 3), np.uint16))
         path.unlink()
@@ -282,7 +283,29 @@ def test_a_workspace_of_the_version_before_is_brought_up_to_date(finished: Finis
     assert backups(finished.dense) == {}
 
 
-MINE = ["pairs/notes.txt", "pairs/1-2.npz", "photometric/a/b.sph", "state/notes.json", "state/a.txt", "mine.txt"]
+def test_disparity_maps_in_one_folder_are_made_anew_in_several(finished: Finished) -> None:
+    """As the version before had them; what is there under such a name, but not ours, stays."""
+    before = contents(finished.dense)
+    flat = finished.dense / "colmap_sph/pairs"
+    for path in flat.glob("*/*.sph"):
+        path.rename(flat / path.name)
+    (flat / "mine.sph").write_bytes(b"mine")
+    assert make_plan(Project(workspace=finished.dense), OPTIONS).pairs_done == 0
+    assert finished.rerun().made == NOTHING | {"match pairs": 6}
+    assert [path.name for path in flat.glob("*.sph")] == ["mine.sph"]
+    (flat / "mine.sph").unlink()
+    assert contents(finished.dense) == before
+
+
+MINE = [
+    "known/a.json",
+    "pairs/notes.txt",
+    "pairs/1-2.npz",
+    "photometric/a/b.sph",
+    "state/notes.json",
+    "state/a.txt",
+    "mine.txt",
+]
 
 
 @pytest.mark.parametrize("how", ["overwrite", "remove"])
@@ -387,7 +410,7 @@ def test_verify_finds_what_the_samples_do_not_show(
 @pytest.mark.parametrize(("folder", "made"), [("pairs", "match pairs"), ("photometric", "vote on depth")])
 def test_verify_finds_damaged_intermediate_results(folder: str, made: str, finished: Finished) -> None:
     before = contents(finished.dense)
-    path = min(finished.dense.glob(f"colmap_sph/{folder}/*.sph"))
+    path = min(finished.dense.glob(f"colmap_sph/{folder}/**/*.sph"))
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)

@@ -100,27 +100,27 @@ def test_worth_of_a_candidate() -> None:
     """Closed formula: (what is believed) * (what the parallax is good for), 0 outside the candidate's image."""
     points = np.array([[0.0, 0, 10], [0, 0, 10], [4.99, 0, 10], [0, 0, 200]])
     view, candidate = view_at([0, 0, 0], "a"), view_at([2, 0, 0], "b")
-    both = np.array([True, False, False, False])
+    both = np.array([[True, False, False, False]])
     angles = np.degrees(np.arctan([0.2, 0.2, 0.499, 0.01]) - np.arctan([0, 0, 0.299, 0]))
     assert (angles[:3] > 6).all() and angles[3] < 6
     np.testing.assert_allclose(
-        worth_of(view, candidate, points, both), [1, 0.5, 0.5, 0.5 * angles[3] / 6], rtol=1e-6
+        worth_of(view, [candidate], points, both)[0], [1, 0.5, 0.5, 0.5 * angles[3] / 6], rtol=1e-6
     )
     away = view_at([-2, 0, 0], "c")  # its image ends at x = 3
     for believed in (0.5, 1.0):
-        worth = worth_of(view, away, points, believed)[[0, 2]]
+        worth = worth_of(view, [away], points, believed)[0, [0, 2]]
         np.testing.assert_allclose(worth, [0.5 + believed / 2, 0], rtol=1e-6)
     wide = view_at([10 * np.tan(np.radians(60)), 0, 0], "d")  # out of its image, but what is observed is in sight
-    np.testing.assert_allclose(worth_of(view, wide, points, both)[:2], [1 / 3, 0], rtol=1e-6)
+    np.testing.assert_allclose(worth_of(view, [wide], points, both)[0, :2], [1 / 3, 0], rtol=1e-6)
 
 
 def test_what_few_see_is_served_before_what_many_see() -> None:
     left, right = np.repeat([1.0, 0], [90, 10]), np.repeat([0, 1.0], [90, 10])
-    worths = [w.astype(np.float32) for w in (left, 0.99 * left, right, 0.98 * left, np.zeros(100), 0.5 * right)]
+    worths = np.float32([left, 0.99 * left, right, 0.98 * left, np.zeros(100), 0.5 * right])
     # Seen once, the left side is worth 0.2 * 90 = 18, more than the right one; seen twice, less than that.
     assert choose(worths, 6) == [0, 1, 2, 3, 5, 4]
     assert choose(worths, 3) == [0, 1, 2]
-    assert choose([], 3) == []
+    assert choose(worths[:0], 3) == []
 
 
 def test_partners_see_what_others_see(data_dir: Path) -> None:

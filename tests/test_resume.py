@@ -82,7 +82,7 @@ def finished(pristine: Finished, tmp_path: Path) -> Iterator[Finished]:
 def results(dense: Path) -> dict[str, tuple[int, bytes]]:
     """Time stamp and content of everything that a stage wrote, but for the cloud's and the maps' records."""
     files = [*dense.glob("stereo/*_maps/*.bin"), *Workspace(dense).cloud_paths]
-    files += [*dense.glob("colmap_sph/pairs/*"), *dense.glob("colmap_sph/photometric/*")]
+    files += [*dense.glob("colmap_sph/pairs/*/*"), *dense.glob("colmap_sph/photometric/*")]
     assert len(files) == 4 * 4 + 2 + 6 + 4
     return {str(path.relative_to(dense)): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
 
@@ -292,7 +292,7 @@ def alter(path: Path) -> None:
 
 
 DAMAGED = {
-    "disparity map": ("colmap_sph/pairs/*.sph", {"match pairs": 1}),
+    "disparity map": ("colmap_sph/pairs/*/*.sph", {"match pairs": 1}),
     "estimate": ("colmap_sph/photometric/*.sph", {"vote on depth": 1}),
     "photometric map": ("stereo/depth_maps/*.photometric.bin", {"vote on depth": 1}),
     "geometric map": ("stereo/normal_maps/*.geometric.bin", {"confirm depth": 1}),
@@ -358,7 +358,7 @@ def spoil_disparities(path: Path) -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Finished, threads: int) -> None:
     ids = finished.ids
-    path = finished.dense / f"colmap_sph/pairs/{ids[NAMES[0]]:06d}-{ids[NAMES[1]]:06d}.sph"
+    path = finished.dense / f"colmap_sph/pairs/000/{ids[NAMES[0]]:06d}-{ids[NAMES[1]]:06d}.sph"
     spoil_disparities(path)
     changed: dict[str, Any] = {"vote": VoteOptions(tolerance=2.5), "threads": threads}
     report = finished.rerun(**changed)
@@ -510,7 +510,7 @@ def test_leftovers_of_killed_runs_are_removed(finished: Finished) -> None:
     leftovers = [
         finished.dense / "stereo/depth_maps/.123-4567.tmp",
         finished.dense / "colmap_sph/.99-1.tmp",
-        finished.dense / "colmap_sph/pairs/.99-140001.tmp",
+        finished.dense / "colmap_sph/pairs/000/.99-140001.tmp",
         finished.dense / "colmap_sph/.fusion.tmp/fused.ply",
     ]
     mine = [finished.dense / "stereo/.mine.tmp", finished.dense / "stereo/depth_maps/1-2.tmp"]

@@ -266,7 +266,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     if report.polishing:
         facts.append(("poses", report.polishing))
     if report.points:  # there are none where only maps were asked for
-        facts.append(("cloud", f"{report.points:,} points in {workspace.fused_path}"))
+        where = f"{report.tiles} tiles in {workspace.tiles_dir}" if report.tiles else str(workspace.fused_path)
+        facts.append(("cloud", f"{report.points:,} points in {where}"))
     if any(report.reused.values()):
         kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
         facts.append(("up to date", kept))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -66,7 +67,7 @@ class Mesh:
 
 
 def read_geometry(path: Path) -> PointCloud | Mesh:
-    """Read a cloud (PLY, OBJ without faces, LAS, LAZ) or a mesh (PLY or OBJ with faces).
+    """Read a cloud (PLY, OBJ without faces, LAS, LAZ; all tiles of an index) or a mesh (PLY or OBJ with faces).
 
     Raises
     ------
@@ -81,6 +82,9 @@ def read_geometry(path: Path) -> PointCloud | Mesh:
     if kind in (".las", ".laz"):
         points, crs = _read(path, "LAS/LAZ", partial(read_las, laspy=require("laspy")))
         return PointCloud(str(path), points, crs, z_is_up=True)
+    if kind == ".json":
+        points = _read(path, "index of tiles", _read_tiles)
+        return PointCloud(str(path), points)
     if kind not in (".ply", ".obj"):
         raise InputError(
             f"{path} has the unknown format {kind or '(no ending)'!r}: convert it to PLY, OBJ, LAS or LAZ"
@@ -100,6 +104,14 @@ def _read(path: Path, kind: str, reader: Callable[[Path], _Content]) -> _Content
     # The decompressor's own panic is no `Exception`.
     except BaseException as error:
         raise InputError(f"{path} cannot be read as {kind}, it may be damaged: {reason_of(error)}") from error
+
+
+def _read_tiles(index: Path) -> Points:
+    """All points of the tiles beside an index that this program wrote."""
+    files = [str(tile["file"]) for tile in json.loads(index.read_bytes())["tiles"]]
+    if not all(Path(file).name == file for file in files):
+        raise ValueError("its tiles are not beside it")
+    return np.concatenate([np.zeros((0, 3)), *(read_ply(index.parent / file)[0] for file in files)])
 
 
 def require(module: str) -> Any:

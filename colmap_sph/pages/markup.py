@@ -99,15 +99,23 @@ def _head(content: Content, run: RunFacts) -> dict[str, Any]:
         "headline": _headline(content, run),
         "notices": notices,
         "facts": _facts(content, run),
-        "how_to_look": (
-            f"The whole cloud is {content.workspace.fused_path.name}, beside the folder of this page: colmap_sph "
-            "view --full shows all of it, and CloudCompare, MeshLab and Blender open it. "
-            if content.cloud.total
-            else ""
-        )
+        "how_to_look": (_where_the_cloud_is(content) if content.cloud.total else "")
         + "Depth and normal maps are in stereo, as COLMAP has them; "
         "colmap gui and the meshers of COLMAP and OpenMVS take the whole folder as their workspace.",
     }
+
+
+def _where_the_cloud_is(content: Content) -> str:
+    workspace = content.workspace
+    if workspace.fused_path.exists():
+        return (
+            f"The whole cloud is {workspace.fused_path.name}, beside the folder of this page: colmap_sph "
+            "view --full shows all of it, and CloudCompare, MeshLab and Blender open it. "
+        )
+    return (
+        f"The whole cloud is in tiles, in {workspace.tiles_dir.name} beside the folder of this page, whose "
+        "index.json says where each lies; CloudCompare, MeshLab and Blender open them. "
+    )
 
 
 def _headline(content: Content, run: RunFacts) -> str:

@@ -12,6 +12,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.pipeline.digests import digest
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
@@ -23,6 +24,7 @@ from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Region, Scene
 from colmap_sph.stereo.agreement import SparseTracks
 from colmap_sph.stereo.extent import outline_of
+from colmap_sph.stereo.partners.places import Places
 from colmap_sph.stereo.partners.stations import Stations
 from colmap_sph.stereo.region.core import core_of
 from colmap_sph.stereo.region.focus import Focus, focused, region_of
@@ -30,6 +32,9 @@ from colmap_sph.stereo.region.inside import is_inside
 from colmap_sph.stereo.region.window import Window
 
 logger = logging.getLogger(__name__)
+
+# Images whose pairs' disparity maps share a folder.
+_IMAGES_IN_FOLDER = 1000
 
 Until = Literal["photometric", "geometric", "cloud"]
 """The last results that a run makes."""
@@ -64,9 +69,28 @@ class Context:
     focus: Focus | None = None
 
     @cached_property
+    def scene_key(self) -> str:
+        """Digest of all that stages look at in the scene and in the region, and of what is known of the images."""
+        views = self.scene.views
+        return digest(
+            [(view.name, view.image_id, view.width, view.height, view.full_size) for view in views],
+            [np.array([getattr(view, name) for view in views]) for name in ("K", "R", "t", "reprojection_error")],
+            [view.point_indices for view in views],
+            self.scene.points,
+            self.focus,
+            [self.details.get(view.name) for view in views],
+            self.keys.contents([view.name for view in views]),
+        )
+
+    @cached_property
     def stations(self) -> Stations:
         """Which images stand side by side: what is too near to be matched."""
         return Stations(self.scene, self.options.pairs.min_triangulation_angle)
+
+    @cached_property
+    def order(self) -> Places:
+        """The order of place, in which images and pairs are worked on."""
+        return Places(self.scene)
 
     def in_region(self) -> "Context":
         """The same with what of the scene shows the region that the options ask for, if they do; it is reported.
@@ -134,9 +158,13 @@ class Context:
         return SparseTracks(self.scene, self.region)
 
     def pair_path(self, a: str, b: str) -> Path:
-        """Disparity map of a pair: named by COLMAP's image ids, since names may hold anything."""
+        """Disparity map of a pair: named by COLMAP's image ids, since names may hold anything.
+
+        Those of so many images share a folder that no folder holds more than some thousands.
+        """
         low, high = sorted((self.scene.view(a).image_id, self.scene.view(b).image_id))
-        return self.workspace.pairs_dir / f"{low:06d}-{high:06d}{SUFFIX}"
+        folder = f"{low // _IMAGES_IN_FOLDER:03d}"
+        return self.workspace.pairs_dir / folder / f"{low:06d}-{high:06d}{SUFFIX}"
 
     def estimate_path(self, name: str) -> Path:
         """Photometric depth of an image with its standard deviation and support."""

@@ -1,7 +1,7 @@
 """Options that ask for more images than there are: told before hours of work."""
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.context import Context
@@ -20,10 +20,9 @@ def check_numbers(context: Context, pairs: Sequence[Pair]) -> None:
     pairs : sequence of (str, str)
         That will be matched.
     """
-    partners = partners_of(pairs)
-    most = max((len(set(context.stations.elsewhere(name, partners[name])[1])) for name in partners), default=0)
     check_fusion(context)
     support = context.options.vote.min_support
+    most = _most_places(context, partners_of(pairs), max(support, context.options.confirm.min_consistent))
     if support > most:
         raise OptionError(
             f"vote.min_support is {support}, but no image has partners at more than {most} places: no pixel would "
@@ -39,6 +38,17 @@ def check_numbers(context: Context, pairs: Sequence[Pair]) -> None:
             consistent,
             most,
         )
+
+
+def _most_places(context: Context, partners: Mapping[str, list[str]], enough: int) -> int:
+    """At how many places an image has partners at most; or at least, where one has enough."""
+    most = 0
+    for name, others in partners.items():
+        if len(others) > most:
+            most = max(most, len(set(context.stations.elsewhere(name, others)[1])))
+        if most >= enough:
+            break
+    return most
 
 
 def check_fusion(context: Context) -> None:

@@ -14,7 +14,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.report_files import make_page
 from colmap_sph.pipeline.stages.fuse_to import FuseToStage
-from colmap_sph.pipeline.stages.fusion_partners import partners_in_fusion
+from colmap_sph.pipeline.stages.fusion_partners import PartnersInFusion
 from colmap_sph.pipeline.stages.fusion_parts import index_in_model
 from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.pipeline.stages.view_maps import MapSources
@@ -81,7 +81,7 @@ def fuse_maps(
             pairs = _pairs_of_maps(context, mapped) or choose_pairs(workspace, scene, options, None).unique_pairs()
             progress.advance()
         names = sorted(mapped)
-        partners = partners_in_fusion(context, dict.fromkeys(pairs, ""), names)
+        partners = PartnersInFusion(context, pairs, names)
         own_region = None if region is None else region.moved(-scene.origin - scene.anchor)
         stage = FuseToStage(context, partners, _sources(context, mapped), output, own_region)
         execute(stage)

@@ -20,6 +20,7 @@ _MAKERS = {
     for kind, module in {
         "known images": "check_images",
         "undistorted": "undistort",
+        "selection": "selection",
         "pair": "match",
         "polish": "polish",
         "vote": "vote",
@@ -85,6 +86,14 @@ class Keys:
 
     def _key(self, kind: str, *parts: object) -> str:
         return digest(kind, self._programs.get(kind), self.fresh, *parts)
+
+    def contents(self, names: Sequence[str]) -> list[tuple[str | None, str | None]]:
+        """Digests of each image's content and of its mask's, None where there is none."""
+        return [(self._image(name), self._mask(name)) for name in names]
+
+    def stage(self, kind: str, *parts: object) -> str:
+        """Of all that goes into a stage whose results are of this kind."""
+        return self._key(kind, "stage", *parts)
 
     def known_images(self) -> str:
         """Of what is known of images: how they were looked at. Their contents stand beside it."""
@@ -176,7 +185,7 @@ class Keys:
         options += tuple(cut)
         return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)
 
-    def cloud(self, maps: Mapping[str, str], partners: Mapping[str, Sequence[object]], scene: Scene) -> str:
+    def cloud(self, maps: Mapping[str, str], pairs: object, scene: Scene) -> str:
         """Of the cloud, from the keys of the geometric maps of the images to fuse.
 
         The photometric maps need none of their own: the key of the geometric ones stands for them, too.
@@ -185,18 +194,18 @@ class Keys:
         ----------
         maps : mapping of str to str
             Key of the maps of each image.
-        partners : mapping of str to sequence
-            For each image those in which it is looked up, and their stations.
+        pairs : sequence
+            All that tells, beside the model, in which others each image is looked up, and their stations.
         scene : Scene
-            Where it lies, and how the model numbers its images.
+            Where it lies, which images it has, and how the model numbers them.
         """
         folder = self._options.fusion.mask_path
         return self._key(
             "cloud",
             maps,
             [self._image(name) for name in maps],
-            partners,
-            (scene.origin, scene.anchor, scene.image_ids),
+            pairs,
+            (scene.origin, scene.anchor, scene.image_ids, [view.name for view in scene.views]),
             [] if self.fresh else [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
             self._options.fusion,
             [_digest_if_there(mask_path(folder, name)) for name in maps] if folder else [],

@@ -4,6 +4,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -11,7 +12,9 @@ T = TypeVar("T")
 
 
 class LoadCache(Generic[T]):
-    """Loads each key once and keeps the most recently used values while bytes are held for them.
+    """Loads each key once and keeps values while bytes are held for them.
+
+    Those go first that will be needed last, as far as that is known, and of these the least recently used.
 
     Parameters
     ----------
@@ -23,6 +26,7 @@ class LoadCache(Generic[T]):
         self._size = size
         self._capacity = 0
         self._values: OrderedDict[str, T] = OrderedDict()
+        self._needed: dict[str, float] = {}
         self._loading: dict[str, threading.Lock] = {}
         self._lock = threading.Lock()
         self._bytes = 0
@@ -39,26 +43,37 @@ class LoadCache(Generic[T]):
                 self._capacity -= capacity
                 self._evict()
 
-    def get(self, key: str, load: Callable[[], T]) -> T:
-        """The value of `key`, loaded if need be: outside the lock, at most once at a time per key."""
+    def get(self, key: str, load: Callable[[], T], needed: float = 0.0) -> T:
+        """The value of `key`, loaded if need be: outside the lock, at most once at a time per key.
+
+        Parameters
+        ----------
+        key : str
+        load : callable
+        needed : float
+            When it will be needed next, on any scale that all callers share; infinite: never.
+        """
         with self._lock:
             loading = self._loading.setdefault(key, threading.Lock())
         with loading:
             with self._lock:
                 if key in self._values:
                     self._values.move_to_end(key)
+                    self._needed[key] = needed
                     return self._values[key]
             value = load()
             with self._lock:
                 self._values[key] = value
+                self._needed[key] = needed
                 self._bytes += self._size(value)
                 self._evict()
             return value
 
     def _evict(self) -> None:
         while self._bytes > self._capacity and len(self._values) > (self._capacity > 0):
-            _, oldest = self._values.popitem(last=False)
-            self._bytes -= self._size(oldest)
+            last = max(islice(self._values, max(len(self._values) - 1, 1)), key=self._needed.__getitem__)
+            self._bytes -= self._size(self._values.pop(last))
+            del self._needed[last]
         if not self._values:
             self._loading.clear()
 

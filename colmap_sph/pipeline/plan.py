@@ -1,8 +1,9 @@
 """What a run would do and need, found without writing anything: ``colmap_sph run --dry-run``.
 
 The same stages are asked that a run executes. Which pairs and images are to do is exact, but for pairs that fail
-while they are matched. Time, memory and disk are sums of what the jobs say that they cost; the constants stand in
-the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
+while they are matched, and, of more than a thousand of which nothing is there, for those that cannot be done: some
+of these are asked, and stand for all. Time, memory and disk are sums of what the jobs say that they cost; the
+constants stand in the stages, and ``scripts/calibrate_plan.py`` compares them with runs.
 """
 
 import logging
@@ -41,6 +42,9 @@ logger = logging.getLogger(__name__)
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
 
+# Of the items of a stage that are to be made, so many or somewhat fewer are asked what that takes.
+_ASKED = 1000
+_TO_MAKE = Result("", made=True, facts=Facts(coverage=1.0))
 # Bytes that the interpreter and the libraries have in use.
 _BASE_MEMORY = 200e6
 
@@ -157,7 +161,9 @@ def make_plan(
     context = Context(dense, scene, options, keys, report=report).in_region()
     options = context.options
     context = with_good_images(context, survey, to_come=to_come)
-    selection = choose_pairs(dense if foreseen is None else None, context.scene, options, project.database())
+    there = dense if foreseen is None else None
+    key = context.keys.stage("selection", context.scene_key)
+    selection = choose_pairs(there, context.scene, options, project.database(), scene_key=key)
     context = replace(context, scene=wanted_scene(context.scene, selection))
     foreign = foreign_files(context.places, overwrite=overwrite)
     if foreign:
@@ -209,10 +215,19 @@ class Survey:
     stages: list[StagePlan] = field(default_factory=list)
 
     def __call__(self, stage: Stage[Item, Task], /) -> dict[Item, Result]:
-        """Foresee the result of each item; all images that are to do are taken to get some depth."""
-        results: dict[Item, Result] = {}
-        costs: list[Cost] = []
+        """Foresee the result of each item; all images that are to do are taken to get some depth.
+
+        Of items whose results are not there, an even part is asked, where they are very many; the others are
+        taken to be like these.
+        """
+        missing = [item for item in stage.items if stage.is_missing(item)]
+        asked = set(missing[:: -(-len(missing) // _ASKED) or 1])
+        results: dict[Item, Result] = {item: _TO_MAKE for item in missing if item not in asked}
+        scale = len(missing) / max(len(asked), 1)
+        costs: list[tuple[Cost, float]] = []
         for item in stage.items:
+            if item in results:
+                continue
             try:
                 job = stage.job(item)
             except ColmapSphError as error:
@@ -221,8 +236,9 @@ class Survey:
             if job.done is not None:
                 results[item] = Result(job.key, made=False, facts=job.done)
             else:
-                results[item] = Result(job.key, made=True, facts=Facts(coverage=1.0))
-                costs.append(job.cost)
+                results[item] = Result(job.key, made=True, facts=_TO_MAKE.facts)
+                costs.append((job.cost, scale if item in asked else 1.0))
+        results = {item: results[item] for item in stage.items if item in results}
         stage.tell_problems()
         made, there = stage.count(results)
         self.stages.append(
@@ -230,9 +246,9 @@ class Survey:
                 stage.name,
                 made + there,
                 there,
-                sum(cost.seconds for cost in costs),
-                _memory_of(stage, costs),
-                sum(cost.disk for cost in costs),
+                sum(cost.seconds * times for cost, times in costs),
+                _memory_of(stage, [cost for cost, _ in costs]),
+                sum(cost.disk * times for cost, times in costs),
             )
         )
         return results

@@ -28,6 +28,7 @@ class MatchToPolishStage(MatchStage):
     """Matches the pairs with the given poses."""
 
     name = "match pairs to polish"
+    remembered_as = None  # its results make room for those with the polished poses
 
 
 def with_polished_poses(

@@ -9,6 +9,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from statistics import mean
+from typing import TypeVar
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, Until, timed_stage
@@ -22,7 +23,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.report_files import command_of, make_page, write_report
+from colmap_sph.pipeline.report_files import command_of, keep_or_make_page, write_report
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
@@ -46,6 +47,8 @@ from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.rectification import sampling_of
 
 logger = logging.getLogger(__name__)
+
+Item = TypeVar("Item", str, Pair)
 
 
 def run(
@@ -151,13 +154,16 @@ def run_project(
         )
         preparation.run(executor)
         given = preparation.given_model()
+        options = preparation.options
+        names = preparation.names
+        del preparation  # the model takes much memory
         if given.reason_to_keep or not options.polish.is_wanted:
             restore_given(dense)
         return reconstruct(
             dense,
-            preparation.options,
+            options,
             executor=executor,
-            expected=preparation.names,
+            expected=names,
             progress=progress,
             report=report,
             database=project.database(),
@@ -261,7 +267,8 @@ def reconstruct(
             raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
         workspace.create_stereo_dirs(scene.index_of)
         with timed_stage("select pairs", 1, progress, report):
-            selection = choose_pairs(workspace, scene, options, database, pair_list)
+            key = context.keys.stage("selection", context.scene_key)
+            selection = choose_pairs(workspace, scene, options, database, pair_list, scene_key=key, keep=True)
             report.pair_source = selection.source
             progress.advance()
         context = replace(context, scene=wanted_scene(scene, selection))
@@ -280,7 +287,7 @@ def reconstruct(
             context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), executor)
         judge_agreement(report)
     write_report(context)
-    make_page(context)
+    keep_or_make_page(context)
     refuse_disagreement(report)
     if until == "cloud" and not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
@@ -317,12 +324,12 @@ def go_through_stages(
         The last results to make.
     """
     check_numbers(context, pairs)
-    matched = executor(MatchStage(context, pairs))
+    matched = _by_name(executor(MatchStage(context, context.order.sorted_pairs(pairs))))
     votes = _vote(context, matched, executor)
     if until == "photometric":
         report_photometric(context, votes)
         return
-    maps = executor(ConfirmStage(context, matched, votes))
+    maps = _by_name(executor(ConfirmStage(context, matched, votes)))
     if until == "cloud":
         executor(fuse_stage(context, keys_of(matched), maps))
 
@@ -332,7 +339,7 @@ def go_through_stages_within(within: Within, executor: Executor) -> Context:
     context, matched = within.match(executor)
     votes = _vote(context, matched, executor)
     context = within.refined(context, matched, votes)
-    maps = executor(ConfirmStage(context, matched, votes))
+    maps = _by_name(executor(ConfirmStage(context, matched, votes)))
     executor(fuse_stage(context, keys_of(matched), maps))
     return context
 
@@ -340,7 +347,12 @@ def go_through_stages_within(within: Within, executor: Executor) -> Context:
 def _vote(context: Context, matched: Mapping[Pair, Result], executor: Executor) -> dict[str, Result]:
     measured = {pair: result.facts.row_residual for pair, result in matched.items()}
     judge_rows(context.report, context.scene, measured)
-    return executor(VoteStage(context, matched))
+    return _by_name(executor(VoteStage(context, matched)))
+
+
+def _by_name(results: Mapping[Item, Result]) -> dict[Item, Result]:
+    """Results in the order of their items' names, whatever the order in which they were worked on."""
+    return {item: results[item] for item in sorted(results)}
 
 
 def with_good_images(

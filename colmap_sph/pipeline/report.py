@@ -138,6 +138,8 @@ class RunReport:
         Where hardly any point agrees over all: why the results mean nothing.
     points : int
         Points of the fused cloud.
+    tiles : int
+        Its files, where it is in tiles; 0: it is in one.
     points_of : dict
         Image name → how many of them it made; empty where COLMAP fused.
     advice : str
@@ -179,6 +181,7 @@ class RunReport:
     imprecision: str = ""
     refusal: str = ""
     points: int = 0
+    tiles: int = 0
     points_of: dict[str, int] = field(default_factory=dict)
     advice: str = ""
     made: dict[str, int] = field(default_factory=dict)

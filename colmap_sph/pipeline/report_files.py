@@ -11,16 +11,25 @@ from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+
+import colmap_sph.pages
 from colmap_sph.errors import OutputError, reason_of, shell_word
 from colmap_sph.pages import write_page
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.digests import digest, file_digest
+from colmap_sph.pipeline.known.table import stamp_of_files
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.program import versions
-from colmap_sph.project.files import atomic_file, remove
+from colmap_sph.pipeline.program import program_digest, versions
+from colmap_sph.project.files import atomic_file, make_dir, remove
 from colmap_sph.project.project import Project
 from colmap_sph.project.region_file import AUTO
+from colmap_sph.project.state.records import read_json
 
 logger = logging.getLogger(__name__)
+
+# What of a report differs from run to run with the same results.
+_OF_THE_RUN = {"made", "reused", "seconds", "peak_memory"}
 
 
 def command_of(project: Project, options: RunOptions) -> str:
@@ -50,9 +59,49 @@ def write_report(context: Context) -> None:
     report = context.report
     unit = 1 if sys.platform == "darwin" else 1024
     report.peak_memory = max(report.peak_memory, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
-    content = {"versions": versions(), "options": asdict(context.options), **asdict(report)}
     with atomic_file(context.workspace.report_path) as file:
-        file.write(json.dumps(content, indent=1, default=str).encode())
+        file.write(json.dumps(_content(context), indent=1, default=str).encode())
+
+
+def _content(context: Context) -> dict[str, Any]:
+    return {"versions": versions(), "options": asdict(context.options), **asdict(context.report)}
+
+
+def keep_or_make_page(context: Context) -> None:
+    """Make the page of a run that is done, unless nothing was made and the page that is there says the same."""
+    workspace = context.workspace
+    key = _page_key(context)
+    path = workspace.known_path("page")
+    if not any(context.report.made.values()):
+        known = read_json(path, _KnownPage)
+        if known is not None and known == _KnownPage(key, stamp_of_files([str(workspace.page_path)])):
+            workspace.page_path.touch()  # it is of this report
+            _know_page(path, key, workspace.page_path)
+            return
+    make_page(context)
+    if workspace.page_path.exists():
+        _know_page(path, key, workspace.page_path)
+
+
+class _KnownPage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Of the page: digest of what it was made from, and the stamp of its file."""
+
+    key: str
+    stamp: str
+
+
+def _know_page(path: Path, key: str, page: Path) -> None:
+    make_dir(path.parent)
+    with atomic_file(path, sync=False) as file:
+        file.write(msgspec.json.encode(_KnownPage(key, stamp_of_files([str(page)]))))
+
+
+def _page_key(context: Context) -> str:
+    """Digest of what a page is made from, of maps and a cloud that are as they were; less times and numbers."""
+    content = {name: value for name, value in _content(context).items() if name not in _OF_THE_RUN}
+    files = sorted(path for path in Path(colmap_sph.pages.__file__).parent.rglob("*.*") if path.is_file())
+    templates = [file_digest(path) for path in files if path.suffix != ".pyc"]
+    return digest(program_digest("colmap_sph.pages.page"), templates, json.dumps(content, default=str))
 
 
 def make_page(context: Context) -> None:

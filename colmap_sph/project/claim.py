@@ -52,7 +52,7 @@ def check_links(workspace: Workspace, *, is_given: bool) -> None:
     is_given : bool
         Whether its images, model and masks are the user's, which are only read and may be anywhere.
     """
-    written = [workspace.state_dir, workspace.stereo_dir, *workspace.cloud_paths]
+    written = [workspace.state_dir, workspace.stereo_dir, workspace.tiles_dir, *workspace.cloud_paths]
     # Both are removed as a whole before anything is written there, and have links of our own inside.
     remade = {workspace.local_dir, workspace.fusion_scratch_dir}
     check_ways_out(workspace.root, written, unlinked=remade)

@@ -3,7 +3,7 @@
 import os
 import shutil
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,9 @@ _HEADER = "\n".join(
 )
 
 
-def write_part(stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.uint32]]]) -> int:
+def write_part(
+    stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.uint32]]], *, with_visibility: bool = True
+) -> int:
     """Write points and their visibility to ``STEM.points`` and ``STEM.vis``; return the number of points.
 
     Parameters
@@ -36,6 +38,8 @@ def write_part(stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.ui
     stem : Path
     bands : iterable of (points, visibility)
         As of `fusion.fuse_view`.
+    with_visibility : bool
+        Whether to write the second file.
 
     Raises
     ------
@@ -43,19 +47,25 @@ def write_part(stem: Path, bands: Iterable[tuple[NDArray[np.void], NDArray[np.ui
         A file cannot be written.
     """
     count = 0
-    with (
-        atomic_file(stem.with_suffix(".points"), sync=False) as cloud,
-        atomic_file(stem.with_suffix(".vis"), sync=False) as visible,
-    ):
+    with ExitStack() as opened:
+        cloud = opened.enter_context(atomic_file(stem.with_suffix(".points"), sync=False))
+        path = stem.with_suffix(".vis")
+        visible = opened.enter_context(atomic_file(path, sync=False)) if with_visibility else None
         for points, visibility in bands:
             cloud.write(points.data)
-            visible.write(visibility.astype("<u4", copy=False).data)
+            if visible is not None:
+                visible.write(visibility.astype("<u4", copy=False).data)
             count += len(points)
     return count
 
 
-def join_parts(stems: Sequence[Path], folder: Path, count: int) -> None:
-    """Join parts of a cloud, and remove them.
+def ply_header(count: int) -> bytes:
+    """The header of a cloud of so many points."""
+    return _HEADER.format(count=count).encode()
+
+
+def join_parts(stems: Sequence[Path], folder: Path, count: int, *, with_visibility: bool = True) -> None:
+    """Join parts of a cloud, and remove them one by one: the disk never holds more than one part twice.
 
     Parameters
     ----------
@@ -65,6 +75,8 @@ def join_parts(stems: Sequence[Path], folder: Path, count: int) -> None:
         Where ``fused.ply`` and ``fused.ply.vis`` go.
     count : int
         Number of points of all parts together.
+    with_visibility : bool
+        Whether to make the second file.
 
     Raises
     ------
@@ -72,8 +84,9 @@ def join_parts(stems: Sequence[Path], folder: Path, count: int) -> None:
         A file cannot be written.
     """
     cloud, visible = Workspace(folder).cloud_paths
-    _join(stems, ".points", cloud, _HEADER.format(count=count).encode())
-    _join(stems, ".vis", visible, np.array(count, "<u8").tobytes())
+    _join(stems, ".points", cloud, ply_header(count))
+    if with_visibility:
+        _join(stems, ".vis", visible, np.array(count, "<u8").tobytes())
 
 
 def _join(stems: Sequence[Path], suffix: str, target: Path, start: bytes) -> None:
@@ -151,7 +164,8 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
     # A kill in between must not leave a cloud beside the visibility of another.
     workspace.visibility_path.unlink(missing_ok=True)
     for made, place in zip(Workspace(scratch).cloud_paths, workspace.cloud_paths, strict=True):
-        made.replace(place)
+        if made.exists():  # visibility is not always wanted
+            made.replace(place)
 
 
 def remove_local_workspace(workspace: Workspace) -> None:
@@ -182,6 +196,7 @@ def _keep_local_workspace(workspace: Workspace, linked: Workspace, origin: NDArr
             set_aside(kept)
         made.rename(kept)
     # Relative, so that the workspace can be moved as a whole.
-    local.visibility_path.symlink_to(os.path.relpath(workspace.visibility_path, local.root))
+    if linked.visibility_path.exists():
+        local.visibility_path.symlink_to(os.path.relpath(workspace.visibility_path, local.root))
     workspace.local_origin_path.write_text(" ".join(map(repr, origin.tolist())) + "\n")
     move_cloud(local.fused_path, linked.fused_path, origin)

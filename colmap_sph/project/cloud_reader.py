@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, reason_of
+from colmap_sph.project.cloud_tiles import TileIndex
 from colmap_sph.project.files import open_regular
 from colmap_sph.project.map_coordinates import is_plausible
 
@@ -68,6 +69,22 @@ def read_some_points(path: Path, most: int) -> tuple[NDArray[np.float64], NDArra
     except OSError as error:
         raise InputError(f"The cloud {path} cannot be read ({reason_of(error)}); fuse again.") from error
     return *points_of(points), layout.count
+
+
+def read_some_of_tiles(
+    folder: Path, index: TileIndex, most: int
+) -> tuple[NDArray[np.float64], NDArray[np.uint8], int]:
+    """Do what `read_some_points` does for a cloud in tiles: of each as many points as it has of all."""
+    share = min(most / max(index.points, 1), 1.0)
+    some = [
+        read_some_points(folder / tile.file, max(round(share * tile.points), 1))
+        for tile in index.tiles
+        if tile.points
+    ]
+    if not some:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.uint8), 0
+    xyz, rgb, counts = zip(*some, strict=True)
+    return np.concatenate(xyz), np.concatenate(rgb), sum(counts)
 
 
 def points_of(points: NDArray[np.void]) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:

@@ -130,7 +130,7 @@ def pairs_on_disk(workspace: Workspace, scene: Scene) -> list[tuple[str, str]]:
     """Names of the images of each pair that this program has matched in a workspace."""
     name_of = {view.image_id: view.name for view in scene.views}
     pairs = []
-    for path in sorted(workspace.pairs_dir.glob(f"*{SUFFIX}")):
+    for path in sorted(workspace.pairs_dir.rglob(f"*{SUFFIX}"), key=lambda path: path.name):
         found = _PAIR_FILE.fullmatch(path.name)
         ids = [int(digits[:18]) for digits in found.groups()] if found else []
         if ids and all(each in name_of for each in ids):

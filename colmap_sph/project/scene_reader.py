@@ -2,7 +2,8 @@
 
 import logging
 import math
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,9 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import is_pinhole
+from colmap_sph.project.given.binary_arrays import Observations, read_observations, read_points
 from colmap_sph.project.map_coordinates import is_plausible, local_origin
-from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.sparse_model import is_text, load_model, model_files
 from colmap_sph.scene import Scene, View
 
 logger = logging.getLogger(__name__)
@@ -39,19 +41,63 @@ def read_scene(sparse_dir: Path) -> Scene:
     InputError
         No readable model in the folder, no registered image, or a distorted camera.
     """
-    return scene_of_model(load_model(sparse_dir), sparse_dir)
+    files = model_files(sparse_dir)
+    model = load_model(sparse_dir)
+    return _scene(model, sparse_dir, _of_library(model) if is_text(files) else _of_files(files))
 
 
 def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
-    """Return the scene of a model read from `sparse_dir`; see `read_scene`."""
+    """Return the scene of a model read from `sparse_dir`, and maybe changed since; see `read_scene`."""
+    return _scene(model, sparse_dir, _of_library(model))
+
+
+@dataclass(frozen=True, eq=False)
+class _Sparse:
+    """Ascending ids of the points of a model and their coordinates; what is observed, by image id."""
+
+    ids: NDArray[np.int64]
+    points: NDArray[np.float64]
+    observations: Iterable[tuple[int, Observations]]
+
+
+def _of_files(files: Sequence[Path]) -> _Sparse:
+    """Of a binary model that has been read."""
+    path_of = {path.name: path for path in files}
+    return _Sparse(*read_points(path_of["points3D.bin"]), read_observations(path_of["images.bin"]))
+
+
+def _of_library(model: pycolmap.Reconstruction) -> _Sparse:
+    xyz_of = {point_id: point.xyz for point_id, point in model.points3D.items()}
+    ids = sorted(xyz_of)
+    points = np.array([xyz_of[i] for i in ids], dtype=np.float64).reshape(-1, 3)
+    observations = ((image_id, _observations(model.image(image_id))) for image_id in model.reg_image_ids())
+    return _Sparse(np.array(ids, np.int64), points, observations)
+
+
+def _observations(image: pycolmap.Image) -> Observations:
+    points2D = [image.points2D[i] for i in image.get_observation_point2D_idxs()]
+    xy = np.array([point.xy for point in points2D], np.float64).reshape(-1, 2)
+    return Observations(xy, np.array([point.point3D_id for point in points2D], np.int64))
+
+
+def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse) -> Scene:
     origin = local_origin(model)
     if origin.any():
         logger.info("%s is in map coordinates; worked on relative to %s", sparse_dir, tuple(origin.tolist()))
-    points, row_of = _read_points(model)
-    points -= origin
-    views = [_read_view(model, i, points, row_of, sparse_dir, origin) for i in model.reg_image_ids()]
-    usable = [view for view in views if _is_possible(view)]
-    for view in views:
+    is_kept = is_plausible(sparse.points)
+    if not is_kept.all():
+        number = len(is_kept) - int(is_kept.sum())
+        logger.warning("%d sparse points have no possible coordinates; left out", number)
+    ids = sparse.ids[is_kept]
+    points = sparse.points[is_kept] - origin
+    registered = set(model.reg_image_ids())
+    views = {}
+    for image_id, observations in sparse.observations:
+        if image_id in registered:
+            view = _read_view(model, image_id, sparse_dir, origin)
+            views[image_id] = _with_observations(view, observations, ids, points)
+    usable = [views[image_id] for image_id in model.reg_image_ids() if _is_possible(views[image_id])]
+    for view in views.values():
         if not _is_possible(view):
             logger.warning("%s: the pose or calibration in %s is impossible; left out", view.name, sparse_dir)
     if not usable:
@@ -60,25 +106,10 @@ def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
     return Scene(views_by_name, points, origin, image_ids=tuple(model.reg_image_ids()))
 
 
-def _read_points(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], dict[int, int]]:
-    """Return the (N, 3) finite points, by ascending id, and the row of each point id."""
-    xyz_of = {point_id: point.xyz for point_id, point in model.points3D.items()}
-    ids = sorted(xyz_of)
-    points = np.array([xyz_of[i] for i in ids], dtype=np.float64).reshape(-1, 3)
-    kept = np.flatnonzero(is_plausible(points))
-    if len(kept) < len(ids):
-        logger.warning("%d sparse points have no possible coordinates; left out", len(ids) - len(kept))
-    return points[kept], {ids[index]: row for row, index in enumerate(kept)}
-
-
 def _read_view(
-    model: pycolmap.Reconstruction,
-    image_id: int,
-    points: NDArray[np.float64],
-    row_of: dict[int, int],
-    sparse_dir: Path,
-    origin: NDArray[np.float64],
+    model: pycolmap.Reconstruction, image_id: int, sparse_dir: Path, origin: NDArray[np.float64]
 ) -> View:
+    """An image of a model as a view that observes nothing."""
     image = model.image(image_id)
     camera = model.camera(image.camera_id)
     if not is_pinhole(camera):
@@ -89,9 +120,7 @@ def _read_view(
     pose = np.array(image.cam_from_world().matrix(), dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):  # an impossible pose is told later
         translation = pose[:, 3] + pose[:, :3] @ origin
-    points2D = [image.points2D[i] for i in image.get_observation_point2D_idxs()]
-    rows = np.array([row_of.get(point.point3D_id, -1) for point in points2D], dtype=np.int64)
-    view = View(
+    return View(
         image_id=image_id,
         name=image.name,
         width=camera.width,
@@ -99,11 +128,20 @@ def _read_view(
         K=np.array(camera.calibration_matrix(), dtype=np.float64),
         R=np.ascontiguousarray(pose[:, :3]),
         t=translation,
-        point_indices=np.unique(rows[rows >= 0]),
+        point_indices=np.empty(0, np.int64),
     )
-    observed = np.array([point.xy for point in points2D]).reshape(-1, 2)[rows >= 0]
-    error = _reprojection_error(view, observed, points[rows[rows >= 0]])
-    return replace(view, reprojection_error=error)
+
+
+def _with_observations(
+    view: View, observations: Observations, ids: NDArray[np.int64], points: NDArray[np.float64]
+) -> View:
+    """A view with what it observes of points, whose ids ascend, and how far off these are."""
+    places = np.searchsorted(ids, observations.point)
+    known = places < len(ids)
+    known[known] = ids[places[known]] == observations.point[known]
+    rows = places[known]
+    error = _reprojection_error(view, observations.xy[known], points[rows])
+    return replace(view, point_indices=np.unique(rows), reprojection_error=error)
 
 
 def _reprojection_error(view: View, observed: NDArray[np.float64], points: NDArray[np.float64]) -> float:

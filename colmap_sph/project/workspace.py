@@ -2,13 +2,15 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path, PurePosixPath
-from typing import Literal
+from typing import Literal, get_args
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.files import make_dir
 
 MapKind = Literal["photometric", "geometric"]
+Known = Literal["selection", "pairs", "photometric", "geometric", "page"]
 
 # Folders are made one inside the other, and a path has an end.
 _MAX_FOLDERS = 200
@@ -31,17 +33,17 @@ class Workspace:
     root: Path
     given_masks: Path | None = None
 
-    @property
+    @cached_property
     def images_dir(self) -> Path:
         """Undistorted images."""
         return self.root / "images"
 
-    @property
+    @cached_property
     def sparse_dir(self) -> Path:
         """Sparse model of the undistorted images."""
         return self.root / "sparse"
 
-    @property
+    @cached_property
     def stereo_dir(self) -> Path:
         """Depth maps, normal maps and COLMAP's configuration files."""
         return self.root / "stereo"
@@ -55,6 +57,11 @@ class Workspace:
     def visibility_path(self) -> Path:
         """Which images see each point of the cloud; COLMAP derives its name from the cloud's."""
         return self.root / "fused.ply.vis"
+
+    @property
+    def tiles_dir(self) -> Path:
+        """The cloud, where it is in tiles."""
+        return self.root / "fused_tiles"
 
     @property
     def cloud_paths(self) -> tuple[Path, Path]:
@@ -71,7 +78,7 @@ class Workspace:
         """Source images of every reference image."""
         return self.stereo_dir / "patch-match.cfg"
 
-    @property
+    @cached_property
     def state_dir(self) -> Path:
         """Our own state, report and log, which COLMAP never looks at."""
         return self.root / "colmap_sph"
@@ -126,17 +133,31 @@ class Workspace:
         """While images are undistorted: what there is of the workspace so far."""
         return self.state_dir / ".undistorting.tmp"
 
+    @cached_property
+    def known_dir(self) -> Path:
+        """What is known of results, so that it need not be found out again."""
+        return self.state_dir / "known"
+
+    def known_path(self, of: Known) -> Path:
+        """What is known of results of a kind, of the pairs that were chosen, or of the page."""
+        return self.known_dir / f"{of}.json"
+
     @property
+    def known_paths(self) -> list[Path]:
+        """All of these; need not exist."""
+        return [self.known_path(of) for of in get_args(Known)]
+
+    @cached_property
     def pairs_dir(self) -> Path:
         """Disparity maps of the pairs."""
         return self.state_dir / "pairs"
 
-    @property
+    @cached_property
     def photometric_dir(self) -> Path:
         """Photometric depth of the images, with its standard deviation and number of votes."""
         return self.state_dir / "photometric"
 
-    @property
+    @cached_property
     def records_dir(self) -> Path:
         """Records that vouch for depth and normal maps."""
         return self.state_dir / "state"
@@ -145,6 +166,11 @@ class Workspace:
     def cloud_record_path(self) -> Path:
         """Record that vouches for the cloud; its name is none of an image's."""
         return self.state_dir / "cloud.json"
+
+    @property
+    def tiles_record_path(self) -> Path:
+        """Record that vouches for the index of a cloud in tiles."""
+        return self.state_dir / "tiles.json"
 
     @property
     def fusion_cfg_record_path(self) -> Path:
@@ -170,7 +196,7 @@ class Workspace:
         """Undistorted image `name`."""
         return self.images_dir / checked_name(name)
 
-    @property
+    @cached_property
     def masks_dir(self) -> Path:
         """Masks of the undistorted images; need not exist."""
         return self.given_masks or self.root / "masks"

@@ -56,6 +56,12 @@ class FusionOptions:
     """Keep only part of the maps in memory, `cache_size` of them (COLMAP's only; ours always does)."""
     cache_size: float = 32.0
     """Gigabytes of maps to keep in memory with `use_cache`."""
+    visibility: bool = True
+    """Write fused.ply.vis, too: which images see each point, for COLMAP's meshers (our own method only)."""
+    max_points_per_file: int = 500_000_000
+    """Points of the cloud above which it is written as tiles, fused_tiles, with an index: each has the points of
+    neighbouring images, and no more than this, but for single images that have; 0: always one file (our own method
+    only)."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
@@ -66,6 +72,11 @@ class FusionOptions:
         for name in ("min_num_pixels", "max_num_pixels", "max_traversal_depth", "check_num_images"):
             if getattr(self, name) < 1:
                 raise OptionError(f"{name} must be at least 1, not {getattr(self, name)}.", name)
+        if self.max_points_per_file < 0:
+            raise OptionError(
+                f"max_points_per_file must be at least 1, or 0 for no limit, not {self.max_points_per_file}.",
+                "max_points_per_file",
+            )
         if self.max_num_pixels < self.min_num_pixels:
             raise OptionError(
                 f"max_num_pixels must not be less than min_num_pixels ({self.min_num_pixels}), "
@@ -82,7 +93,7 @@ class FusionOptions:
         values = {
             field.name: getattr(self, field.name)
             for field in fields(self)
-            if field.name not in ("method", "input")
+            if field.name not in ("method", "input", "visibility", "max_points_per_file")
         }
         return {name: value for name, value in values.items() if value is not None}
 

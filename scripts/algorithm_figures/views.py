@@ -68,7 +68,7 @@ def _need(demo: Demo, view: View, partners: list[str]) -> Float:
     for name in partners:
         partner = demo.scene.view(name)
         observed = np.isin(view.point_indices, partner.point_indices)
-        need *= 1 - 0.8 * worth_of(view, partner, points, observed)
+        need *= 1 - 0.8 * worth_of(view, [partner], points, observed[None])[0]
     return need
 
 

@@ -65,7 +65,7 @@ def set_up(stage: Stage, name: str) -> Scenario:
     dense = root / "dense"
     if name == "resumed":
         shutil.rmtree(dense / "colmap_sph" / "photometric")
-        min((dense / "colmap_sph" / "pairs").iterdir()).unlink()
+        min((dense / "colmap_sph" / "pairs").rglob("*.sph")).unlink()
         (dense / "fused.ply").unlink()
         for path in dense.glob("stereo/depth_maps/*.bin"):
             path.unlink()

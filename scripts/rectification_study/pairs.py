@@ -93,7 +93,7 @@ def pair_files(run: Run) -> dict[tuple[str, str], Path]:
 def pair_files_of(workspace: Workspace) -> dict[tuple[str, str], Path]:
     """File of every pair that was matched in a workspace, by the sorted names of its images."""
     found = {}
-    for file in sorted((workspace.state_dir / "pairs").glob("*.sph")):
+    for file in sorted((workspace.state_dir / "pairs").rglob("*.sph")):
         pair = read_pair(file)
         found[as_pair(pair.left, pair.right)] = file
     return found

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 from msgspec import Meta
 
 from colmap_sph.pipeline.load_cache import LoadCache
+from colmap_sph.project.cloud_tiles import missing_tiles, read_index, retire_tiles
 from colmap_sph.project.files import read_small, whole_digest
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.pair_lists import fusion_cfg, write_fusion_cfg
 from colmap_sph.project.sparse_model import image_names, load_model
 from colmap_sph.project.state.cloud_marks import map_mark
-from colmap_sph.project.state.ownership import fusion_cfg_place
+from colmap_sph.project.state.ownership import fusion_cfg_place, tiles_place
 from colmap_sph.project.state.records import begin, claim, vouch, vouch_when_on_disk, vouched_facts
 from colmap_sph.project.workspace import mask_path
 from colmap_sph.stereo.fusion_losses import DepthAndNormals, explain_losses
@@ -43,25 +44,37 @@ class CloudFacts:
     """The number of points of a cloud, what to advise where they are few, and how many each image made.
 
     The last is in the order of the images' names, and empty where that is not known. `of_maps` are the marks of
-    the maps that were fused, see `map_mark`.
+    the maps that were fused, see `map_mark`. `tiles` is the number of files, of a cloud that is not in one.
     """
 
     points: Annotated[int, Meta(ge=0)]
     advice: str
     of_images: tuple[Annotated[int, Meta(ge=0)], ...] = ()
     of_maps: tuple[str, ...] = ()
+    tiles: Annotated[int, Meta(ge=0)] = 0
 
 
 def known_cloud(context: "Context", key: str) -> CloudFacts | None:
     """What is known of the cloud, or None where it must be made."""
     place = context.cloud_place
-    return vouched_facts(place.record, key, place.files, CloudFacts)
+    known = vouched_facts(place.record, key, place.files, CloudFacts)
+    return known or _known_tiles(context, key)
+
+
+def _known_tiles(context: "Context", key: str) -> CloudFacts | None:
+    place = tiles_place(context.workspace)
+    known = vouched_facts(place.record, key, place.files, CloudFacts)
+    index = None if known is None else read_index(context.workspace.tiles_dir)
+    if index is None or missing_tiles(context.workspace.tiles_dir, index):
+        return None
+    return known
 
 
 def begin_cloud(context: "Context") -> None:
     """Say that the cloud is about to be replaced; what is not ours in its place is set aside."""
     place = context.cloud_place
     begin(place.record, place.files)
+    retire_tiles(context.workspace)
 
 
 def vouch_for_cloud(
@@ -81,8 +94,8 @@ def vouch_for_cloud(
     is_complete : bool
         Whether nothing that belongs to it could not be read.
     """
-    place = context.cloud_place
-    digests = {path: whole_digest(path) for path in place.files if path.exists()}
+    place = tiles_place(context.workspace) if facts.tiles else context.cloud_place
+    digests = {path: whole_digest(path) if path.exists() else "" for path in place.files}
     kind = context.options.fusion.input
     facts = replace(facts, of_maps=tuple(map_mark(context.workspace, name, kind) for name in names))
     vouch_when_on_disk(place.record, key, digests, facts, state="done" if is_complete else "void")
@@ -122,6 +135,7 @@ def _all_images(context: "Context") -> set[str]:
 def report_cloud(context: "Context", facts: CloudFacts, names: Sequence[str] = ()) -> None:
     """Report the cloud's facts, of which those of images are of images `names`."""
     context.report.points = facts.points
+    context.report.tiles = facts.tiles
     if len(facts.of_images) == len(names):
         context.report.points_of = dict(zip(names, facts.of_images, strict=True))
     context.report.advice = facts.advice

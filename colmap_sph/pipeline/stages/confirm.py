@@ -9,11 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
-from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, keys_of
 from colmap_sph.pipeline.stages.vote import normals_seconds
 from colmap_sph.project.images.reading import bytes_to_reduce, read_whole_grey
 from colmap_sph.project.masks import read_view_mask
@@ -40,15 +41,16 @@ _REFINE_SECONDS = 0.065
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
 _CONFIRM_BYTES = 40.0
 _REFINE_BYTES = 55.0
-# Per pixel: of an image and of an estimate in a cache; and bytes of a cache: more is no faster.
+# Per pixel: of an image and of an estimate in the cache.
 _IMAGE_BYTES = 1
 _ESTIMATE_BYTES = 9
-_CACHE_BYTES = 512 << 20
 # Caches take what the costliest image leaves, with some room to spare.
 _ROOM = 1.2
 
-_images: LoadCache[NDArray[np.uint8]] = LoadCache(lambda image: image.nbytes)
-_estimates: LoadCache[DepthEstimate] = LoadCache(lambda estimate: _ESTIMATE_BYTES * estimate.depth.size)
+# Images of views, and estimates of their depth.
+_loaded: LoadCache[NDArray[np.uint8] | DepthEstimate] = LoadCache(
+    lambda loaded: _ESTIMATE_BYTES * loaded.depth.size if isinstance(loaded, DepthEstimate) else loaded.nbytes
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,13 +124,18 @@ def _usual(residuals: Sequence[float]) -> float:
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
-    return _estimates.get(file_stamp(file.estimate), lambda: read_estimate(file.estimate, file.view))
+    key = f"estimate {file_stamp(file.estimate)}"
+    estimate = _loaded.get(key, lambda: read_estimate(file.estimate, file.view))
+    assert isinstance(estimate, DepthEstimate)
+    return estimate
 
 
 def _image(file: EstimateFile) -> NDArray[np.uint8]:
     size = (file.whole.width, file.whole.height)
-    key = f"{file_stamp(file.image)} {size} {file.window}"
-    return _images.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
+    key = f"image {file_stamp(file.image)} {size} {file.window}"
+    image = _loaded.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
+    assert not isinstance(image, DepthEstimate)
+    return image
 
 
 def confirm_seconds(partners: int, normals: NormalOptions, refinement: RefinementOptions) -> float:
@@ -137,12 +144,13 @@ def confirm_seconds(partners: int, normals: NormalOptions, refinement: Refinemen
     return seconds + _REFINE_SECONDS * refinement.images_used(partners)
 
 
-class ConfirmStage(Stage[str, ConfirmTask]):
+class ConfirmStage(RememberingStage[str, ConfirmTask]):
     """Confirms and refines the depth of every image with a vote."""
 
     name = "confirm depth"
+    remembered_as = "geometric"
     make = staticmethod(make_geometric_maps)
-    caches = (_images, _estimates)
+    caches = (_loaded,)
 
     @staticmethod
     def found(task: ConfirmTask) -> Facts | None:
@@ -150,19 +158,34 @@ class ConfirmStage(Stage[str, ConfirmTask]):
         return task.maps.facts(task.key)
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result], votes: Mapping[str, Result]) -> None:
-        super().__init__(context, [view.name for view in context.scene.views if view.name in votes])
+        super().__init__(context, context.order.sorted(votes))
         self._vote_keys = keys_of(votes)
         self._voted = {name: result.facts.coverage for name, result in votes.items()}
         self._residuals = residuals_of(matched)
         self._all_partners = partners_of(matched)
-        self._tracks = context.sparse_tracks  # found once, and not by every worker at a time
 
-    def job(self, item: str) -> Job[ConfirmTask]:
-        """See `Stage.job`."""
+    def input_key(self) -> str:
+        """See `RememberingStage`."""
+        context = self.context
+        options = context.options
+        given = (options.pairs, options.rectification, options.confirm, options.normals, options.refinement)
+        matched = sorted((*pair, residual) for pair, residual in self._residuals.items())
+        return context.keys.stage("geometric", context.scene_key, given, matched, self._vote_keys)
+
+    def files(self, item: str) -> list[str]:
+        """See `RememberingStage`."""
+        return self.context.map_files(item, "geometric").paths
+
+    def is_there(self, item: str, key: str) -> bool:
+        """See `RememberingStage`."""
+        return self.context.map_files(item, "geometric").facts(key) is not None
+
+    def ask(self, item: str) -> Job[ConfirmTask]:
+        """See `RememberingStage`."""
         options = self.context.options
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
-        sights = self._tracks.sights(item).between(options.rectification.depths)
+        sights = self.context.sparse_tracks.sights(item).between(options.rectification.depths)
         residuals = [self._residuals[as_pair(item, name)] for name in partners]
         cut = self.context.cut(item)
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights, cut)
@@ -213,12 +236,14 @@ class ConfirmStage(Stage[str, ConfirmTask]):
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """See `Stage.kept_memory`."""
         most = max((self._cost(name).memory for name in self.items), default=0.0)
-        cache = int(min(_CACHE_BYTES, gate.spare(_ROOM * most) / 2))
         filled = (_IMAGE_BYTES + _ESTIMATE_BYTES) * sum(map(self._pixels, self.items))
-        return Kept(cache=cache, caches=2, filled=filled)
+        # Half of what is spare goes to more workers at a time.
+        cache = int(min(filled, gate.spare(_ROOM * most) / 2))
+        return Kept(cache=cache, caches=1, filled=filled)
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""
+        self.remember(results)
         report = self.context.report
         names = [view.name for view in self.context.scene.views]
         report.coverage = {name: results[name].facts.coverage if name in results else 0.0 for name in names}

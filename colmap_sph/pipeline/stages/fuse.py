@@ -7,10 +7,12 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
+from colmap_sph.pipeline.known.remembering import done
 from colmap_sph.pipeline.memory import format_memory, resident
 from colmap_sph.pipeline.stages.cloud import (
     begin_cloud,
@@ -21,9 +23,11 @@ from colmap_sph.pipeline.stages.cloud import (
     vouch_for_cloud,
 )
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.fusion_partners import partners_in_fusion
+from colmap_sph.pipeline.stages.fusion_partners import PartnersInFusion
 from colmap_sph.pipeline.stages.fusion_parts import (
     CLOUD_BYTES,
+    FuseTask,
+    Partners,
     PartsStage,
     index_in_model,
     seconds_per_megapixel,
@@ -37,8 +41,8 @@ from colmap_sph.project.cloud_files import (
     link_workspace,
     move_cloud_into_place,
 )
+from colmap_sph.project.cloud_tiles import Part, publish_tiles, write_tiles
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
-from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions
@@ -114,42 +118,58 @@ class FuseStage(PartsStage):
     """Fuses the maps of every image with any depth into its part of the cloud, and joins these."""
 
     def __init__(self, context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> None:
-        items = list(maps)
-        partners = partners_in_fusion(context, pair_keys, items)
-        indices = index_in_model(context)
-        # All at once: where maps turn out to be damaged, their records say other things meanwhile.
-        sources = {name: _sources_of(context, name, indices[name]) for name in items}
-        super().__init__(context, items, partners, sources)
-        self._key = context.keys.cloud({name: maps[name].key for name in maps}, partners, context.scene)
+        super().__init__(context, list(maps))
+        self.with_visibility = context.options.fusion.visibility
+        self._pair_keys = pair_keys
+        self._key = _key_of_cloud(context, pair_keys, maps)
         self._known = known_cloud(context, self._key)
         self._is_there = self._known is not None
 
-    def _done(self) -> Facts | None:
-        """All parts are done where the cloud is."""
-        return None if self._known is None else Facts()
+    @cached_property
+    def partners(self) -> Partners:
+        """See `PartsStage`."""
+        return PartnersInFusion(self.context, self._pair_keys, self.items)
+
+    @cached_property
+    def sources(self) -> Mapping[str, MapSources]:
+        """See `PartsStage`."""
+        indices = index_in_model(self.context)
+        # All at once: where maps turn out to be damaged, their records say other things meanwhile.
+        return {name: _sources_of(self.context, name, indices[name]) for name in self.items}
+
+    def is_missing(self, item: str) -> bool:
+        """See `Stage.is_missing`."""
+        return self._known is None
+
+    def job(self, item: str) -> Job[FuseTask]:
+        """See `Stage.job`: all parts are done where the cloud is."""
+        return super().job(item) if self._known is None else done(self._key, Facts())
 
     @contextmanager
     def opened(self) -> Iterator[None]:
         """Where the cloud must be made, its parts are there until this ends."""
-        list_fused_images(self.context, self.items)
+        list_fused_images(self.context, self._names)
         if self._known is not None:
             yield
             return
         check_places(self.context.workspace)
         warn_of_masks(self.context)
-        with scratch_folder(self._scratch):
+        assert self.sources.keys() == set(self._names)
+        with self.in_scratch():
             yield
 
     def close(self, results: Mapping[str, Result]) -> None:
         """Join the parts to the cloud."""
         context = self.context
+        results = self.in_order(results)
         if self._known is None:
             if not results:
                 raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
             points = sum(result.facts.points for result in results.values())
-            self._put_together(self._stems(results), points)
+            tiles = self._put_together(results, points)
             facts = facts_of_cloud(context, list(results), points, self._partners_among(results))
-            self._known = replace(facts, of_images=tuple(result.facts.points for result in results.values()))
+            of_images = tuple(result.facts.points for result in results.values())
+            self._known = replace(facts, of_images=of_images, tiles=tiles)
             is_complete = not self._report_unread(results) and len(results) == len(self.items)
             vouch_for_cloud(context, self._key, self._known, list(results), is_complete=is_complete)
         report_cloud(context, self._known, list(results))
@@ -159,29 +179,53 @@ class FuseStage(PartsStage):
         among = {}
         for name in results:
             kept = [
-                (other, number) for other, number in zip(*self._partners[name], strict=True) if other in results
+                (other, number) for other, number in zip(*self.partners[name], strict=True) if other in results
             ]
             among[name] = ([other for other, _ in kept], [number for _, number in kept])
         return among
 
-    def _put_together(self, stems: list[Path], points: int) -> None:
-        """Make the cloud of its parts, and move it to its place."""
+    def _put_together(self, results: Mapping[str, Result], points: int) -> int:
+        """Make the cloud of its parts, and move it to its place; return the number of its tiles, 0: one file."""
         workspace = self.context.workspace
-        origin = self.context.scene.origin
+        most = self.context.options.fusion.max_points_per_file
         try:
-            join_parts(stems, self._scratch, points)
-            if origin.any():
-                link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
-            begin_cloud(self.context)  # not before: it may take hours, in which the one that is there is whole
-            move_cloud_into_place(self._scratch, workspace, origin)
+            if 0 < most < points:
+                return self._put_together_tiles(results, most)
+            self._put_together_file(self._stems(results), points)
         except (OSError, RuntimeError) as error:
             raise OutputError(
                 f"{workspace.fused_path} cannot be written ({reason_of(error)}); check space and permissions."
             ) from error
+        return 0
+
+    def _put_together_file(self, stems: list[Path], points: int) -> None:
+        workspace = self.context.workspace
+        origin = self.context.scene.origin
+        join_parts(stems, self._scratch, points, with_visibility=self.context.options.fusion.visibility)
+        if origin.any():
+            link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
+        begin_cloud(self.context)  # not before: it may take hours, in which the one that is there is whole
+        move_cloud_into_place(self._scratch, workspace, origin)
+
+    def _put_together_tiles(self, results: Mapping[str, Result], most: int) -> int:
+        context = self.context
+        made = self._scratch / "tiles"
+        in_place = context.order.sorted(results)  # so that tiles are of neighbouring images
+        parts = [Part(self._stem(name), results[name].facts.points) for name in in_place]
+        with_visibility = context.options.fusion.visibility
+        index = write_tiles(parts, made, most, context.scene.origin, with_visibility=with_visibility)
+        publish_tiles(made, context.workspace)
+        return len(index.tiles)
 
     def count(self, results: Mapping[str, Result]) -> tuple[int, int]:
         """One cloud."""
         return int(not self._is_there), int(self._is_there)
+
+
+def _key_of_cloud(context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> str:
+    """The pairs and the model tell who looks where, and who stands beside whom."""
+    pairs = (sorted(pair_keys), context.options.pairs.min_triangulation_angle)
+    return context.keys.cloud({name: result.key for name, result in maps.items()}, pairs, context.scene)
 
 
 def _sources_of(context: "Context", name: str, index: int) -> MapSources:
@@ -213,9 +257,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         self._views = [context.scene.view(name) for name in self._names]
         # Without tracks COLMAP would find no images that overlap.
         self._partners = None if context.scene.has_tracks else partners_of(pair_keys)
-        self._key = context.keys.cloud(
-            {name: maps[name].key for name in maps}, self._partners or {}, context.scene
-        )
+        self._key = _key_of_cloud(context, pair_keys, maps)
         self._known = known_cloud(context, self._key)
 
     def job(self, item: str) -> Job[ColmapFuseTask]:

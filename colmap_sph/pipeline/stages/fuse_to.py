@@ -12,7 +12,8 @@ from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.pipeline.stages.view_maps import MapSources
 from colmap_sph.project.cloud_files import join_parts
 from colmap_sph.project.cloud_output import CloudOutput
-from colmap_sph.project.files import real_path, scratch_folder
+from colmap_sph.project.cloud_tiles import retire_tiles
+from colmap_sph.project.files import real_path
 from colmap_sph.project.state.records import begin
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Region
@@ -42,20 +43,33 @@ class FuseToStage(PartsStage):
         output: CloudOutput,
         region: Region | None = None,
     ) -> None:
-        super().__init__(context, list(sources), partners, sources)
+        super().__init__(context, list(sources))
+        self._partners = partners
+        self._sources = sources
         self.region = region
         self._output = output
+
+    @property
+    def partners(self) -> Partners:
+        """See `PartsStage`."""
+        return self._partners
+
+    @property
+    def sources(self) -> Mapping[str, MapSources]:
+        """See `PartsStage`."""
+        return self._sources
 
     @contextmanager
     def opened(self) -> Iterator[None]:
         """The parts of the cloud are there until this ends."""
         warn_of_masks(self.context)
-        with scratch_folder(self._scratch):
+        with self.in_scratch():
             yield
 
     def close(self, results: Mapping[str, Result]) -> None:
         """Join the parts to the cloud."""
         context = self.context
+        results = self.in_order(results)
         if not results:
             raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
         points = sum(result.facts.points for result in results.values())
@@ -80,5 +94,6 @@ class FuseToStage(PartsStage):
             begin(context.cloud_place.record, context.cloud_place.files)
             for path in context.cloud_place.files[2:]:
                 Path(path).unlink(missing_ok=True)
+            retire_tiles(context.workspace)
         made = Workspace(self._scratch)
         self._output.write(made, context.workspace.sparse_dir, context.scene.origin)

@@ -1,7 +1,11 @@
 """Maps of a view and of those that overlap it → its part of the cloud: what every way to make a cloud shares."""
 
+import math
+from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +18,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.cloud_files import write_part
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.images.reading import bytes_to_reduce
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.scene import Region
@@ -25,7 +30,7 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.memory import MemoryGate
 
 Partners = Mapping[str, tuple[list[str], list[int]]]
-"""For each image to fuse those that it is looked up in, and their stations; see `partners_in_fusion`."""
+"""For each image to fuse those that it is looked up in, and their stations; see `PartnersInFusion`."""
 
 CLOUD_BYTES = 12.0
 """Bytes on disk per pixel, of the cloud."""
@@ -44,7 +49,8 @@ _maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 class FuseTask:
     """A view to fuse, those that overlap it, what to add to its points, and the path of its part less suffixes.
 
-    Of a `region`, in the scene's frame, only the points inside are made.
+    Of a `region`, in the scene's frame, only the points inside are made. `needed` says when the maps of the view
+    and of each partner are needed next, see `LoadCache.get`.
     """
 
     reference: MapSources
@@ -54,32 +60,39 @@ class FuseTask:
     offset: NDArray[np.float64]
     stem: Path
     region: Region | None = None
+    needed: tuple[float, ...] = ()
+    with_visibility: bool = True
 
 
 def make_cloud_part(task: FuseTask) -> Facts:
     """Fuse a view; writes the points of the cloud which it sees better than any other."""
-    reference = _view_maps(task.reference)
+    needed = task.needed or (0.0,) * (1 + len(task.partners))
+    reference = _view_maps(task.reference, needed[0])
     if task.region is not None:
         inside = pixels_inside(reference.view, reference.depth, task.region)
         reference = replace(reference, depth=np.where(inside, reference.depth, np.float32(0)))
     unread: dict[str, str] = {}
-    partners = _partner_maps(task.partners, unread)
+    partners = _partner_maps(task.partners, needed[1:], unread)
     bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
-    return Facts(points=write_part(task.stem, bands), unread=unread)
+    points = write_part(task.stem, bands, with_visibility=task.with_visibility)
+    return Facts(points=points, unread=unread)
 
 
-def _view_maps(sources: MapSources) -> ViewMaps:
+def _view_maps(sources: MapSources, needed: float) -> ViewMaps:
     files = (sources.depth, sources.normals, sources.image, sources.mask)
     stamps = [file_stamp(file) for file in files if file is not None]
     size = (sources.view.width, sources.view.height)
-    return _maps.get(f"{sources.index} {size} {stamps}", lambda: read_view_maps(sources))
+    return _maps.get(f"{sources.index} {size} {stamps}", lambda: read_view_maps(sources), needed)
 
 
-def _partner_maps(partners: Sequence[MapSources], unread: dict[str, str]) -> Iterator[ViewMaps | None]:
+def _partner_maps(
+    partners: Sequence[MapSources], needed: Sequence[float], unread: dict[str, str]
+) -> Iterator[ViewMaps | None]:
     """Maps of the partners; None for one whose maps cannot be read, and the reason in `unread`."""
-    for sources in partners:
+    for sources, when in zip(partners, needed, strict=True):
+        maps: ViewMaps | None
         try:
-            maps = _view_maps(sources)
+            maps = _view_maps(sources, when)
         except InputError as error:
             unread[sources.view.name] = str(error)
             maps = None
@@ -97,12 +110,8 @@ class PartsStage(Stage[str, FuseTask]):
     Parameters
     ----------
     context : Context
-    items : sequence of str
-        Names of the images.
-    partners : mapping
-        See `Partners`.
-    sources : mapping of str to MapSources
-        Where what is fused of each image lies.
+    names : sequence of str
+        Of the images, in the order in which their parts are joined.
     """
 
     name = "fuse"
@@ -111,43 +120,74 @@ class PartsStage(Stage[str, FuseTask]):
     region: Region | None = None
     """Where points are wanted, see `FuseTask`."""
 
-    def __init__(
-        self, context: "Context", items: Sequence[str], partners: Partners, sources: Mapping[str, MapSources]
-    ) -> None:
-        super().__init__(context, items)
-        self._partners = partners
-        self._sources = sources
+    with_visibility = True
+    """Whether it shall be known which images see each point."""
+
+    def __init__(self, context: "Context", names: Sequence[str]) -> None:
+        super().__init__(context, context.order.sorted(names))
+        self._names = names
+        self._is_open = False
         self._scratch = context.workspace.fusion_scratch_dir
         self._key = ""
 
-    def _done(self) -> Facts | None:
-        """What is known of a part where it need not be made."""
-        return None
+    @property
+    @abstractmethod
+    def partners(self) -> Partners:
+        """Of each image."""
+
+    @cached_property
+    def needed(self) -> dict[str, tuple[float, ...]]:
+        """When the maps of each image and of its partners are needed next, as numbers of items."""
+        needed = {}
+        next_of: dict[str, float] = {}
+        for number, item in reversed(list(enumerate(self.items))):
+            names = [item, *self.partners[item][0]]
+            needed[item] = tuple(next_of.get(name, math.inf) for name in names)
+            next_of |= dict.fromkeys(names, float(number))
+        return needed
+
+    @property
+    @abstractmethod
+    def sources(self) -> Mapping[str, MapSources]:
+        """Where what is fused of each image lies."""
 
     def job(self, item: str) -> Job[FuseTask]:
         """See `Stage.job`."""
         scene = self.context.scene
         pixels = scene.view(item).num_pixels
-        partners, stations = self._partners[item]
+        partners, stations = self.partners[item]
         seconds = seconds_per_megapixel(len(partners))
         memory = _FUSE_BYTES * pixels + bytes_to_reduce(*map(scene.view, [item, *partners]))
         cost = Cost(seconds * pixels / 1e6, memory, CLOUD_BYTES * pixels)
         task = FuseTask(
-            self._sources[item],
-            tuple(self._sources[partner] for partner in partners),
+            self.sources[item],
+            tuple(self.sources[partner] for partner in partners),
             tuple(stations),
             self.context.options.fusion,
             scene.anchor,
             self._stem(item),
             self.region,
+            self.needed[item] if self._is_open else (),
+            self.with_visibility,
         )
-        return Job(self._key, self._done(), cost, task)
+        return Job(self._key, None, cost, task)
 
     def _stem(self, name: str) -> Path:
         return self._scratch / f"{self.context.scene.view(name).image_id}"
 
+    def in_order(self, results: Mapping[str, Result]) -> dict[str, Result]:
+        """Results in the order in which they are joined, and not in which they were made."""
+        return {name: results[name] for name in self._names if name in results}
+
     def _stems(self, results: Mapping[str, Result]) -> list[Path]:
         return [self._stem(name) for name in results]
+
+    @contextmanager
+    def in_scratch(self) -> Iterator[None]:
+        """Parts are made in a folder that is there until this ends."""
+        self._is_open = bool(self.needed)  # found once, and not by every worker at a time
+        with scratch_folder(self._scratch):
+            yield
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """See `Stage.kept_memory`."""

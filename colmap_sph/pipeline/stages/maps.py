@@ -47,6 +47,11 @@ class MapFiles:
     normals: Path
     record: Path
 
+    @property
+    def paths(self) -> list[str]:
+        """Paths of all three."""
+        return [str(self.depth), str(self.normals), str(self.record)]
+
     def write(
         self,
         normals: NDArray[np.float32],

@@ -6,22 +6,24 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError, RectificationError
+from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
 from colmap_sph.pipeline.stages.photo import Grey, Photo
-from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
 from colmap_sph.project.masks import read_view_mask
-from colmap_sph.project.state.array_file import OLD_SUFFIX
-from colmap_sph.project.state.ownership import remove_array_files
+from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
+from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs
+from colmap_sph.project.workspace import Known
 from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.census import RectifiedImage
@@ -148,10 +150,11 @@ def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] 
     return counts if mask is None else np.minimum(counts, mask)
 
 
-class MatchStage(Stage[Pair, MatchTask]):
+class MatchStage(RememberingStage[Pair, MatchTask]):
     """Matches pairs of image names."""
 
     name = "match pairs"
+    remembered_as: ClassVar[Known | None] = "pairs"
     make = staticmethod(make_disparity_map)
     caches = (_photos, _masks)
 
@@ -167,8 +170,23 @@ class MatchStage(Stage[Pair, MatchTask]):
         self._unfit: set[Pair] = set()
         self._usual_detail = float(np.median([*context.details.values()] or [1.0]))
 
-    def job(self, item: Pair) -> Job[MatchTask]:
-        """See `Stage.job`; `RectificationError` for a pair that cannot be rectified."""
+    def input_key(self) -> str:
+        """See `RememberingStage`."""
+        context = self.context
+        options = context.options
+        return context.keys.stage("pair", context.scene_key, options.rectification, options.matching)
+
+    def files(self, item: Pair) -> list[str]:
+        """See `RememberingStage`."""
+        return [str(self.context.pair_path(*item))]
+
+    def is_there(self, item: Pair, key: str) -> bool:
+        """See `RememberingStage`."""
+        head = read_head(self.context.pair_path(*item))
+        return head is not None and head.key == key
+
+    def ask(self, item: Pair) -> Job[MatchTask]:
+        """See `RememberingStage`; `RectificationError` for a pair that cannot be rectified."""
         context = self.context
         first, second = (context.scene.view(name) for name in item)
         points = shared_points(context.scene, first, second)
@@ -254,8 +272,10 @@ class MatchStage(Stage[Pair, MatchTask]):
     @contextmanager
     def opened(self) -> Iterator[None]:
         """See `Stage.opened`."""
-        make_dir(self.context.workspace.pairs_dir)
+        for folder in sorted({self.context.pair_path(*pair).parent for pair in self.items}):
+            make_dir(folder)
         remove_array_files(self.context.workspace, OLD_SUFFIX)
+        remove_flat_pairs(self.context.workspace)
         yield
 
     @contextmanager
@@ -272,3 +292,4 @@ class MatchStage(Stage[Pair, MatchTask]):
             reason = next(iter(report.skipped_pairs.values()), "no pair")
             raise NoResultError(f"None of the {len(self.items)} pairs could be matched ({reason}).")
         report.pairs = len(results)
+        self.remember(results)

@@ -134,6 +134,10 @@ class Stage(ABC, Generic[Item, Task]):
         """Whether there is still time for an item; asked by the worker that is to begin it, in their order."""
         return True
 
+    def is_missing(self, item: Item) -> bool:
+        """Whether the result of an item is surely not there, as can be told at a glance."""
+        return False
+
     def label(self, item: Item) -> str:
         """What an item is called in messages: itself, where it is a name."""
         return str(item)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import (
@@ -17,7 +18,7 @@ from colmap_sph.pipeline.stages.pair_files import (
     residuals_of,
     write_estimate,
 )
-from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Result, keys_of
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.masks import read_view_mask
@@ -126,10 +127,11 @@ def vote_seconds(pairs: int, normals: NormalOptions) -> float:
     return normals_seconds(normals) + _SECONDS * pairs
 
 
-class VoteStage(Stage[str, VoteTask]):
+class VoteStage(RememberingStage[str, VoteTask]):
     """Votes on the depth of every image of the scene. Its results have the keys of the votes."""
 
     name = "vote on depth"
+    remembered_as = "photometric"
     make = staticmethod(make_photometric_maps)
 
     @staticmethod
@@ -139,13 +141,39 @@ class VoteStage(Stage[str, VoteTask]):
         return task.maps.facts(task.maps_key) if is_voted else None
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result]) -> None:
-        super().__init__(context, [view.name for view in context.scene.views])
+        super().__init__(context, context.order.sorted(context.scene.index_of))
         self._pair_keys = keys_of(matched)
         self._residuals = residuals_of(matched)
         self._partners = partners_of(matched)
 
-    def job(self, item: str) -> Job[VoteTask]:
-        """See `Stage.job`."""
+    def input_key(self) -> str:
+        """See `RememberingStage`."""
+        context = self.context
+        options = context.options
+        given = (options.pairs, options.rectification, options.vote, options.normals)
+        matched = sorted((*pair, key, self._residuals[pair]) for pair, key in self._pair_keys.items())
+        return context.keys.stage("vote", context.scene_key, given, matched)
+
+    def files(self, item: str) -> list[str]:
+        """See `RememberingStage`."""
+        maps = self.context.map_files(item, "photometric")
+        return [*maps.paths, str(self.context.estimate_path(item))]
+
+    def is_there(self, item: str, key: str) -> bool:
+        """See `RememberingStage`."""
+        window = self.context.window(item)
+        view = window.view(self.context.scene.view(item))
+        maps = self.context.map_files(item, "photometric")
+        if not is_estimate_there(self.context.estimate_path(item), key, view):
+            return False
+        return maps.facts(self.context.keys.photometric(key)) is not None
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """See `Stage.close`."""
+        self.remember(results)
+
+    def ask(self, item: str) -> Job[VoteTask]:
+        """See `RememberingStage`."""
         context = self.context
         view = context.scene.view(item)
         partners, stations = context.stations.elsewhere(item, self._partners.get(item, []))

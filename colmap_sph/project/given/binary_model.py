@@ -78,7 +78,8 @@ def _camera_end(data: mmap.mmap, offset: int) -> int:
     return offset + 24 + 8 * len(pycolmap.Camera.create_from_model_id(0, camera_model, 1, 1, 1).params)
 
 
-def _image_end(data: mmap.mmap, offset: int) -> int:
+def image_end(data: mmap.mmap, offset: int) -> int:
+    """Offset behind a record of ``images.bin``."""
     end_of_name = data.find(b"\0", offset + 8 + _POSE_BYTES)
     if end_of_name < 0:
         raise ValueError("an image name that does not end")
@@ -86,7 +87,8 @@ def _image_end(data: mmap.mmap, offset: int) -> int:
     return int(end_of_name + 9 + 24 * num_points2D)
 
 
-def _point3D_end(data: mmap.mmap, offset: int) -> int:
+def point3D_end(data: mmap.mmap, offset: int) -> int:
+    """Offset behind a record of ``points3D.bin``."""
     (track_length,) = struct.unpack_from("<Q", data, offset + 43)
     return int(offset + 51 + 8 * track_length)
 
@@ -107,8 +109,8 @@ def _frame_end(data: mmap.mmap, offset: int) -> int:
 
 _RECORD_END: dict[str, Callable[[mmap.mmap, int], int]] = {
     "cameras.bin": _camera_end,
-    "images.bin": _image_end,
-    "points3D.bin": _point3D_end,
+    "images.bin": image_end,
+    "points3D.bin": point3D_end,
     "rigs.bin": _rig_end,
     "frames.bin": _frame_end,
 }

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import xxhash
 
+from colmap_sph.project.cloud_tiles import INDEX
 from colmap_sph.project.state.records import recorded_facts, stamp_of
 from colmap_sph.project.workspace import MapKind, Workspace
 
@@ -36,7 +37,10 @@ def is_cloud_of(workspace: Workspace, maps: Iterable[tuple[str, MapKind]]) -> bo
     bool or None
         None where that is not known: another program made it, or an earlier version.
     """
-    known = recorded_facts(workspace.cloud_record_path, _Marked, workspace.cloud_paths)
+    if workspace.fused_path.exists():
+        known = recorded_facts(workspace.cloud_record_path, _Marked, workspace.cloud_paths)
+    else:
+        known = recorded_facts(workspace.tiles_record_path, _Marked, [workspace.tiles_dir / INDEX])
     if known is None or not known.of_maps:
         return None
     return set(known.of_maps) <= {map_mark(workspace, name, kind) for name, kind in maps}

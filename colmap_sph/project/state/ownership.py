@@ -4,6 +4,7 @@ A file is ours where a record says so. Arrays in files of our own are ours by th
 """
 
 import logging
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import get_args
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.cloud_files import remove_local_workspace
+from colmap_sph.project.cloud_tiles import INDEX, damaged_tiles, read_index, retire_tiles
 from colmap_sph.project.files import remove, set_aside, whole_digest
 from colmap_sph.project.state.array_file import OLD_SUFFIX, SUFFIX, is_array_file, is_whole
 from colmap_sph.project.state.records import (
@@ -37,7 +39,7 @@ class Place:
     @property
     def foreign(self) -> list[Path]:
         """Files that are there, though no record knows of them."""
-        return altered_files(None, self.files) if read_record(self.record) is None else []
+        return [] if os.path.lexists(self.record) else altered_files(None, self.files)
 
 
 def map_place(workspace: Workspace, name: str, kind: MapKind) -> Place:
@@ -50,6 +52,11 @@ def cloud_place(workspace: Workspace, *, local: bool) -> Place:
     """The cloud and its visibility, and for a model in map coordinates (`local`) the cloud near its origin."""
     near = (Workspace(workspace.local_dir).fused_path,) if local else ()
     return Place(workspace.cloud_record_path, (*workspace.cloud_paths, *near))
+
+
+def tiles_place(workspace: Workspace) -> Place:
+    """The index of a cloud in tiles, which vouches for these."""
+    return Place(workspace.tiles_record_path, (workspace.tiles_dir / INDEX,))
 
 
 def fusion_cfg_place(workspace: Workspace) -> Place:
@@ -84,6 +91,8 @@ def recorded_places(workspace: Workspace) -> Iterator[Place]:
     cloud = read_record(workspace.cloud_record_path)
     if cloud is not None:
         yield cloud_place(workspace, local=len(cloud.stamps) != len(workspace.cloud_paths))
+    if read_record(workspace.tiles_record_path) is not None:
+        yield tiles_place(workspace)
     if read_record(workspace.fusion_cfg_record_path) is not None:
         yield fusion_cfg_place(workspace)
 
@@ -177,6 +186,13 @@ def remove_array_files(workspace: Workspace, *suffixes: str) -> None:
             remove(path)
 
 
+def remove_flat_pairs(workspace: Workspace) -> None:
+    """Remove disparity maps of an earlier version, which had all of them in one folder."""
+    for path in sorted(workspace.pairs_dir.glob(f"*{SUFFIX}")):
+        if is_array_file(path):
+            remove(path)
+
+
 def remove_recorded(workspace: Workspace) -> list[Path]:
     """Remove maps, cloud and intermediate results of ours, and their records.
 
@@ -190,10 +206,14 @@ def remove_recorded(workspace: Workspace) -> list[Path]:
     OutputError
         A file cannot be removed.
     """
+    retire_tiles(workspace)
     altered = _remove(recorded_places(workspace))
     remove_array_files(workspace, SUFFIX, OLD_SUFFIX)
     remove_local_workspace(workspace)
-    remove_empty_folders(workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir)
+    for path in workspace.known_paths:
+        remove(path)
+    folders = (workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir, workspace.known_dir)
+    remove_empty_folders(*folders)
     return altered
 
 
@@ -256,6 +276,10 @@ def damaged_files(result: Place | Path) -> list[Path]:
     # What is missing is made again without more ado.
     there = [(path, digest) for path, digest in zip(result.files, known.digests, strict=False) if path.exists()]
     damaged = [path for path, digest in there if not _has_digest(path, digest)]
+    for path in result.files:
+        index = read_index(path.parent) if path.name == INDEX and not damaged else None
+        if index is not None:
+            damaged += damaged_tiles(path.parent, index)
     if damaged:
         invalidate(result.record, "doubtful")
     return damaged

@@ -179,16 +179,16 @@ def vouch(
         JSON file to write; its folder is created.
     key : str
     files : mapping of Path to str
-        With the digest of every byte, see `files.whole_digest`.
+        With the digest of every byte, see `files.whole_digest`; empty for one that is not wanted.
     facts : dataclass, optional
         What a later run wants to know without reading the files.
     state : {"done", "void"}
         "void": they are not what they should be, and only ours.
     """
     stamps = []
-    for path in files:
+    for path, digest in files.items():
         try:
-            stamps.append(_stamp(path))
+            stamps.append(_stamp(path) if digest else "")
         except OSError as error:
             raise OutputError(f"{path} cannot be read back ({reason_of(error)}); run again.") from error
     plain = {} if facts is None else asdict(facts)
@@ -215,10 +215,11 @@ def _sync_and_vouch(
     facts: "DataclassInstance | None",
     state: Literal["done", "void"],
 ) -> None:
+    written = [path for path, digest in files.items() if digest]
     try:
-        for path in files:
+        for path in written:
             sync_file(path)
-        for folder in {path.parent for path in files}:
+        for folder in {path.parent for path in written}:
             sync_folder(folder)
     except OSError as error:
         raise OutputError(
@@ -247,7 +248,8 @@ def vouched_facts(record: Path, key: str, files: Sequence[Path], kind: type[T]) 
     known = read_record(record)
     if known is None or known.state != "done" or known.key != key or len(known.digests) != len(files):
         return None
-    if altered_files(known, files) or not all(path.is_file() for path in files):
+    wanted = [path for path, digest in zip(files, known.digests, strict=True) if digest]
+    if altered_files(known, files) or not all(path.is_file() for path in wanted):
         return None
     return _facts_of(known, kind)
 

@@ -6,7 +6,7 @@ without matches the overlap of the viewing frusta.
 
 import logging
 from collections.abc import Mapping
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ _ANGLE_PERCENTILE = 75
 
 
 class Covisibility:
-    """Candidates of every view with the weight of each, and the angles of pairs, computed when asked for.
+    """Candidates of every view with the weight of each; angles and worth are computed when asked for.
 
     Parameters
     ----------
@@ -57,8 +57,10 @@ class Covisibility:
         self._weights = weights
         self._points = points
         self._observed = observed
-        self._angles: dict[tuple[int, int], float] = {}
-        self._is_observed = np.zeros(len(points), dtype=bool)
+        by_point = _incidence(observed, len(points)).T.tocsr()
+        by_point.sort_indices()
+        self._first, self._observers = by_point.indptr, by_point.indices
+        self._place = np.full(len(observed), -1)
 
     def weight(self, i: int, j: int) -> int:
         """Return what views `i` and `j` share."""
@@ -72,44 +74,68 @@ class Covisibility:
         order = np.lexsort((views, -weights))
         return views[order].astype(np.int64), weights[order].astype(np.int64)
 
-    def angle(self, i: int, j: int) -> float:
-        """Return the 75th percentile of the triangulation angles in degrees; NaN without common points."""
-        key = (min(i, j), max(i, j))
-        if key not in self._angles:
-            self._angles[key] = self._compute_angle(*key)
-        return self._angles[key]
+    def angles(self, i: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Return the parallax of view `i` with each of (C,) others, degrees; NaN without common points.
+
+        It is the 75th percentile of the triangulation angles over an even part of the points that both see.
+        """
+        entry, place = self._seen_too(self._observed[i], others)
+        by_view = np.argsort(place, kind="stable")  # within each view the points ascend
+        rows, place = self._observed[i][entry[by_view]], place[by_view]
+        counts = np.bincount(place, minlength=len(others))
+        # Spread evenly over the points, whose order says nothing about where they are.
+        within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
+        kept = within % -(-np.maximum(counts, 1) // _MAX_ANGLE_POINTS)[place] == 0
+        rows, place = rows[kept], place[kept]
+        angles = triangulation_angles(self._points[rows], self.centers[i], self.centers[others][place])
+        return _percentiles(angles, place, len(others))
 
     def seen_by(self, i: int) -> NDArray[np.float64]:
         """Return the (n, 3) points that view `i` observes or has in view."""
         return self._points[self._observed[i]]
 
-    def worth(self, i: int, j: int) -> NDArray[np.float32]:
-        """Return how well view `j` would serve the points of view `i`, or an even part of them."""
+    def worths(self, i: int, others: NDArray[np.int64]) -> NDArray[np.float32]:
+        """Return how well each of (C,) views would serve the points of view `i`, or an even part of them."""
         rows = self._observed[i]
         rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
-        believed: NDArray[np.bool_] | float
+        believed: NDArray[Any]
         if self.source == "database":
-            believed = float(self.weight(i, j) / self._weights[[i]].max())
+            most = self._weights[[i]].max()
+            believed = np.array([[self.weight(i, int(j)) / most] for j in others])
         else:
-            believed = self._observes(j, rows)
+            entry, place = self._seen_too(rows, others)
+            believed = np.zeros((len(others), len(rows)), bool)
+            believed[place, entry] = True
         views = self.scene.views
-        return worth_of(views[i], views[j], self._points[rows], believed)
+        return worth_of(views[i], [views[j] for j in others], self._points[rows], believed)
 
-    def _observes(self, i: int, rows: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Return which of the points view `i` observes."""
-        self._is_observed[self._observed[i]] = True
-        result = self._is_observed[rows]
-        self._is_observed[self._observed[i]] = False
-        return result
+    def _seen_too(
+        self, rows: NDArray[np.int64], others: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Find who else sees some points: entries in `rows`, ascending, and in `others`, one for each sight."""
+        self._place[others] = np.arange(len(others))
+        counts = self._first[rows + 1] - self._first[rows]
+        entry = np.repeat(np.arange(len(rows)), counts)
+        behind = np.arange(len(entry)) - np.repeat(np.cumsum(counts) - counts, counts)
+        place = self._place[self._observers[self._first[rows][entry] + behind]]
+        self._place[others] = -1
+        return entry[place >= 0], place[place >= 0]
 
-    def _compute_angle(self, i: int, j: int) -> float:
-        shared = self._observed[j][self._observes(i, self._observed[j])]
-        if len(shared) == 0:
-            return float("nan")
-        # Spread evenly over the points, whose order says nothing about where they are.
-        points = self._points[shared[:: -(-len(shared) // _MAX_ANGLE_POINTS)]]
-        angles = triangulation_angles(points, self.centers[i], self.centers[j])
-        return float(np.percentile(angles, _ANGLE_PERCENTILE))
+
+def _percentiles(values: NDArray[np.float64], group: NDArray[np.int64], groups: int) -> NDArray[np.float64]:
+    """The percentile of the values of each group, which lie together, as NumPy has it; NaN of an empty one."""
+    values = values[np.lexsort((values, group))]
+    counts = np.bincount(group, minlength=groups)
+    result = np.full(groups, np.nan)
+    some = np.flatnonzero(counts)
+    first = (np.cumsum(counts) - counts)[some]
+    place = (counts[some] - 1) * (_ANGLE_PERCENTILE / 100)
+    below = np.floor(place).astype(np.int64)
+    low, high = values[first + below], values[first + np.minimum(below + 1, counts[some] - 1)]
+    share = place - below
+    step = high - low
+    result[some] = np.where(share >= 0.5, high - step * (1 - share), low + step * share)
+    return result
 
 
 def find_covisibility(
@@ -143,11 +169,16 @@ def find_covisibility(
 
 def _shared_points(observed: list[NDArray[np.int64]], num_points: int, least: int) -> sparse.csr_array:
     """Count the points that two views share, as a (V, V) matrix of counts of at least `least`."""
-    indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
-    indices = np.concatenate([*observed, np.empty(0, np.int64)])
-    ones = np.ones(len(indices), dtype=np.int32)
-    seen = sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
+    seen = _incidence(observed, num_points)
     return _without_self_and_few(seen @ seen.T, least)
+
+
+def _incidence(observed: list[NDArray[np.int64]], num_points: int) -> sparse.csr_array:
+    """(V, N) matrix of ones where a view sees a point."""
+    indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
+    indices = np.concatenate([*observed, np.empty(0, np.int64)]).astype(np.int32)
+    ones = np.ones(len(indices), dtype=np.int32)
+    return sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
 
 
 def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_array:

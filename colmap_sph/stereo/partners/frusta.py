@@ -7,6 +7,8 @@ of these distances away. So every view's frustum is sampled at a few multiples o
 and whoever sees most of each other's samples overlaps most. Occlusion is not considered.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
@@ -43,8 +45,11 @@ def points_in_view(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
     """
     finite = np.asarray(np.isfinite(scene.points).all(axis=1))
     posed = [bool(np.isfinite(view.cam_from_world).all()) for view in scene.views]
+    all_finite = bool(finite.all())
     observed = [
-        view.point_indices[finite[view.point_indices]] if good else np.empty(0, np.int64)
+        (view.point_indices if all_finite else view.point_indices[finite[view.point_indices]])
+        if good
+        else np.empty(0, np.int64)
         for view, good in zip(scene.views, posed, strict=True)
     ]
     if any(len(indices) for indices in observed):
@@ -121,6 +126,18 @@ def _sample(view: View, depth: float) -> NDArray[np.float64]:
     pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
     rays = pixels @ np.linalg.inv(view.K).T
     return np.asarray((depth * rays - view.t) @ view.R)
+
+
+def seen_by(views: Sequence[View], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(V, N) bool: which of (N, 3) points each view has in its image, as `sees` has it."""
+    rotations = np.array([view.R.T for view in views])
+    calibrations = np.array([view.K.T for view in views])
+    camera = points @ rotations + np.array([view.t for view in views])[:, None]
+    x, y, w = np.moveaxis(camera @ calibrations, -1, 0)
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        x, y = x / w, y / w
+    widths, heights = np.array([(view.width, view.height) for view in views]).T[..., None]
+    return np.asarray((camera[..., 2] > 0) & (x > 0) & (y > 0) & (x < widths) & (y < heights))
 
 
 def sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:

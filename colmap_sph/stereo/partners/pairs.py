@@ -25,6 +25,8 @@ logger = logging.getLogger(__name__)
 PairSource = CovisibilitySource | Literal["patch-match.cfg"]
 # Candidates that a view chooses from, unless it is to have more.
 _MAX_CANDIDATES = 100
+# So many are looked at together.
+_AT_A_TIME = 64
 # So many times as many may stand beside these.
 _MAX_BESIDE = 10
 
@@ -159,20 +161,30 @@ def select_pairs(
         selection = PairSelection(partners, graph.source)
     else:
         selection = _explicit_selection(graph, options, explicit)
-    _report(selection, options)
+    report_selection(selection, options)
     return selection
 
 
-def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
-    """Names of up to `most` views that overlap each view, those which share most points with it first.
+class Overlap:
+    """Tells which views overlap each view of a scene; may be used by several threads.
 
     Where the model has no tracks, projected points or the frusta say what overlaps.
     """
-    graph = find_covisibility(scene, 1, None)
-    return {
-        view.name: [scene.views[j].name for j in graph.candidates(i)[0][:most]]
-        for i, view in enumerate(scene.views)
-    }
+
+    def __init__(self, scene: Scene) -> None:
+        self._graph = find_covisibility(scene, 1, None)
+
+    def of(self, name: str, most: int) -> list[str]:
+        """Names of up to so many views, those which share most points with the view first."""
+        scene = self._graph.scene
+        candidates, _ = self._graph.candidates(scene.index_of[name])
+        return [scene.views[j].name for j in candidates[:most]]
+
+
+def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
+    """Names of up to `most` views that overlap each view, see `Overlap`."""
+    overlap = Overlap(scene)
+    return {view.name: overlap.of(view.name, most) for view in scene.views}
 
 
 def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[Partner, ...]:
@@ -186,25 +198,33 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
     beside: list[Partner] = []
     worths: list[NDArray[np.float32]] = []
     most = max(_MAX_CANDIDATES, options.num_pairs)
-    stations = StationCounter(graph.seen_by(i), graph.scene.views[i], options.min_triangulation_angle)
-    for j, weight in zip(*graph.candidates(i), strict=True):
+    views = graph.scene.views
+    stations = StationCounter(graph.seen_by(i), views[i], options.min_triangulation_angle)
+    candidates, weights = graph.candidates(i)
+    for first in range(0, len(candidates), _AT_A_TIME):
         if len(near) == most or len(near) + len(wide) == 2 * most or len(beside) == _MAX_BESIDE * most:
             break
-        angle = graph.angle(i, int(j))
-        if np.isnan(angle) and np.array_equal(graph.centers[i], graph.centers[j]):
-            continue
-        if angle < options.min_triangulation_angle:
-            continue
-        partner = Partner(graph.scene.views[j].name, int(weight), angle)
-        if not stations.is_new(graph.scene.views[j]):
-            beside.append(partner)
-        elif angle > options.max_triangulation_angle:
-            wide.append(partner)
-        else:
-            near.append(partner)
-            worths.append(graph.worth(i, int(j)))
-    chosen = [near[k] for k in choose(worths, options.num_pairs)]
-    return tuple((chosen + wide + beside)[: options.num_pairs])
+        some = candidates[first : first + _AT_A_TIME]
+        angles = graph.angles(i, some)
+        is_apart = ~np.isnan(angles) | (graph.centers[some] != graph.centers[i]).any(axis=1)
+        good = np.flatnonzero(is_apart & ~(angles < options.min_triangulation_angle))
+        is_new = stations.are_new([views[j] for j in some[good]])
+        chosen = []
+        for k, new in zip(good.tolist(), is_new, strict=True):
+            if len(near) == most or len(near) + len(wide) == 2 * most or len(beside) == _MAX_BESIDE * most:
+                break
+            partner = Partner(views[some[k]].name, int(weights[first + k]), float(angles[k]))
+            if not new:
+                beside.append(partner)
+            elif angles[k] > options.max_triangulation_angle:
+                wide.append(partner)
+            else:
+                near.append(partner)
+                chosen.append(k)
+        if chosen:
+            worths.append(graph.worths(i, some[chosen]))
+    best = choose(np.concatenate(worths), options.num_pairs) if worths else []
+    return tuple(([near[k] for k in best] + wide + beside)[: options.num_pairs])
 
 
 def _explicit_selection(
@@ -223,8 +243,10 @@ def _explicit_selection(
         obeyed = True
         named = index_of if sources == "__all__" else sources
         known = [index_of[other] for other in named if other in index_of and other != name]
+        angles = graph.angles(i, np.array(known, np.int64))
         partners[name] = tuple(
-            Partner(graph.scene.views[j].name, graph.weight(i, j), graph.angle(i, j)) for j in known
+            Partner(graph.scene.views[j].name, graph.weight(i, j), float(angle))
+            for j, angle in zip(known, angles, strict=True)
         )
     return PairSelection(partners, "patch-match.cfg" if obeyed else graph.source)
 
@@ -238,7 +260,8 @@ def _warn_unknown(explicit: Mapping[str, SourceImages], index_of: Mapping[str, i
         logger.warning("patch-match.cfg names %s, which is not among the usable images; ignored", name)
 
 
-def _report(selection: PairSelection, options: PairOptions) -> None:
+def report_selection(selection: PairSelection, options: PairOptions) -> None:
+    """Log what was chosen; `NoResultError` where no image has a partner."""
     words = {
         "tracks": "the sparse points that images share",
         "database": "the verified matches in the database, as the model has no tracks",

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.scene import View
-from colmap_sph.stereo.partners.frusta import sees
+from colmap_sph.stereo.partners.frusta import seen_by
 
 # What a point that a view and a candidate both observe is worth; one that only lies in the candidate's view, where
 # something may hide it, is worth the rest.
@@ -29,55 +29,60 @@ def triangulation_angles(
 
     Parameters
     ----------
-    points : (n, 3) float64 ndarray
+    points : (…, 3) float64 ndarray
         World frame.
-    center1, center2 : (3,) float64 ndarray
-        Projection centres, world frame.
+    center1, center2 : (…, 3) float64 ndarray
+        Projection centres, world frame: of all points, or of each.
 
     Returns
     -------
-    (n,) float64 ndarray
+    (…) float64 ndarray
         Degrees, 0 to 180.
     """
-    rays1 = center1 - points
-    rays2 = center2 - points
+    x1, y1, z1 = np.moveaxis(center1 - points, -1, 0)
+    x2, y2, z2 = np.moveaxis(center2 - points, -1, 0)
     # Unlike the arc cosine, exact for small angles.
-    sines = np.linalg.norm(np.cross(rays1, rays2), axis=1)
-    return np.asarray(np.degrees(np.arctan2(sines, np.einsum("ij,ij->i", rays1, rays2))))
+    x, y, z = y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2
+    sines = np.sqrt(x * x + y * y + z * z)
+    return np.asarray(np.degrees(np.arctan2(sines, x1 * x2 + y1 * y2 + z1 * z2)))
 
 
 def worth_of(
-    view: View, candidate: View, points: NDArray[np.float64], observed: NDArray[np.bool_] | float
+    view: View, candidates: Sequence[View], points: NDArray[np.float64], observed: NDArray[np.bool_] | float
 ) -> NDArray[np.float32]:
-    """How well a candidate would serve each point of a view.
+    """How well candidates would serve each point of a view.
 
     Parameters
     ----------
-    view, candidate : View
+    view : View
+    candidates : sequence of View
+        C of them.
     points : (N, 3) float64 ndarray
         Points that the view observes, world frame.
-    observed : (N,) bool ndarray or float
-        Which of them the candidate observes, too; or where that is not known, how much to believe that it does.
+    observed : (C, N) bool ndarray, or (C, 1) or a float
+        Which of them each candidate observes, too; or where that is not known, how much to believe that it does.
 
     Returns
     -------
-    (N,) float32 ndarray
+    (C, N) float32 ndarray
         0 to 1.
     """
-    angles = triangulation_angles(points, view.center, candidate.center)
-    in_sight = sees(candidate, points)
-    if isinstance(observed, np.ndarray):
+    centers = np.array([candidate.center for candidate in candidates])
+    angles = triangulation_angles(points, view.center, centers[:, None])
+    in_sight = seen_by(candidates, points)
+    observed = np.asarray(observed)
+    if observed.dtype == bool:
         in_sight |= observed  # whatever the rounding at the image's rim
     parallax = np.interp(angles, _ANGLES, (0.0, 1.0, 1.0, 0.0))
     return np.asarray(in_sight * parallax * (1 - _OBSERVED + _OBSERVED * observed), dtype=np.float32)
 
 
-def choose(worths: Sequence[NDArray[np.float32]], count: int) -> list[int]:
+def choose(worths: NDArray[np.float32], count: int) -> list[int]:
     """Choose up to `count` candidates, the best first.
 
     Parameters
     ----------
-    worths : sequence of (N,) float32 ndarray
+    worths : (C, N) float32 ndarray
         Worth of each candidate for each point, see `worth_of`.
     count : int
 
@@ -87,14 +92,13 @@ def choose(worths: Sequence[NDArray[np.float32]], count: int) -> list[int]:
         Indices of candidates; of equals the first.
     """
     chosen: list[int] = []
-    table = np.array(worths)
-    need = np.ones(len(worths[0]) if worths else 0)
+    need = np.ones(worths.shape[1])
     left = np.ones(len(worths), dtype=bool)
     while left.any() and len(chosen) < count:
         # Rounded: of candidates that serve alike the first must win, however their points' places are rounded.
-        gains = np.where(left, np.round(np.einsum("ij,j->i", table, need), 3), -1.0)
+        gains = np.where(left, np.round(np.einsum("ij,j->i", worths, need), 3), -1.0)
         best = int(np.argmax(gains))
         chosen.append(best)
         left[best] = False
-        need *= 1 - (1 - _SEEN_AGAIN) * table[best]
+        need *= 1 - (1 - _SEEN_AGAIN) * worths[best]
     return chosen

@@ -20,6 +20,8 @@ from colmap_sph.stereo.partners.frusta import points_in_view
 # the 75th percentile, too).
 _MAX_POINTS = 64
 _MOST = 0.75
+# Views that are numbered together.
+_AT_A_TIME = 64
 # Views look the same way where their axes are less than 30 degrees apart.
 _SAME_WAY = 0.866
 
@@ -43,33 +45,62 @@ class StationCounter:
     def __init__(self, points: NDArray[np.float64], view: View, least_angle: float) -> None:
         self._points = points[:: -(-len(points) // _MAX_POINTS) or 1]
         self._cosine = float(np.cos(np.radians(least_angle)))
-        self._firsts = self._rays(view)[None]
-        self._axes = [view.viewing_direction]
+        self._firsts = self._rays([view])
+        self._axes = view.viewing_direction[None]
 
-    def number(self, view: View) -> int:
-        """Return the station of a view: the first one whose first view is near enough, or a new one."""
-        rays = self._rays(view)
-        count = len(self._axes)
-        cosines = np.einsum("kpi,pi->kp", self._firsts[:count], rays)
-        is_near = np.count_nonzero(cosines > self._cosine, axis=1) >= max(_MOST * len(rays), 1)
-        is_one = is_near & (np.array(self._axes) @ view.viewing_direction > _SAME_WAY)
-        if is_one.any():
-            return int(np.argmax(is_one))
-        if count == len(self._firsts):
-            self._firsts = np.concatenate([self._firsts, np.empty_like(self._firsts)])
-        self._firsts[count] = rays
-        self._axes.append(view.viewing_direction)
-        return count
+    def numbers(self, views: Sequence[View]) -> list[int]:
+        """Return the station of each view: the first one whose first view is near enough, or a new one."""
+        numbers: list[int] = []
+        for first in range(0, len(views), _AT_A_TIME):
+            numbers += self._numbers(views[first : first + _AT_A_TIME])
+        return numbers
 
-    def is_new(self, view: View) -> bool:
-        """Whether a view stands where none stood before; from then on one does."""
-        before = len(self._axes)
-        return self.number(view) == before
+    def are_new(self, views: Sequence[View]) -> list[bool]:
+        """Whether each view stands where none stood before, the one after the other."""
+        known = len(self._axes)
+        is_new = []
+        for number in self.numbers(views):
+            is_new.append(number == known)
+            known = max(known, number + 1)
+        return is_new
 
-    def _rays(self, view: View) -> NDArray[np.float64]:
-        rays = self._points - view.center
+    def _numbers(self, views: Sequence[View]) -> list[int]:
+        rays = self._rays(views)
+        axes = np.array([view.viewing_direction for view in views])
+        stands_at = self._are_one(rays, axes, self._firsts, self._axes)
+        among = self._are_one(rays, axes, rays, axes)
+        numbers: list[int] = []
+        new: list[int] = []
+        for k in range(len(views)):
+            places = np.flatnonzero(stands_at[k])
+            found = int(places[0]) if len(places) else -1
+            if found < 0:
+                found = next((len(self._axes) + n for n, first in enumerate(new) if among[k, first]), -1)
+            if found < 0:
+                found = len(self._axes) + len(new)
+                new.append(k)
+            numbers.append(found)
+        self._firsts = np.concatenate([self._firsts, rays[new]])
+        self._axes = np.concatenate([self._axes, axes[new]])
+        return numbers
+
+    def _are_one(
+        self,
+        rays: NDArray[np.float64],
+        axes: NDArray[np.float64],
+        others: NDArray[np.float64],
+        other_axes: NDArray[np.float64],
+    ) -> NDArray[np.bool_]:
+        """(V, W) bool: which of two lots of views stand side by side and look the same way."""
+        cosines = np.einsum("vpi,wpi->vwp", rays, others)
+        is_near = np.count_nonzero(cosines > self._cosine, axis=2) >= max(_MOST * rays.shape[1], 1)
+        return np.asarray(is_near & (axes @ other_axes.T > _SAME_WAY))
+
+    def _rays(self, views: Sequence[View]) -> NDArray[np.float64]:
+        """(V, P, 3) unit vectors from the views to the points."""
+        rays = self._points - np.array([view.center for view in views])[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):  # a point at the centre is near to nothing
-            return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+            return np.asarray(rays / np.linalg.norm(rays, axis=2, keepdims=True))
 
 
 class Stations:
@@ -110,7 +141,7 @@ class Stations:
         index = self._scene.index_of[name]
         points, observed = self._points_in_view
         stations = StationCounter(points[observed[index]], self._scene.views[index], self._least_angle)
-        found = [stations.number(self._scene.view(other)) for other in others]
+        found = stations.numbers([self._scene.view(other) for other in others])
         return found if any(found) else list(range(1, 1 + len(found)))
 
     def elsewhere(self, name: str, others: Sequence[str]) -> tuple[list[str], list[int]]:
