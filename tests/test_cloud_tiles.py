@@ -166,6 +166,7 @@ def test_map_coordinates(workspace, tmp_path):
 def test_the_page_shows_them_and_the_full_view_says_what_to_do(workspace):
     fuse(workspace, **TILED)
     index = read_index(workspace.tiles_dir)
+    assert index is not None
     points, colours, total = read_some_of_tiles(workspace.tiles_dir, index, 1000)
     assert total == index.points and 500 < len(points) == len(colours) < 2000
     write_page(workspace)

@@ -2,8 +2,10 @@
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,12 +17,13 @@ from colmap_sph.pipeline.known.selection import read_selection, write_selection
 from colmap_sph.pipeline.known.table import Known, ResultTable, stamp_of_files
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
+from colmap_sph.pipeline.stages import selection as selection_module
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.project import Project
-from colmap_sph.stereo.partners.pairs import PairSelection, Partner
+from colmap_sph.stereo.partners.pairs import PairSelection, Partner, select_pairs
 from colmap_sph.stereo.refinement import RefinementOptions
 
 OPTIONS = RunOptions(threads=1)
@@ -103,16 +106,17 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[object]:
     items: list[object] = []
     # It asks some items of stages whose input it does not know yet.
     monkeypatch.setattr("colmap_sph.pipeline.reconstruct.foreseen_stages", lambda *args, **kwargs: [])
+
+    def noting(original: Callable[..., Any], what: Callable[..., object]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            items.append(what(*args))
+            return original(*args, **kwargs)
+
+        return call
+
     for stage in (MatchStage, VoteStage, ConfirmStage):
-        original = stage.ask
-        monkeypatch.setattr(
-            stage, "ask", lambda self, item, original=original: (items.append(item), original(self, item))[1]
-        )
-    select = colmap_sph.pipeline.stages.selection.select_pairs  # type: ignore[attr-defined]
-    monkeypatch.setattr(
-        "colmap_sph.pipeline.stages.selection.select_pairs",
-        lambda *args, **kwargs: (items.append("selection"), select(*args, **kwargs))[1],
-    )
+        monkeypatch.setattr(stage, "ask", noting(stage.ask, lambda _, item: item))
+    monkeypatch.setattr(selection_module, "select_pairs", noting(select_pairs, lambda *_: "selection"))
     return items
 
 

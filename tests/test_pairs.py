@@ -116,7 +116,7 @@ def test_worth_of_a_candidate() -> None:
 
 def test_what_few_see_is_served_before_what_many_see() -> None:
     left, right = np.repeat([1.0, 0], [90, 10]), np.repeat([0, 1.0], [90, 10])
-    worths = np.float32([left, 0.99 * left, right, 0.98 * left, np.zeros(100), 0.5 * right])
+    worths = np.array([left, 0.99 * left, right, 0.98 * left, np.zeros(100), 0.5 * right], np.float32)
     # Seen once, the left side is worth 0.2 * 90 = 18, more than the right one; seen twice, less than that.
     assert choose(worths, 6) == [0, 1, 2, 3, 5, 4]
     assert choose(worths, 3) == [0, 1, 2]

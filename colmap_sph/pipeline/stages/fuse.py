@@ -109,7 +109,8 @@ def fuse_stage(context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[
     FuseStage or ColmapFuseStage
         On the images with any depth.
     """
-    with_depth = {name: result for name, result in maps.items() if result.facts.coverage > 0}
+    # Their order is that of the cloud's parts.
+    with_depth = {name: maps[name] for name in sorted(maps) if maps[name].facts.coverage > 0}
     stage = ColmapFuseStage if context.options.fusion.method == "colmap" else FuseStage
     return stage(context, pair_keys, with_depth)
 
