@@ -84,6 +84,12 @@ class OutOfMemoryError(ColmapSphError):
         )
 
 
+class LostWorkersError(ColmapSphError):
+    """The machines of a cluster are gone, or die of the work."""
+
+    exit_code = 6
+
+
 class RectificationError(ColmapSphError):
     """A pair that cannot be rectified on the chosen surface; the pair is skipped and reported."""
 

@@ -40,6 +40,12 @@ class Display:
     def __exit__(self, *_: object) -> None:
         self._terminal.settle()
 
+    def engage(self, threads: int, words: str) -> None:
+        """See `Progress`."""
+        self._time_left.engage(threads, words)
+        if words:
+            self._terminal.note(words, label="cluster:")
+
     def foresee(self, stages: Sequence[StageEstimate]) -> None:
         """See `Progress`."""
         self._time_left.foresee(stages)

@@ -73,6 +73,11 @@ class Events:
             disk=round(plan.disk),
         )
 
+    def engage(self, threads: int, words: str) -> None:
+        """See `Progress`."""
+        self._time_left.engage(threads, words)
+        self._write("cluster", threads=threads, words=words)
+
     def foresee(self, stages: Sequence[StageEstimate]) -> None:
         """See `Progress`."""
         self._time_left.foresee(stages)

@@ -2,18 +2,47 @@
 
 import logging
 import time
-from collections.abc import Callable, Hashable
-from typing import TypeVar
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.util import find_spec
+from typing import Any, Protocol, TypeVar
 
+from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.memory import MemoryGate
+from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.stage import Job, Result, Stage
 from colmap_sph.pipeline.workers import for_all
 from colmap_sph.project.state.background import vouching_in_background
+from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
+
+
+class Executor(Protocol):
+    """What is done with each stage: all of its jobs, or a plan of them."""
+
+    def __call__(self, stage: Stage[Any, Any], /) -> dict[Any, Result]:
+        """Return the result of each item; those that fail are left out."""
+
+
+@contextmanager
+def executor_of(options: RunOptions, workspace: Workspace) -> Iterator[Executor]:
+    """What makes the results of a run in a workspace that it holds: threads of this machine, or a cluster."""
+    if not options.scheduler:
+        yield execute
+        return
+    if find_spec("distributed") is None:
+        raise OptionError(
+            "--scheduler needs Dask, which is not installed; install this program with it: pip install '.[dask]'."
+        )
+    # Not before: who needs no cluster need not have Dask.
+    from colmap_sph.pipeline.engine.cluster import on_cluster
+
+    with on_cluster(options.scheduler, workspace) as cluster:
+        yield cluster
 
 
 def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
@@ -30,9 +59,8 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
         A wrong option, an output that cannot be written, or nothing to go on with.
     """
     context = stage.context
-    gate = MemoryGate(context.options.memory_budget)
+    gate = MemoryGate(context.options.memory_budget, context.options.num_threads)
     kept = stage.kept_memory(gate)
-    gate.keep(kept.total(context.options.num_threads))
 
     def work(item: Item) -> Result | None:
         if not stage.is_wanted(item):
@@ -46,16 +74,22 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
             return _made(stage, job)
 
     with stage.opened(), context.stage(stage.name, len(stage.items)):
-        with stage.holding(kept), vouching_in_background():
+        with gate.keeping(kept.total(gate.threads)), stage.holding(kept), vouching_in_background():
             results = _one_by_one(work, stage) if stage.whole else _by_threads(work, stage)
         stage.close(results)
+    tell_counts(stage, results)
+    return results
+
+
+def tell_counts(stage: Stage[Item, Task], results: Mapping[Item, Result]) -> None:
+    """Report how many results of a stage were made, and how many were there."""
     made, reused = stage.count(results)
+    report = stage.context.report
     if made or reused:
-        context.report.made[stage.name] = made
-        context.report.reused[stage.name] = reused
+        report.made[stage.name] = made
+        report.reused[stage.name] = reused
     if reused:
         logger.info("%s: %d were up to date", stage.name.capitalize(), reused)
-    return results
 
 
 def _made(stage: Stage[Item, Task], job: Job[Task]) -> Result:

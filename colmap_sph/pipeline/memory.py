@@ -90,11 +90,27 @@ class MemoryGate:
     Parameters
     ----------
     total : int
-        Bytes of the whole run, what the process has in use already among them.
+        Bytes of the whole process, what it has in use already among them.
+    threads : int
+        Workers that share them.
+    in_use : int, optional
+        What the process has in use already; without it, it is this process.
+    source : str
+        Where `total` comes from, for the message where it is too little.
     """
 
-    def __init__(self, total: int) -> None:
-        self._total, self._outside = total, resident()
+    def __init__(
+        self,
+        total: int,
+        threads: int = 1,
+        *,
+        in_use: int | None = None,
+        source: str = "--memory, or a share of what is free",
+    ) -> None:
+        self.threads = threads
+        self._total = total
+        self._outside = resident() if in_use is None else in_use
+        self._source = source
         self._reserved = 0
         self._changed = threading.Condition()
 
@@ -107,9 +123,14 @@ class MemoryGate:
         """Bytes for caches: of what is free, what the largest piece of work, of `needed` bytes, leaves."""
         return max(self.free - needed, 0)
 
-    def keep(self, amount: int) -> None:
-        """Take `amount` bytes for caches and scratch memory, for good; before any work begins."""
+    @contextmanager
+    def keeping(self, amount: int) -> Iterator[None]:
+        """Take `amount` bytes for caches and scratch memory; no work is under way when this begins or ends."""
         self._outside += amount
+        try:
+            yield
+        finally:
+            self._outside -= amount
 
     @contextmanager
     def reserve(self, amount: float, what: str) -> Iterator[None]:
@@ -117,7 +138,7 @@ class MemoryGate:
         needed = int(_SLACK * amount)
         if needed > self.free:
             raise OptionError(
-                f"{format_memory(self._total)} of memory (--memory, or a share of what is free) is too little for "
+                f"{format_memory(self._total)} of memory ({self._source}) is too little for "
                 f"{what}; {format_memory((self._outside + needed) * 1.05)} would do."
             )
         with self._changed:

@@ -34,6 +34,9 @@ class RunOptions:
     """Worker threads; 0: as many as the process may use cores."""
     memory: str = ""
     """Memory the run may use, such as "6GiB"; empty: a safe share of what is free."""
+    scheduler: str = ""
+    """Dask scheduler whose workers make the results, instead of this machine: its address, or the file in which it
+    stands. Images and workspace must lie on a disk that all machines share."""
     region: str = ""
     """Part of the scene that is wanted, in the model's coordinates: a box x0,y0,z0,x1,y1,z1, a file of one as for
     COLMAP, or polygons in GeoJSON; or auto: what the images look at, without the background far behind. Images

@@ -19,7 +19,7 @@ from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
 
 if TYPE_CHECKING:
-    from colmap_sph.pipeline.reconstruct import Executor
+    from colmap_sph.pipeline.execute import Executor
 
 logger = logging.getLogger(__name__)
 

@@ -60,7 +60,7 @@ from colmap_sph.scene import NO_SCENE, Scene
 from colmap_sph.stereo.anchor import anchored
 
 if TYPE_CHECKING:
-    from colmap_sph.pipeline.reconstruct import Executor
+    from colmap_sph.pipeline.execute import Executor
 
 logger = logging.getLogger(__name__)
 

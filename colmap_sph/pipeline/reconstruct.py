@@ -8,12 +8,12 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import TypeVar
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.pipeline.context import Context, Until, timed_stage
 from colmap_sph.pipeline.contradictions import check_numbers
-from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.execute import Executor, execute, executor_of
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.forecast.sizes import with_affordable_size
 from colmap_sph.pipeline.forecast.time_limit import TimeLimit, time_limit
@@ -31,7 +31,7 @@ from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
-from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
@@ -128,29 +128,32 @@ def run_project(
     check_input(project, options, limit)
     if limit is not None:
         options = with_affordable_size(project, options, limit, overwrite=overwrite)
+    if options.scheduler:
+        project = project.absolute()  # workers have other current folders
     program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
     report = RunReport(command=command_of(project, options))
     dense = Workspace(project.root)
     if project.model is None:
         dense = open_workspace(project)
-        with claimed(dense):
+        with claimed(dense), executor_of(options, dense) as executor:
             if overwrite:
                 discard_results(dense)
             return reconstruct(
                 dense,
                 options,
+                executor=executor,
                 progress=progress,
                 report=report,
                 overwrite=overwrite,
                 verify=verify,
                 limit=limit,
             )
-    with claimed(dense):
+    with claimed(dense), executor_of(options, dense) as executor:
         preparation = Preparation(
             project, options, overwrite=overwrite, verify=verify, progress=progress, report=report
         )
-        preparation.run(execute)
+        preparation.run(executor)
         given = preparation.given_model()
         options = preparation.options
         names = preparation.names
@@ -160,6 +163,7 @@ def run_project(
         return reconstruct(
             dense,
             options,
+            executor=executor,
             expected=names,
             progress=progress,
             report=report,
@@ -176,6 +180,8 @@ def check_input(project: Project, options: RunOptions, limit: TimeLimit | None =
     options.check()
     if limit is not None:
         limit.check(options)
+        if options.scheduler:
+            raise OptionError("--within knows this machine alone; leave out it or --scheduler.")
     project.check()
     check_links(Workspace(project.root), is_given=project.workspace is not None)
     if project.model is None and options.undistortion != UndistortionOptions():
@@ -191,6 +197,7 @@ def reconstruct(
     workspace: Workspace,
     options: RunOptions,
     *,
+    executor: Executor = execute,
     progress: Progress | None = None,
     report: RunReport | None = None,
     database: Path | None = None,
@@ -209,6 +216,8 @@ def reconstruct(
     ----------
     workspace : Workspace
     options : RunOptions
+    executor : callable
+        Makes the results of a stage, see `Executor`.
     progress : Progress, optional
     report : RunReport, optional
         What is known of the run so far.
@@ -252,7 +261,7 @@ def reconstruct(
             if name not in report.skipped_images:
                 report.skipped_images[name] = "the model has no possible pose or calibration of it"
                 progress.leave_out("image", name, report.skipped_images[name])
-        context = with_good_images(context, execute, verify=verify)
+        context = with_good_images(context, executor, verify=verify)
         scene = context.scene
         if needs_all and report.skipped_images:
             reason = next(iter(sorted(report.skipped_images.items())))[1]
@@ -270,13 +279,13 @@ def reconstruct(
         if given is not None and is_polishing:
             first = (MatchToPolishStage(context, selection.unique_pairs()),)
             progress.foresee(foreseen_stages(context, selection.unique_pairs(), first))
-            context = with_polished_poses(context, selection.unique_pairs(), execute, given)
+            context = with_polished_poses(context, selection.unique_pairs(), executor, given)
         judge_reprojection(report, context.scene)
         if limit is None:
             progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
-            go_through_stages(context, selection.unique_pairs(), execute, until=until)
+            go_through_stages(context, selection.unique_pairs(), executor, until=until)
         else:
-            context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), execute)
+            context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), executor)
         judge_agreement(report)
     write_report(context)
     keep_or_make_page(context)
@@ -298,13 +307,6 @@ def _verify(context: Context) -> None:
         logger.warning("Damaged, and made again: %s", named(damaged))
     else:
         logger.info("No earlier result is damaged")
-
-
-class Executor(Protocol):
-    """What is done with each stage: all of its jobs, or a plan of them."""
-
-    def __call__(self, stage: Stage[Any, Any], /) -> dict[Any, Result]:
-        """Return the result of each item; those that fail are left out."""
 
 
 def go_through_stages(

@@ -34,6 +34,9 @@ class StageEstimate:
 class Progress(Protocol):
     """What the pipeline tells a progress display. Derive from `Silent` to hear some of it only."""
 
+    def engage(self, threads: int, words: str) -> None:
+        """Other machines work for the run, with so many threads; words about them, where they are new."""
+
     def foresee(self, stages: Sequence[StageEstimate]) -> None:
         """These stages are to come, and no others; told once pairs are selected, and again where that changes."""
 
@@ -49,6 +52,9 @@ class Progress(Protocol):
 
 class Silent:
     """A display that shows nothing."""
+
+    def engage(self, threads: int, words: str) -> None:
+        """Nothing."""
 
     def foresee(self, stages: Sequence[StageEstimate]) -> None:
         """Nothing."""
@@ -143,7 +149,7 @@ class RunReport:
     seconds : dict
         Stage → wall time.
     peak_memory : int
-        Largest resident set of the process, bytes.
+        Largest resident set of the process, or of a worker on another machine, bytes.
     """
 
     command: str = ""

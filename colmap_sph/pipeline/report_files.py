@@ -58,7 +58,7 @@ def write_report(context: Context) -> None:
     """Write `report.json`: versions, options, and what the run tells of itself."""
     report = context.report
     unit = 1 if sys.platform == "darwin" else 1024
-    report.peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+    report.peak_memory = max(report.peak_memory, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
     with atomic_file(context.workspace.report_path) as file:
         file.write(json.dumps(_content(context), indent=1, default=str).encode())
 

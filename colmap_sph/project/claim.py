@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from colmap_sph.errors import OutputError
-from colmap_sph.project.files import make_dir, remove_temporary_files
+from colmap_sph.project.files import make_dir, remove, remove_temporary_files
 from colmap_sph.project.workspace import Workspace
 
 
@@ -30,7 +30,7 @@ def claimed(workspace: Workspace) -> Iterator[None]:
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         _lock(descriptor, workspace)
-        _remove_leftovers(workspace)
+        remove_leftovers(workspace)
         yield
     finally:
         os.close(descriptor)
@@ -114,7 +114,10 @@ def _lock(descriptor: int, workspace: Workspace) -> None:
         pass
 
 
-def _remove_leftovers(workspace: Workspace) -> None:
+def remove_leftovers(workspace: Workspace) -> None:
+    """Remove what processes that were killed left behind in a workspace that is held."""
+    # First: with it other machines that still work for a run that was killed lose the right to write here.
+    remove(workspace.token_path)
     shutil.rmtree(workspace.fusion_scratch_dir, ignore_errors=True)
     for folder in (workspace.stereo_dir, workspace.state_dir):
         remove_temporary_files(folder)

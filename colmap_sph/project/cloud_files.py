@@ -48,9 +48,9 @@ def write_part(
     """
     count = 0
     with ExitStack() as opened:
-        # One alone is an atomic file, whose temporary name is that of the thread.
         cloud = opened.enter_context(atomic_file(stem.with_suffix(".points"), sync=False))
-        visible = opened.enter_context(stem.with_suffix(".vis").open("wb")) if with_visibility else None
+        path = stem.with_suffix(".vis")
+        visible = opened.enter_context(atomic_file(path, sync=False)) if with_visibility else None
         for points, visibility in bands:
             cloud.write(points.data)
             if visible is not None:

@@ -1,13 +1,15 @@
 """Folders and files made, read and removed for the user: errors are sentences, no file is ever half-written."""
 
 import errno
+import itertools
 import os
 import re
 import shutil
+import socket
 import stat
-import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from contextvars import ContextVar
 from io import BufferedReader
 from pathlib import Path
 from typing import BinaryIO
@@ -16,13 +18,22 @@ import xxhash
 
 from colmap_sph.errors import InputError, OutputError, reason_of
 
-# What a file is called until it is complete: short, so that it fits wherever the real name fits; one per thread,
-# which writes one file at a time.
-_TEMPORARY_NAME = ".{process}-{thread}.tmp"
-_TEMPORARY = re.compile(r"\.\d+-\d+\.tmp")
+# What a file is called until it is complete: short, so that it fits wherever the real name fits. Processes of
+# other machines may have the same number. Earlier versions did not name the machine.
+_TEMPORARY_NAME = ".{process}-{number}.tmp"
+_TEMPORARY = re.compile(r"\.([\w-]{1,32}-)?\d+-\d+\.tmp")
+_numbers = itertools.count()
+_check_before_writing: ContextVar[Callable[[], None] | None] = ContextVar("check_before_writing", default=None)
 # What a file system answers that cannot sync at all: there is nothing to wait for then.
 _NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
 _READ_BYTES = 1 << 17
+_HOST_LETTERS = 32
+
+
+def process_name() -> str:
+    """Name of this process among those of all machines that share a folder: host and number."""
+    host = re.sub(r"[^\w-]", "_", socket.gethostname(), flags=re.ASCII)[:_HOST_LETTERS] or "_"
+    return f"{host}-{os.getpid()}"
 
 
 def make_dir(folder: Path) -> None:
@@ -81,7 +92,7 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
     OutputError
         The file cannot be written: permissions, a full disk, a folder in the way.
     """
-    name = _TEMPORARY_NAME.format(process=os.getpid(), thread=threading.get_ident())
+    name = _TEMPORARY_NAME.format(process=process_name(), number=next(_numbers))
     temporary = path.parent / name
     try:
         temporary.unlink(missing_ok=True)  # of a process with the same number that was killed
@@ -90,6 +101,9 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
             file.flush()
             if sync:
                 _sync(file.fileno())
+        check = _check_before_writing.get()
+        if check is not None:
+            check()
         temporary.replace(path)
         if sync:
             sync_folder(path.parent)
@@ -100,6 +114,16 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
     finally:
         with suppress(OSError):  # not there, or on a disk that has become read-only
             temporary.unlink()
+
+
+@contextmanager
+def writing_only_if(check: Callable[[], None]) -> Iterator[None]:
+    """Call `check` before each file that `atomic_file` completes meanwhile; where it raises, there is no file."""
+    token = _check_before_writing.set(check)
+    try:
+        yield
+    finally:
+        _check_before_writing.reset(token)
 
 
 def sync_file(path: Path) -> None:

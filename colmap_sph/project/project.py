@@ -1,6 +1,6 @@
 """What a run works on, as the user gives it: one record, checked; a dense workspace given is opened."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 from colmap_sph.errors import InputError, OptionError
@@ -60,6 +60,11 @@ class Project:
             raise OptionError(
                 f"{workspace} is a sparse model, not a dense workspace; give it as --model {workspace}."
             )
+
+    def absolute(self) -> "Project":
+        """The same, whatever the current folder is."""
+        given = {each.name: getattr(self, each.name) for each in fields(self)}
+        return Project(**{name: path and Path(path).absolute() for name, path in given.items()})
 
     @property
     def is_named(self) -> bool:

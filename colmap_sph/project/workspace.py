@@ -124,6 +124,11 @@ class Workspace:
         return self.state_dir / ".polishing.tmp"
 
     @property
+    def token_path(self) -> Path:
+        """While other machines work for a run: which run that is."""
+        return self.state_dir / ".workers.tmp"
+
+    @property
     def undistortion_scratch_dir(self) -> Path:
         """While images are undistorted: what there is of the workspace so far."""
         return self.state_dir / ".undistorting.tmp"

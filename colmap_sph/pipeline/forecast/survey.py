@@ -127,7 +127,7 @@ def _memory_of(stage: Stage[Item, Task], costs: list[Cost]) -> float:
     if stage.whole:
         return _BASE_MEMORY + working
     budget = stage.context.options.memory_budget
-    kept: Kept = stage.kept_memory(MemoryGate(budget))
+    kept: Kept = stage.kept_memory(MemoryGate(budget, threads))
     scratch = nlargest(threads, (min(kept.scratch, cost.scratch) for cost in costs))
     held = sum(scratch) + min(kept.caches * kept.cache, kept.filled)
     return min(_BASE_MEMORY + working + held, budget)

@@ -39,6 +39,10 @@ class TimeLeft(Silent):
         self._made_steps = 0
         self._made = 0.0
 
+    def engage(self, threads: int, words: str) -> None:
+        """See `Progress`."""
+        self._workers = max(threads, 1)
+
     def foresee(self, stages: Sequence[StageEstimate]) -> None:
         """See `Progress`."""
         self._is_foreseen = True

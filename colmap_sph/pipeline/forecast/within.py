@@ -28,7 +28,7 @@ from colmap_sph.stereo.partners.pairing import Pair, partners_of
 from colmap_sph.stereo.partners.pairs import PairSelection
 
 if TYPE_CHECKING:
-    from colmap_sph.pipeline.reconstruct import Executor
+    from colmap_sph.pipeline.execute import Executor
 
 logger = logging.getLogger(__name__)
 

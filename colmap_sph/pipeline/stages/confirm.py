@@ -1,7 +1,6 @@
 """Third stage: every image's depth is confirmed by its partners' and refined on their images: geometric maps."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -151,6 +150,12 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
     name = "confirm depth"
     remembered_as = "geometric"
     make = staticmethod(make_geometric_maps)
+    caches = (_loaded,)
+
+    @staticmethod
+    def found(task: ConfirmTask) -> Facts | None:
+        """See `Stage.found`."""
+        return task.maps.facts(task.key)
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result], votes: Mapping[str, Result]) -> None:
         super().__init__(context, context.order.sorted(votes))
@@ -201,7 +206,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
             maps,
             key,
         )
-        return Job(key, maps.facts(key), self._cost(item), task)
+        return Job(key, self.found(task), self._cost(item), task)
 
     def _partners(self, name: str) -> list[str]:
         return [other for other in self._all_partners.get(name, []) if other in self._vote_keys]
@@ -235,12 +240,6 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         # Half of what is spare goes to more workers at a time.
         cache = int(min(filled, gate.spare(_ROOM * most) / 2))
         return Kept(cache=cache, caches=1, filled=filled)
-
-    @contextmanager
-    def holding(self, kept: Kept) -> Iterator[None]:
-        """See `Stage.holding`."""
-        with _loaded.holding(kept.cache):
-            yield
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""

@@ -238,7 +238,7 @@ def _sources_of(context: "Context", name: str, index: int) -> MapSources:
         maps.depth,
         maps.normals,
         context.workspace.image_path(name),
-        None if options.mask_path is None else mask_path(options.mask_path, name),
+        None if options.mask_path is None else mask_path(options.mask_path.absolute(), name),
         maps.digests(),
         maps.record,
     )

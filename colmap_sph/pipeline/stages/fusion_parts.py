@@ -116,6 +116,7 @@ class PartsStage(Stage[str, FuseTask]):
 
     name = "fuse"
     make = staticmethod(make_cloud_part)
+    caches = (_maps,)
     region: Region | None = None
     """Where points are wanted, see `FuseTask`."""
 
@@ -194,12 +195,6 @@ class PartsStage(Stage[str, FuseTask]):
         filled = _MAPS_BYTES * sum(pixels)
         spare = gate.spare(2 * _FUSE_BYTES * max(pixels, default=0)) / 2
         return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
-
-    @contextmanager
-    def holding(self, kept: Kept) -> Iterator[None]:
-        """See `Stage.holding`."""
-        with _maps.holding(kept.cache):
-            yield
 
     def _report_unread(self, results: Mapping[str, Result]) -> bool:
         """Report images whose maps could not be read while others were fused; whether there are any."""

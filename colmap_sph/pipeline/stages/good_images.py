@@ -13,7 +13,7 @@ from colmap_sph.pipeline.stages.stage import keys_of
 from colmap_sph.stereo.rectification import sampling_of
 
 if TYPE_CHECKING:
-    from colmap_sph.pipeline.reconstruct import Executor
+    from colmap_sph.pipeline.execute import Executor
 
 logger = logging.getLogger(__name__)
 

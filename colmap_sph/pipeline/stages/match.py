@@ -161,6 +161,13 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
     name = "match pairs"
     remembered_as: ClassVar[Known | None] = "pairs"
     make = staticmethod(make_disparity_map)
+    caches = (_photos, _masks)
+
+    @staticmethod
+    def found(task: MatchTask) -> Facts | None:
+        """See `Stage.found`."""
+        names = (task.left.view.name, task.right.view.name)
+        return facts_of_pair(task.target, task.key, *names, task.geometry)
 
     def __init__(self, context: "Context", pairs: Sequence[Pair]) -> None:
         super().__init__(context, pairs)
@@ -215,7 +222,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
             target,
             key,
         )
-        return Job(key, facts_of_pair(target, key, left.name, right.name, geometry), cost, task)
+        return Job(key, self.found(task), cost, task)
 
     def _geometry(self, left: View, right: View) -> RectifiedPair:
         try:
@@ -262,7 +269,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         finest = max(sampling_of(self._detail(view)) for view in views)
         share = _RECTIFIED_SHARE * (finest * self.context.options.rectification.sampling) ** 2
         spare = int(max(gate.spare(share * _MATCH_BYTES * largest), gate.free / 8))
-        scratch = min(_SCRATCH_BYTES, spare // (3 * self.context.options.num_threads))
+        scratch = min(_SCRATCH_BYTES, spare // (3 * gate.threads))
         paths = (self.context.workspace.image_path(view.name) for view in views)
         filled = sum(view.num_pixels * (grey_bytes(path) + 1) for view, path in zip(views, paths, strict=True))
         return Kept(scratch, min(_CACHE_BYTES, spare // 6), 2, filled)
@@ -280,7 +287,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
     def holding(self, kept: Kept) -> Iterator[None]:
         """See `Stage.holding`."""
         self._scratch_bytes = kept.scratch
-        with _photos.holding(kept.cache), _masks.holding(kept.cache):
+        with super().holding(kept):
             yield
 
     def close(self, results: Mapping[Pair, Result]) -> None:

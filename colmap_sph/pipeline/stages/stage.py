@@ -8,10 +8,11 @@ that a run executes.
 
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
+from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.stages.facts import Facts
 
 if TYPE_CHECKING:  # what the code of a stage's results depends on is in its key, see `program`; these have no part
@@ -104,6 +105,8 @@ class Stage(ABC, Generic[Item, Task]):
     name: ClassVar[str]
     whole: ClassVar[bool] = False
     """Whether one item is all there is: its failure ends the run, and the budget does not bound its memory."""
+    caches: ClassVar[tuple[LoadCache[Any], ...]] = ()
+    """What `make` loads, it keeps there for the items that follow, in each process."""
 
     def __init__(self, context: "Context", items: Sequence[Item]) -> None:
         self.context = context
@@ -117,6 +120,15 @@ class Stage(ABC, Generic[Item, Task]):
     @abstractmethod
     def make(task: Task) -> Facts:
         """Make one result: a plain function of its task, for any thread, process or machine."""
+
+    @staticmethod
+    def found(task: Task) -> Facts | None:
+        """What is known of a task's result where it is there: what a machine that was lost had made already."""
+        return None
+
+    @staticmethod
+    def end_thread() -> None:
+        """Give back what `make` keeps for the calling thread, which ends."""
 
     def is_wanted(self, item: Item) -> bool:
         """Whether there is still time for an item; asked by the worker that is to begin it, in their order."""
@@ -146,7 +158,8 @@ class Stage(ABC, Generic[Item, Task]):
     @contextmanager
     def holding(self, kept: "Kept") -> Iterator[None]:
         """Hold what the stage keeps in memory, while items are made."""
-        yield
+        with holding_caches(self.caches, kept):
+            yield
 
     def close(self, results: Mapping[Item, Result]) -> None:
         """Report the results, and raise `NoResultError` where there is nothing to go on with."""
@@ -184,6 +197,15 @@ class Kept:
     def total(self, threads: int) -> int:
         """Bytes to keep free for all of it."""
         return threads * self.scratch + self.caches * self.cache
+
+
+@contextmanager
+def holding_caches(caches: Sequence[LoadCache[Any]], kept: Kept) -> Iterator[None]:
+    """Let the caches of a stage keep as much as is kept for each."""
+    with ExitStack() as held:
+        for cache in caches:
+            held.enter_context(cache.holding(kept.cache))
+        yield
 
 
 def keys_of(results: Mapping[Item, Result]) -> dict[Item, str]:

@@ -5,8 +5,8 @@ import os
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,14 @@ from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.cameras import plain_camera
-from colmap_sph.project.files import make_dir, remove, scratch_folder, set_aside, whole_digest
+from colmap_sph.project.files import (
+    make_dir,
+    process_name,
+    remove,
+    scratch_folder,
+    set_aside,
+    whole_digest,
+)
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
@@ -59,6 +66,8 @@ class UndistortTask:
         The undistorted image in the workspace, and its mask.
     record : Path
     key : str
+    is_doubted : bool
+        Whether what is there does not count, though its record vouches for it.
     """
 
     image: ImageToUndistort
@@ -66,24 +75,34 @@ class UndistortTask:
     mask_target: Path
     record: Path
     key: str
+    is_doubted: bool = False
+
+    @property
+    def files(self) -> list[Path]:
+        """What will be there."""
+        return [self.target] if self.image.mask is None else [self.target, self.mask_target]
 
 
 def make_undistorted_image(task: UndistortTask) -> Facts:
     """Undistort an image and its mask; writes both into the workspace."""
-    image = task.image
+    # A process that was lost may still be at work on the same image.
+    folder = task.image.folder / process_name()
+    image = replace(task.image, folder=folder, mask_folder=folder / "masks")
     make_dir(image.mask_folder)
     try:
         if image.is_colmaps:
-            _child(image.folder.parent).call(undistort, image, str(task.target))
+            _child(task.image.folder.parent).call(undistort, image, str(task.target))
         else:
             undistort(image)
-        _publish(task)
+        _publish(replace(task, image=image))
     except OSError as error:
         raise OutputError(
             f"{task.target} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
     finally:
-        shutil.rmtree(image.folder, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # another process has not ended there
+            task.image.folder.rmdir()
     return Facts()
 
 
@@ -124,6 +143,15 @@ def _child(folder: Path) -> ChildProcess:
     return child
 
 
+def end_child() -> None:
+    """End the process for COLMAP of the current thread."""
+    child: ChildProcess | None = getattr(_thread, "child", None)
+    if child is not None:
+        _children.remove(child)
+        child.close()
+        _thread.child = None
+
+
 class UndistortStage(Stage[str, UndistortTask]):
     """Undistorts images of a sparse model.
 
@@ -141,6 +169,12 @@ class UndistortStage(Stage[str, UndistortTask]):
 
     name = "undistort"
     make = staticmethod(make_undistorted_image)
+    end_thread = staticmethod(end_child)
+
+    @staticmethod
+    def found(task: UndistortTask) -> Facts | None:
+        """See `Stage.found`."""
+        return None if task.is_doubted else vouched_facts(task.record, task.key, task.files, Facts)
 
     def __init__(
         self,
@@ -177,15 +211,15 @@ class UndistortStage(Stage[str, UndistortTask]):
         key = context.keys.undistorted(self._digests[item], camera_parts, values, mask)
         target = workspace.image_path(item)
         record = undistorted_place(workspace, item).record
-        files = [target] if mask is None else [target, workspace.made_mask_path(item)]
         task = UndistortTask(
             image,
             target,
             workspace.made_mask_path(item),
             record,
             key,
+            self._verify,
         )
-        known = self._is_as_made(task, files) or self._is_changed_by_user(task, files)
+        known = self._is_as_made(task) or self._is_changed_by_user(task)
         pixels = camera.width * camera.height
         memory = (_BYTES if values is None else _DEEP_BYTES) * pixels
         if image.is_colmaps:
@@ -193,13 +227,14 @@ class UndistortStage(Stage[str, UndistortTask]):
         cost = Cost(_SECONDS * pixels, memory, _FILE_BYTES * pixels)
         return Job(key, Facts() if known else None, cost, task)
 
-    def _is_as_made(self, task: UndistortTask, files: list[Path]) -> bool:
+    def _is_as_made(self, task: UndistortTask) -> bool:
         """Whether image and mask are there as they were made; with `verify` every byte of them is looked at."""
+        files = task.files
         if vouched_facts(task.record, task.key, files, Facts) is None:
             return False
         return not self._verify or whole_digests(task.record, len(files)) == tuple(map(whole_digest, files))
 
-    def _is_changed_by_user(self, task: UndistortTask, files: list[Path]) -> bool:
+    def _is_changed_by_user(self, task: UndistortTask) -> bool:
         """Whether an image was made and then exchanged for another good one, or its mask was: they are used.
 
         Not with `verify`: bit rot may look like that, too.
@@ -208,7 +243,7 @@ class UndistortStage(Stage[str, UndistortTask]):
             return False
         record = read_record(task.record)
         is_made = record is not None and (record.key, record.state) == (task.key, "done")
-        if not is_made or not all(path.is_file() for path in files):
+        if not is_made or not all(path.is_file() for path in task.files):
             return False
         camera = task.image.undistorted_camera
         if image_problem(task.target, camera.width, camera.height) is not None:

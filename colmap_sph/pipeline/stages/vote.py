@@ -134,6 +134,12 @@ class VoteStage(RememberingStage[str, VoteTask]):
     remembered_as = "photometric"
     make = staticmethod(make_photometric_maps)
 
+    @staticmethod
+    def found(task: VoteTask) -> Facts | None:
+        """See `Stage.found`."""
+        is_voted = is_estimate_there(task.estimate, task.vote_key, task.window.view(task.view))
+        return task.maps.facts(task.maps_key) if is_voted else None
+
     def __init__(self, context: "Context", matched: Mapping[Pair, Result]) -> None:
         super().__init__(context, context.order.sorted(context.scene.index_of))
         self._pair_keys = keys_of(matched)
@@ -199,12 +205,7 @@ class VoteStage(RememberingStage[str, VoteTask]):
             key,
             maps_key,
         )
-        return Job(
-            key,
-            maps.facts(maps_key) if is_voted else None,
-            self._cost(view, window.num_pixels, files, is_voted),
-            task,
-        )
+        return Job(key, self.found(task), self._cost(view, window.num_pixels, files, is_voted), task)
 
     def _cost(self, view: View, pixels: int, files: tuple[Path, ...], is_voted: bool) -> Cost:
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from contextvars import copy_context
 
 
 class _Background:
@@ -20,7 +21,8 @@ class _Background:
         with self._lock:
             if self._pool is None:
                 return False
-            self._waiting.append(self._pool.submit(function, *arguments))
+            # Whoever may not write here any more may not vouch either, see `files.writing_only_if`.
+            self._waiting.append(self._pool.submit(copy_context().run, function, *arguments))
             return True
 
     def open(self) -> None:

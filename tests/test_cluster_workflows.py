@@ -1,0 +1,113 @@
+"""The recipes for clusters: scheduler, workers and run are started as they should, and all of them end."""
+
+import os
+import shlex
+import subprocess
+from pathlib import Path
+
+import pytest
+
+RECIPES = Path(__file__).parents[1] / "workflows/cluster"
+LOG = 'echo "$(basename "$0") $(printf "%q " "$@")" >> "$CALLS"'
+
+STAND_INS = {
+    # The scheduler tells where it is, and goes on until it is ended; workers leave by themselves.
+    "dask": f"""#!/bin/bash
+{LOG}
+if [ "$1" = scheduler ]; then echo $$ > "$CALLS.pid"; touch "$3"; exec sleep 60; fi
+""",
+    "colmap_sph": f"""#!/bin/bash
+for file; do :; done
+while [ ! -e "$file" ] || [ "$(grep -c "^dask worker" "$CALLS")" -lt 2 ]; do sleep 0.02; done
+{LOG}
+exit 5
+""",
+    "srun": """#!/bin/bash
+while [[ $1 == --* ]]; do shift; done
+"$@"; "$@"
+""",
+    "pbsdsh": """#!/bin/bash
+shift
+env -i CALLS="$CALLS" PATH=/usr/bin:/bin "$@"; env -i CALLS="$CALLS" PATH=/usr/bin:/bin "$@"
+""",
+    "ssh": """#!/bin/bash
+echo "ssh ${*: -2:1}" >> "$CALLS.ssh"
+env -i CALLS="$CALLS" PATH=/usr/bin:/bin /bin/sh -c "${*: -1}"
+""",
+}
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a blank in its name, which is the current one; the programs are stand-ins."""
+    folder = tmp_path / "the project"
+    programs = tmp_path / "some bin"
+    for each in (folder, programs):
+        each.mkdir()
+    for name, text in STAND_INS.items():
+        (programs / name).write_text(text)
+        (programs / name).chmod(0o755)
+    monkeypatch.chdir(folder)
+    monkeypatch.setenv("PATH", f"{programs}:{os.environ['PATH']}")
+    monkeypatch.setenv("CALLS", str(tmp_path / "calls"))
+    return folder
+
+
+def calls_of(*command: object, code: int = 5) -> list[list[str]]:
+    """What was called when a recipe came to its end, with the exit code of the run."""
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode == code, done.stderr
+    calls = Path(os.environ["CALLS"])
+    scheduler = int(Path(f"{calls}.pid").read_text())
+    with pytest.raises(ProcessLookupError):
+        os.kill(scheduler, 0)
+    return [shlex.split(line) for line in calls.read_text().splitlines()]
+
+
+def check(calls: list[list[str]], file: Path, threads: tuple[str, str] | None) -> None:
+    (scheduler,) = (call for call in calls if call[:2] == ["dask", "scheduler"])
+    workers = [call for call in calls if call[:2] == ["dask", "worker"]]
+    (run,) = (call for call in calls if call[0] == "colmap_sph")
+    assert scheduler[2:] == ["--scheduler-file", str(file)]
+    assert len(workers) == 2
+    for worker in workers:
+        options = dict(zip(worker[2::2], worker[3::2], strict=True))
+        assert options["--scheduler-file"] == str(file)
+        assert (options.get("--nworkers"), options.get("--nthreads")) == (threads or (None, None))
+    assert run[1:] == ["run", "--model", "sparse/0", "--num-pairs", "4", "--scheduler", str(file)]
+    assert not file.exists()
+
+
+OPTIONS = ["--model", "sparse/0", "--num-pairs", "4"]
+
+
+@pytest.mark.parametrize(("cores", "threads"), [("32", ("4", "8")), ("6", ("1", "6")), ("20", ("3", "7"))])
+def test_slurm(place: Path, cores: str, threads: tuple[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("SUBMIT_DIR", place), ("JOB_ID", 7), ("CPUS_PER_TASK", cores)):
+        monkeypatch.setenv(f"SLURM_{name}", str(value))
+    check(calls_of(RECIPES / "slurm.sh", *OPTIONS), place / ".scheduler-7.json", threads)
+
+
+def test_pbs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = {"PBS_O_WORKDIR": str(place), "PBS_JOBID": "7.head", "NCPUS": "16", "OPTIONS": " ".join(OPTIONS)}
+    for name, value in given.items():
+        monkeypatch.setenv(name, value)
+    check(calls_of(RECIPES / "pbs.sh"), place / ".scheduler-7.head.json", ("2", "8"))
+
+
+def test_ssh(place: Path) -> None:
+    calls = calls_of(RECIPES / "ssh.sh", "alpha beta", *OPTIONS)
+    file = next(Path(call[3]) for call in calls if call[:2] == ["dask", "scheduler"])
+    check(calls, file, None)
+    assert file.parent == place
+    assert sorted(Path(f"{os.environ['CALLS']}.ssh").read_text().split()) == ["alpha", "beta", "ssh", "ssh"]
+
+
+@pytest.mark.parametrize("recipe", ["slurm.sh", "pbs.sh", "ssh.sh"])
+def test_without_its_surroundings(recipe: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in list(os.environ):
+        if name.startswith(("SLURM_", "PBS_")):
+            monkeypatch.delenv(name)
+    done = subprocess.run([RECIPES / recipe], capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode != 0
+    assert "submit with" in done.stderr or "usage: ssh.sh" in done.stderr
