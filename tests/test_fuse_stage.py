@@ -386,24 +386,25 @@ def test_an_image_that_fails_is_left_out_and_done_again(workspace):
 
 
 def test_a_partner_that_cannot_be_read_for_a_moment_is_made_up_for(workspace, monkeypatch):
-    """One read of c.png fails while a.png is fused: the cloud lacks something, and nothing vouches for it."""
+    """One read of the last image fails while the first is fused: nothing vouches for the cloud, which lacks that."""
+    last = context_of(workspace).order.sorted(NAMES)[-1]
     fuse(workspace)
     whole = cloud_bytes(workspace)
     original = parts_module.read_view_maps
     failed: list[str] = []
 
     def fails_once(sources):
-        if sources.view.name == "c.png" and not failed:
+        if sources.view.name == last and not failed:
             failed.append(sources.view.name)
-            raise InputError("c.png cannot be read (Input/output error); run again.")
+            raise InputError(f"{last} cannot be read (Input/output error); run again.")
         return original(sources)
 
     shutil.rmtree(workspace.state_dir)
     monkeypatch.setattr(parts_module, "read_view_maps", fails_once)
     report = fuse(workspace)
     assert failed and cloud_bytes(workspace) != whole
-    assert list(report.incomplete) == ["c.png"]
-    assert "Input/output error" in report.incomplete["c.png"]
+    assert list(report.incomplete) == [last]
+    assert "Input/output error" in report.incomplete[last]
     again = fuse(workspace)
     assert again.made["fuse"] == 1 and again.incomplete == {}
     assert cloud_bytes(workspace) == whole

@@ -165,7 +165,7 @@ class FuseStage(PartsStage):
         results = self.in_order(results)
         if self._known is None:
             if not results:
-                raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
+                raise NoResultError(f"No image could be fused ({context.report.skipped_images[self._names[0]]})")
             points = sum(result.facts.points for result in results.values())
             tiles = self._put_together(results, points)
             facts = facts_of_cloud(context, list(results), points, self._partners_among(results))

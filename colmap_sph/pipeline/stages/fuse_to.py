@@ -71,7 +71,7 @@ class FuseToStage(PartsStage):
         context = self.context
         results = self.in_order(results)
         if not results:
-            raise NoResultError(f"No image could be fused ({context.report.skipped_images[self.items[0]]})")
+            raise NoResultError(f"No image could be fused ({context.report.skipped_images[self._names[0]]})")
         points = sum(result.facts.points for result in results.values())
         join_parts(self._stems(results), self._scratch, points)
         self._put_into_place()
