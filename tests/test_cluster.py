@@ -323,7 +323,7 @@ def test_workers_without_the_folder(
     code, sentence = refusal(capsys, cluster.scheduler_address)
     assert code == 2
     folder = re.escape(str(small / "dense/colmap_sph"))
-    assert re.match(rf"The worker at tcp://\S+ and 1 others do not see {folder}; images and workspace", sentence)
+    assert re.match(rf"The worker at tcp://\S+ and 1 other do not see {folder}; images and workspace", sentence)
     assert not (small / "dense/sparse").exists()
 
 

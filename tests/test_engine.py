@@ -69,8 +69,10 @@ def run(tmp_path: Path) -> RunSeen:
 
 
 @pytest.fixture
-def place() -> Workplace:
-    return Workplace(resident() + GIB, 2)
+def place(run: RunSeen) -> Iterator[Workplace]:
+    made = Workplace(resident() + GIB, 2)
+    yield made
+    made.rest(run)
 
 
 def group_of(run: RunSeen, *numbers: int, stage: int = 1, memory: float = 1e3, cache: int = 100) -> Group[Any]:

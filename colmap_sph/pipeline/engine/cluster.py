@@ -66,14 +66,14 @@ def on_cluster(scheduler: str, workspace: Workspace) -> Iterator["Cluster"]:
         cluster = Cluster(client, run)
         try:
             yield cluster
+            cluster.dismiss()
             if cluster.has_lost_workers():
                 remove_leftovers(workspace)
         finally:
-            # First: without it workers begin nothing more.
+            # Without it workers begin nothing more. It may be another run's by now.
             with suppress(OSError):
                 if read_small(path, _TOKEN_BYTES, follow=False).decode() == run.token:
                     remove(path)
-            cluster.dismiss()
 
 
 class Cluster:
@@ -140,13 +140,12 @@ class Cluster:
 
     def _least_worker(self, context: Context) -> WorkerFacts:
         """Wait for workers, and check that each can work for the run; the least of all their limits."""
-        if not self._run.path.exists():
+        if self._number == 1:
             with atomic_file(self._run.path, sync=False) as file:
                 file.write(self._run.token.encode())
-        self._wait_for_workers()
-        self._announce(context)
         deadline = time.monotonic() + PATIENCE
         while True:
+            self._wait_for_workers()
             facts = self._facts()
             refusals = [each.refusal for each in facts.values() if each.refusal]
             if refusals:
@@ -157,6 +156,7 @@ class Cluster:
             if blind and time.monotonic() > deadline:
                 raise InputError(unseen(blind, self._run.path.parent))
             time.sleep(0.2)
+        self._announce(context)
         return WorkerFacts(
             min(each.budget - each.in_use for each in facts.values()),
             0,
@@ -177,7 +177,7 @@ class Cluster:
     def _announce(self, context: Context) -> None:
         """Tell who works, and where they can be watched."""
         workers, threads = len(self._threads), sum(self._threads.values())
-        words = f"{workers} workers with {threads} threads"
+        words = f"{_counted(workers, 'worker')} with {_counted(threads, 'thread')}"
         link = dashboard_of(self._client)
         words += f"; their dashboard: {link}" if link else ""
         context.progress.engage(threads, "" if self._is_announced else words)
@@ -236,6 +236,10 @@ class Cluster:
                 self._client.run(entry.rest, self._run, on_error="ignore")
 
 
+def _counted(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
+
+
 def scheduler_lost() -> LostWorkersError:
     """What to say where the scheduler does not answer any more."""
     return LostWorkersError(
@@ -246,7 +250,7 @@ def scheduler_lost() -> LostWorkersError:
 
 def unseen(addresses: list[str], folder: Path) -> str:
     """What to say where workers do not see a run's files."""
-    others = f" and {len(addresses) - 1} others do" if len(addresses) > 1 else " does"
+    others = f" and {_counted(len(addresses) - 1, 'other')} do" if len(addresses) > 1 else " does"
     return (
         f"The worker at {addresses[0]}{others} not see {folder}; images and workspace must lie on a disk that all "
         "machines share, under the same path."
