@@ -142,7 +142,7 @@ class _Rows:
         self._ids = ids
         # A table is looked up many times faster than a sorted array is searched; ids seldom have large gaps.
         self._table = np.full(0, -1, np.int64)
-        if len(ids) and 0 <= ids[0] and ids[-1] < _MOST_GAPS * len(ids):
+        if len(ids) and ids[0] >= 0 and ids[-1] < _MOST_GAPS * len(ids):
             self._table = np.full(ids[-1] + 1, -1, np.int64)
             self._table[ids] = np.arange(len(ids))
 
