@@ -18,16 +18,18 @@ from colmap_sph.app import cli
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
-from colmap_sph.pipeline.forecast import within
+from colmap_sph.pipeline.forecast import sizes, within
 from colmap_sph.pipeline.forecast.ladder import BEST, LADDER, NORMAL, Settings, choices
 from colmap_sph.pipeline.forecast.ranks import ranks_of
-from colmap_sph.pipeline.forecast.time_limit import TimeLimit, format_time, parse_time
+from colmap_sph.pipeline.forecast.time_limit import SIZE, TimeLimit, format_time, parse_time
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.presets import preset
-from colmap_sph.pipeline.reconstruct import go_through_stages_within, with_good_images
+from colmap_sph.pipeline.reconstruct import go_through_stages_within
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.pipeline.stages.stage import Result, Stage
+from colmap_sph.project.project import Project
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
@@ -225,6 +227,15 @@ def test_stages_that_take_longer_than_estimated(context: Context) -> None:
     assert simulation.now <= 1.15 * asked
 
 
+def test_stages_that_take_less_than_estimated(context: Context) -> None:
+    """Matching takes half as long again as thought, and all after it half: what is left is used."""
+    least, most = span(context, 1.0)
+    asked = least + 0.6 * (most - least)
+    simulation = Simulation(context, lambda stage, _: 1.5 if "pairs" in stage else 0.5)
+    simulation.run(asked)
+    assert simulation.now == pytest.approx(asked, rel=0.15)
+
+
 def test_too_little_is_told_beforehand(context: Context, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level("INFO", "colmap_sph"):
         assert Simulation(context, steady(1.0)).run(0.1) == LADDER[0]
@@ -237,6 +248,48 @@ def test_partners_of_the_user_are_all_matched(context: Context) -> None:
     context = replace(context, options=replace(context.options, pairs=pairs))
     simulation = Simulation(context, steady(1.0))
     assert simulation.run(0.5, frozenset({"pairs.num_pairs"})).partners == 3
+
+
+# ---- the size of images ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def small_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the small images of the tests be reduced, and their page take no time."""
+    monkeypatch.setattr(sizes, "_SMALLEST", 40)
+    monkeypatch.setattr(within, "_PAGE_SECONDS", 0.02)
+    monkeypatch.setattr(within, "_PAGE_SECONDS_EACH", 0.01)
+
+
+def size_for(project: Path, seconds: float, *kept: str, overwrite: bool = False) -> int:
+    """Longest side that is chosen by the estimates alone, as no clock moves."""
+    limit = TimeLimit(seconds, frozenset(kept), 0.0, lambda: 0.0)
+    given = Project(model=project / "sparse/0", output=project / "dense")
+    options, words = sizes.affordable_size(given, OPTIONS, limit, overwrite=overwrite)
+    size = options.undistortion.max_image_size
+    assert words == "" if size == -1 else str(size) in words
+    return size
+
+
+@pytest.mark.usefixtures("small_images")
+def test_images_are_reduced_where_time_is_short(project: Path) -> None:
+    assert size_for(project, 100) == -1
+    assert 320 > size_for(project, 3.0) > size_for(project, 1.4) >= 40
+    assert size_for(project, 1e-6) >= 40
+    assert size_for(project, 1e-6, SIZE) == -1
+
+
+@pytest.mark.usefixtures("small_images")
+def test_images_stay_as_an_earlier_run_reduced_them(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    keep_images(project, IMAGES)
+    command = ["run", "--model", str(project / "sparse/0"), "--threads", "2"]
+    assert cli.main([*command, "--max-image-size", "100"]) == 0
+    for seconds in (1e-6, 100):
+        assert size_for(project, seconds) == 100
+    assert size_for(project, 100, overwrite=True) == -1
+    assert cli.main([*command, "--within", "10h", "--num-pairs", "2"]) == 0
+    assert report_of(project / "dense")["options"]["undistortion"]["max_image_size"] == 100
+    assert "--max-image-size 100" in " ".join(capsys.readouterr().err.split())
 
 
 # ---- real runs ---------------------------------------------------------------------------------------------

@@ -59,7 +59,7 @@ class RunCommand:
     quality: Quality = "normal"
     """Preview takes a quarter of the time of normal, best about twice as much. Options given beside it win."""
     within: str = ""
-    """Time to end within, such as 20min: it chooses sampling, partners and refinement."""
+    """Time to end within, such as 20min: it chooses size and settings accordingly."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Write nothing: say what is to do, and about how much time, memory and disk it takes."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False

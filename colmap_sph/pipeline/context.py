@@ -223,11 +223,12 @@ def timed_stage(name: str, total: int, progress: Progress, report: RunReport) ->
         Steps that will be told by `progress.advance`.
     progress : Progress
     report : RunReport
-        Whose `seconds` get the time.
+        Whose `seconds` get the time, in all where there is a stage of this name more than once.
     """
     logger.info("%s (%d)", name.capitalize(), total)
     progress.start(name, total)
     start = time.perf_counter()
     yield
-    report.seconds[name] = round(time.perf_counter() - start, 3)
-    logger.info("%s: %.1f s", name.capitalize(), report.seconds[name])
+    seconds = time.perf_counter() - start
+    report.seconds[name] = round(report.seconds.get(name, 0.0) + seconds, 3)
+    logger.info("%s: %.1f s", name.capitalize(), seconds)

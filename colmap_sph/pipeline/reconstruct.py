@@ -8,7 +8,6 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from statistics import mean
 from typing import Any, Protocol, TypeVar
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
@@ -16,6 +15,7 @@ from colmap_sph.pipeline.context import Context, Until, timed_stage
 from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
+from colmap_sph.pipeline.forecast.sizes import with_affordable_size
 from colmap_sph.pipeline.forecast.time_limit import TimeLimit, time_limit
 from colmap_sph.pipeline.forecast.within import Within, widest
 from colmap_sph.pipeline.keys import Keys, program_digests
@@ -25,9 +25,9 @@ from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.report_files import command_of, keep_or_make_page, write_report
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
-from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
+from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
@@ -44,7 +44,6 @@ from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.rectification import sampling_of
 
 logger = logging.getLogger(__name__)
 
@@ -127,6 +126,8 @@ def run_project(
         The time to end within.
     """
     check_input(project, options, limit)
+    if limit is not None:
+        options = with_affordable_size(project, options, limit, overwrite=overwrite)
     program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
     report = RunReport(command=command_of(project, options))
@@ -323,7 +324,8 @@ def go_through_stages(
     """
     check_numbers(context, pairs)
     matched = _by_name(executor(MatchStage(context, context.order.sorted_pairs(pairs))))
-    votes = _vote(context, matched, executor)
+    _judge_rows(context, matched)
+    votes = _by_name(executor(VoteStage(context, matched)))
     if until == "photometric":
         report_photometric(context, votes)
         return
@@ -334,61 +336,19 @@ def go_through_stages(
 
 def go_through_stages_within(within: Within, executor: Executor) -> Context:
     """Go through all stages in the time that there is; return the context with the options that were chosen."""
-    context, matched = within.match(executor)
-    votes = _vote(context, matched, executor)
+    context, matched, votes = within.match_and_vote(executor)
+    _judge_rows(context, matched)
     context = within.refined(context, matched, votes)
     maps = _by_name(executor(ConfirmStage(context, matched, votes)))
     executor(fuse_stage(context, keys_of(matched), maps))
     return context
 
 
-def _vote(context: Context, matched: Mapping[Pair, Result], executor: Executor) -> dict[str, Result]:
+def _judge_rows(context: Context, matched: Mapping[Pair, Result]) -> None:
     measured = {pair: result.facts.row_residual for pair, result in matched.items()}
     judge_rows(context.report, context.scene, measured)
-    return _by_name(executor(VoteStage(context, matched)))
 
 
 def _by_name(results: Mapping[Item, Result]) -> dict[Item, Result]:
     """Results in the order of their items' names, whatever the order in which they were worked on."""
     return {item: results[item] for item in sorted(results)}
-
-
-def with_good_images(
-    context: Context, executor: Executor, *, verify: bool = False, to_come: Collection[str] = ()
-) -> Context:
-    """Check the undistorted images, and return a context with the good ones alone, whose contents its keys know.
-
-    Parameters
-    ----------
-    context : Context
-    executor : callable
-    verify : bool
-        Whether what is known of them from earlier runs does not count.
-    to_come : collection of str
-        Images that are not there yet, or will be made anew: they are taken for good.
-
-    Returns
-    -------
-    Context
-    """
-    workspace = context.workspace
-    there = [view for view in context.scene.views if view.name not in to_come]
-    sizes = {view.name: view.file_size for view in there}
-    worked_at = {view.name: (view.width, view.height) for view in there}
-    places = ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
-    checked = executor(CheckStage(context, sizes, places, worked_at, verify=verify)) if there else {}
-    images = keys_of(checked)
-    details = details_of(checked)
-    if details:
-        _report_detail(context, details)
-    keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
-    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
-
-
-def _report_detail(context: Context, details: Mapping[str, float]) -> None:
-    """Tell how much the images hold, and how finely they are therefore matched."""
-    sampling = context.options.rectification.sampling * mean(map(sampling_of, details.values()))
-    detail = mean(details.values())
-    context.report.detail = round(detail, 3)
-    context.report.sampling = round(sampling, 3)
-    logger.info("Images hold %.2f of their pixels' detail: pairs are sampled at %.2f", detail, sampling)

@@ -163,11 +163,14 @@ class Choice:
         Seconds.
     expected : float
         Estimated seconds of the whole run, what has passed of it already among them.
+    is_reduced : bool
+        Whether images were reduced for it: what settings are worth was measured with whole ones.
     """
 
     settings: Settings
     asked: float
     expected: float
+    is_reduced: bool = False
 
     @property
     def is_too_little(self) -> bool:
@@ -178,11 +181,12 @@ class Choice:
     def words(self) -> str:
         """What is chosen and what it costs, in sentences."""
         asked, expected = format_time(self.asked), format_time(self.expected)
+        worth = "" if self.is_reduced else worth_of(self.settings)
         if self.is_too_little:
             return (
                 f"{asked} is too little: the run takes about {expected} even with {self.settings.flags}. It goes "
-                f"on with these; a smaller --max-image-size would be faster. {worth_of(self.settings)}"
-            )
+                f"on with these; a smaller --max-image-size would be faster. {worth}"
+            ).rstrip()
         if self.settings == BEST:
             return f"{asked} is enough for the best quality, which takes about {expected}: {self.settings.flags}."
-        return f"Chosen for {asked}: {self.settings.flags}, about {expected}. {worth_of(self.settings)}"
+        return f"Chosen for {asked}: {self.settings.flags}, about {expected}. {worth}".rstrip()

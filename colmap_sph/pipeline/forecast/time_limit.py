@@ -16,7 +16,8 @@ _FORM = re.compile(r"(?:(\d+(?:\.\d+)?)\s*h)?\s*(?:(\d+(?:\.\d+)?)\s*(?:min|m))?
 _LONGEST = 1e7
 """Seconds; nearly four months."""
 
-DIALS = ("rectification.sampling", "pairs.num_pairs", "refinement.rounds", "normals.radius")
+SIZE = "undistortion.max_image_size"
+DIALS = ("rectification.sampling", "pairs.num_pairs", "refinement.rounds", "normals.radius", SIZE)
 """Options that are chosen to keep to a time, by their place in the records."""
 
 

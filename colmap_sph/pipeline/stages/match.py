@@ -46,8 +46,8 @@ logger = logging.getLogger(__name__)
 _PRECISE_POSES = 0.35
 _TRIAL_SAMPLING = 0.4
 # Processor seconds per megapixel of both rectified images, and of a pair beside that.
-_SECONDS = 0.12
-_PAIR_SECONDS = 0.03
+_SECONDS = 0.14
+_PAIR_SECONDS = 0.05
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …
@@ -150,6 +150,11 @@ def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] 
     return counts if mask is None else np.minimum(counts, mask)
 
 
+def match_seconds(pixels: float) -> float:
+    """Processor seconds to match rectified images that have so many pixels together."""
+    return _PAIR_SECONDS + _SECONDS * pixels / 1e6
+
+
 class MatchStage(RememberingStage[Pair, MatchTask]):
     """Matches pairs of image names."""
 
@@ -194,7 +199,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         reading = max(_READ_BYTES * pixels, bytes_to_reduce(left, right))
         both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
-            seconds=_PAIR_SECONDS + _SECONDS * both_pixels / 1e6 * (1 + trial**2 * (trial < 1)),
+            seconds=match_seconds(both_pixels) + (match_seconds(trial**2 * both_pixels) if trial < 1 else 0.0),
             memory=max(_MATCH_BYTES * left_pixels, reading + _RECTIFIED_BYTES * left_pixels),
             disk=_FILE_BYTES * left_pixels,
             scratch=scratch_bytes(left_pixels, context.options.matching),

@@ -1,0 +1,59 @@
+"""The undistorted images that can be worked with, and what they hold."""
+
+import logging
+from collections.abc import Collection, Mapping
+from dataclasses import replace
+from statistics import mean
+from typing import TYPE_CHECKING
+
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
+from colmap_sph.pipeline.stages.stage import keys_of
+from colmap_sph.stereo.rectification import sampling_of
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.reconstruct import Executor
+
+logger = logging.getLogger(__name__)
+
+
+def with_good_images(
+    context: Context, executor: "Executor", *, verify: bool = False, to_come: Collection[str] = ()
+) -> Context:
+    """Check the undistorted images, and return a context with the good ones alone, whose contents its keys know.
+
+    Parameters
+    ----------
+    context : Context
+    executor : callable
+    verify : bool
+        Whether what is known of them from earlier runs does not count.
+    to_come : collection of str
+        Images that are not there yet, or will be made anew: they are taken for good.
+
+    Returns
+    -------
+    Context
+    """
+    workspace = context.workspace
+    there = [view for view in context.scene.views if view.name not in to_come]
+    sizes = {view.name: view.file_size for view in there}
+    worked_at = {view.name: (view.width, view.height) for view in there}
+    places = ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
+    checked = executor(CheckStage(context, sizes, places, worked_at, verify=verify)) if there else {}
+    images = keys_of(checked)
+    details = details_of(checked)
+    if details:
+        _report_detail(context, details)
+    keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
+    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
+
+
+def _report_detail(context: Context, details: Mapping[str, float]) -> None:
+    """Tell how much the images hold, and how finely they are therefore matched."""
+    sampling = context.options.rectification.sampling * mean(map(sampling_of, details.values()))
+    detail = mean(details.values())
+    context.report.detail = round(detail, 3)
+    context.report.sampling = round(sampling, 3)
+    logger.info("Images hold %.2f of their pixels' detail: pairs are sampled at %.2f", detail, sampling)
