@@ -386,7 +386,7 @@ def test_an_image_that_fails_is_left_out_and_done_again(workspace):
 
 
 def test_a_partner_that_cannot_be_read_for_a_moment_is_made_up_for(workspace, monkeypatch):
-    """One read of the last image fails while the first is fused: nothing vouches for the cloud, which lacks that."""
+    """One read of the last image fails while the first is fused: nothing vouches for what lacks it."""
     last = context_of(workspace).order.sorted(NAMES)[-1]
     fuse(workspace)
     whole = cloud_bytes(workspace)

@@ -162,7 +162,7 @@ def test_signals_stop_a_run_which_then_goes_on(
     assert said.splitlines()[-1].startswith("interrupted; what is finished is kept")
     assert not (dense / "fused.ply").exists()
     assert not list(dense.rglob(".*.tmp"))
-    kept = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.sph")}
+    kept = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/**/*.sph")}
     assert len(kept) >= 2
     complete("--model", project / "sparse/0")
     assert {path: path.stat().st_mtime_ns for path in kept} == kept
@@ -289,7 +289,7 @@ def test_full_disk(stage: int, uninterrupted: Path, small_disk: Path) -> None:
     assert not (dense / "fused.ply").exists()
     truth = maps(uninterrupted)
     assert {name: content for name, content in maps(dense).items() if truth[name] != content} == {}
-    done = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/*.sph")}
+    done = {path: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/p*/**/*.sph")}
     assert len(done) >= [0, 1, 6, 10, 10][stage]
     ballast.unlink()
     complete("--model", model, "--output", dense)

@@ -182,7 +182,7 @@ def test_many_that_are_missing_are_foreseen_from_some(
 ) -> None:
     whole = make_plan(Project(workspace=dense), OPTIONS, overwrite=True)
     asked.clear()
-    monkeypatch.setattr("colmap_sph.pipeline.plan._ASKED", 2)
+    monkeypatch.setattr("colmap_sph.pipeline.forecast.survey._ASKED", 2)
     some = make_plan(Project(workspace=dense), OPTIONS, overwrite=True)
     assert len([item for item in asked if item != "selection"]) == 2 + 2 + 2
     assert (some.pairs, some.images, some.pairs_done) == (whole.pairs, whole.images, 0)

@@ -24,8 +24,8 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.fusion_parts import PartsStage
+from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Job, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage

@@ -19,6 +19,9 @@ from colmap_sph.scene import Scene, View
 
 logger = logging.getLogger(__name__)
 
+# A table has so many times as many places as there are points, at most.
+_MOST_GAPS = 8
+
 
 def read_scene(sparse_dir: Path) -> Scene:
     """Read an undistorted COLMAP model, such as the ``sparse`` folder of a dense workspace.
@@ -88,14 +91,14 @@ def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse) ->
     if not is_kept.all():
         number = len(is_kept) - int(is_kept.sum())
         logger.warning("%d sparse points have no possible coordinates; left out", number)
-    ids = sparse.ids[is_kept]
+    rows_of = _Rows(sparse.ids[is_kept])
     points = sparse.points[is_kept] - origin
     registered = set(model.reg_image_ids())
     views = {}
     for image_id, observations in sparse.observations:
         if image_id in registered:
             view = _read_view(model, image_id, sparse_dir, origin)
-            views[image_id] = _with_observations(view, observations, ids, points)
+            views[image_id] = _with_observations(view, observations, rows_of, points)
     usable = [views[image_id] for image_id in model.reg_image_ids() if _is_possible(views[image_id])]
     for view in views.values():
         if not _is_possible(view):
@@ -132,16 +135,35 @@ def _read_view(
     )
 
 
+class _Rows:
+    """Rows of points by their ids."""
+
+    def __init__(self, ids: NDArray[np.int64]) -> None:
+        self._ids = ids
+        # A table is looked up many times faster than a sorted array is searched; ids seldom have large gaps.
+        self._table = np.full(0, -1, np.int64)
+        if len(ids) and ids[0] >= 0 and ids[-1] < _MOST_GAPS * len(ids):
+            self._table = np.full(ids[-1] + 1, -1, np.int64)
+            self._table[ids] = np.arange(len(ids))
+
+    def of(self, wanted: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Row of each id that is wanted, -1 where there is none."""
+        if len(self._table):
+            return np.where(wanted < len(self._table), self._table[np.minimum(wanted, len(self._table) - 1)], -1)
+        if not len(self._ids):
+            return np.full(len(wanted), -1)
+        places = np.minimum(np.searchsorted(self._ids, wanted), len(self._ids) - 1)
+        return np.where(self._ids[places] == wanted, places, -1)
+
+
 def _with_observations(
-    view: View, observations: Observations, ids: NDArray[np.int64], points: NDArray[np.float64]
+    view: View, observations: Observations, rows_of: _Rows, points: NDArray[np.float64]
 ) -> View:
-    """A view with what it observes of points, whose ids ascend, and how far off these are."""
-    places = np.searchsorted(ids, observations.point)
-    known = places < len(ids)
-    known[known] = ids[places[known]] == observations.point[known]
-    rows = places[known]
-    error = _reprojection_error(view, observations.xy[known], points[rows])
-    return replace(view, point_indices=np.unique(rows), reprojection_error=error)
+    """A view with what it observes of points, and how far off these are."""
+    rows = rows_of.of(observations.point)
+    known = rows >= 0
+    error = _reprojection_error(view, observations.xy[known], points[rows[known]])
+    return replace(view, point_indices=np.unique(rows[known]), reprojection_error=error)
 
 
 def _reprojection_error(view: View, observed: NDArray[np.float64], points: NDArray[np.float64]) -> float:
