@@ -28,7 +28,6 @@ from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.state.records import invalidate
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
@@ -102,30 +101,6 @@ def finished_stages(project: Path) -> list[Stage[Any, Any]]:
     stages.append(ConfirmStage(context, matched, execute(stages[-1])))
     stages.append(fuse_stage(context, keys_of(matched), execute(stages[-1])))
     return stages
-
-
-def test_what_a_lost_worker_has_made_is_not_made_again(project: Path, tmp_path: Path) -> None:
-    """Who knows nothing but the task finds the result; and of one half done, the half."""
-    context = context_of(project, tmp_path / "dense")
-    context.workspace.create_stereo_dirs(NAMES)
-    pairs = select_pairs(context.scene, OPTIONS.pairs).unique_pairs()
-    matching = MatchStage(context, pairs)
-    with matching.opened():
-        task = matching.job(pairs[0]).task
-        assert MatchStage.found(task) is None
-        facts = MatchStage.make(task)
-        assert MatchStage.found(task) == facts
-    voting = VoteStage(context, execute(matching))
-    with voting.opened():
-        vote = voting.job(NAMES[0]).task
-        assert VoteStage.found(vote) is None
-        facts = VoteStage.make(vote)
-        assert VoteStage.found(vote) == facts
-        made = vote.estimate.stat().st_mtime_ns
-        invalidate(vote.maps.record)
-        assert VoteStage.found(vote) is None
-        assert VoteStage.make(vote) == facts
-        assert vote.estimate.stat().st_mtime_ns == made
 
 
 def test_a_task_is_small(project: Path) -> None:
