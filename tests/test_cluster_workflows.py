@@ -3,8 +3,10 @@
 import os
 import shlex
 import subprocess
+import time
 from pathlib import Path
 
+import psutil
 import pytest
 
 RECIPES = Path(__file__).parents[1] / "workflows/cluster"
@@ -59,8 +61,10 @@ def calls_of(*command: object, code: int = 5) -> list[list[str]]:
     assert done.returncode == code, done.stderr
     calls = Path(os.environ["CALLS"])
     scheduler = int(Path(f"{calls}.pid").read_text())
-    with pytest.raises(ProcessLookupError):
-        os.kill(scheduler, 0)
+    limit = time.monotonic() + 20
+    while psutil.pid_exists(scheduler):
+        assert time.monotonic() < limit
+        time.sleep(0.02)
     return [shlex.split(line) for line in calls.read_text().splitlines()]
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from projects import FOUR_NAMES, prepare, render_four_images
 
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pipeline.context import Context
@@ -17,16 +18,24 @@ from colmap_sph.pipeline.engine.division import MOST_ITEMS, Asked, Division
 from colmap_sph.pipeline.engine.group import Group, Piece, RunSeen, folders_of
 from colmap_sph.pipeline.engine.lag import made_with_patience
 from colmap_sph.pipeline.engine.worker import Workplace, budget_of
+from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.memory import resident
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import versions
+from colmap_sph.pipeline.reconstruct import with_good_images
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Stage
+from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.files import atomic_file, remove_temporary_files
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.records import invalidate
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import NO_SCENE
+from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.partners.pairs import select_pairs
 
 GIB = 1 << 30
 _cache: LoadCache[bytes] = LoadCache(len)
@@ -129,6 +138,33 @@ def test_what_a_lost_worker_has_made_is_found(run: RunSeen, place: Workplace) ->
     assert [outcome.facts for outcome in first.outcomes] == [Facts(points=1), Facts(points=2)]
     again = place.work(group_of(run, 1, 2, 3))
     assert [outcome.facts for outcome in again.outcomes] == [Facts(points=-1), Facts(points=-2), Facts(points=3)]
+
+
+def test_a_result_half_done_is_not_begun_anew(tmp_path: Path) -> None:
+    """Who knows nothing but the task finds the result of a pair or an image, and an estimate without its maps."""
+    render_four_images(tmp_path)
+    workspace = prepare(tmp_path / "sparse/0", tmp_path / "dense")
+    workspace.create_stereo_dirs(FOUR_NAMES)
+    options = RunOptions(threads=2)
+    scene = anchored(read_scene(workspace.sparse_dir))
+    context = with_good_images(Context(workspace, scene, options, Keys(workspace, options)), execute)
+    pairs = select_pairs(scene, options.pairs).unique_pairs()
+    matching = MatchStage(context, pairs)
+    with matching.opened():
+        pair = matching.job(pairs[0]).task
+        assert MatchStage.found(pair) is None
+        assert MatchStage.make(pair) == MatchStage.found(pair)
+    voting = VoteStage(context, execute(matching))
+    with voting.opened():
+        image = voting.job(FOUR_NAMES[0]).task
+        assert VoteStage.found(image) is None
+        facts = VoteStage.make(image)
+        assert VoteStage.found(image) == facts
+        made = image.estimate.stat().st_mtime_ns
+        invalidate(image.maps.record)
+        assert VoteStage.found(image) is None
+        assert VoteStage.make(image) == facts
+    assert image.estimate.stat().st_mtime_ns == made
 
 
 def test_one_failure_costs_one_item(run: RunSeen, place: Workplace) -> None:

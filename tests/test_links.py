@@ -153,9 +153,10 @@ def test_links_to_nothing(target: str, root: Path, capsys: pytest.CaptureFixture
 def test_an_atomic_file_writes_through_no_link(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither where its temporary name is taken, nor where its own is."""
     monkeypatch.setattr("os.getpid", lambda: 1)
+    monkeypatch.setattr("socket.gethostname", lambda: "host")
     monkeypatch.setattr("threading.get_ident", lambda: 2)
     (tmp_path / "victim").write_text("mine")
-    for name in (".1-2.tmp", "report.json"):
+    for name in (".host-1-2-0.tmp", "report.json"):
         (tmp_path / name).symlink_to("victim")
     with atomic_file(tmp_path / "report.json") as file:
         file.write(b"new")

@@ -1,12 +1,12 @@
 """Folders and files made, read and removed for the user: errors are sentences, no file is ever half-written."""
 
 import errno
-import itertools
 import os
 import re
 import shutil
 import socket
 import stat
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -18,11 +18,12 @@ import xxhash
 
 from colmap_sph.errors import InputError, OutputError, reason_of
 
-# What a file is called until it is complete: short, so that it fits wherever the real name fits. Processes of
-# other machines may have the same number. Earlier versions did not name the machine.
-_TEMPORARY_NAME = ".{process}-{number}.tmp"
-_TEMPORARY = re.compile(r"\.([\w-]{1,32}-)?\d+-\d+\.tmp")
-_numbers = itertools.count()
+# What a file is called until it is complete: short, so that it fits wherever the real name fits. One for each file
+# that a thread writes at a time; processes of other machines may have the same number. Earlier versions did not
+# name the machine.
+_TEMPORARY_NAME = ".{process}-{thread}-{depth}.tmp"
+_TEMPORARY = re.compile(r"\.([\w-]{1,48}-)?\d+-\d+\.tmp")
+_open_files = threading.local()
 _check_before_writing: ContextVar[Callable[[], None] | None] = ContextVar("check_before_writing", default=None)
 # What a file system answers that cannot sync at all: there is nothing to wait for then.
 _NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
@@ -92,7 +93,9 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
     OutputError
         The file cannot be written: permissions, a full disk, a folder in the way.
     """
-    name = _TEMPORARY_NAME.format(process=process_name(), number=next(_numbers))
+    depth = getattr(_open_files, "number", 0)
+    _open_files.number = depth + 1
+    name = _TEMPORARY_NAME.format(process=process_name(), thread=threading.get_ident(), depth=depth)
     temporary = path.parent / name
     try:
         temporary.unlink(missing_ok=True)  # of a process with the same number that was killed
@@ -112,6 +115,7 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
             f"{path} cannot be written ({reason_of(error)}); check space and permissions."
         ) from error
     finally:
+        _open_files.number = depth
         with suppress(OSError):  # not there, or on a disk that has become read-only
             temporary.unlink()
 

@@ -232,13 +232,16 @@ def _key_of_cloud(context: "Context", pair_keys: Mapping[Pair, str], maps: Mappi
 def _sources_of(context: "Context", name: str, index: int) -> MapSources:
     options = context.options.fusion
     maps = context.map_files(name, options.input)
+    folder = options.mask_path
+    if folder is not None and context.options.scheduler:
+        folder = folder.absolute()  # workers have other current folders
     return MapSources(
         context.scene.view(name).without_points(),
         index,
         maps.depth,
         maps.normals,
         context.workspace.image_path(name),
-        None if options.mask_path is None else mask_path(options.mask_path.absolute(), name),
+        None if folder is None else mask_path(folder, name),
         maps.digests(),
         maps.record,
     )

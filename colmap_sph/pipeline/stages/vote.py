@@ -74,7 +74,9 @@ class VoteTask:
 def make_photometric_maps(task: VoteTask) -> Facts:
     """Vote on the depth of a view; writes it with its standard deviation and support, and the photometric maps."""
     view = task.window.view(task.view)
-    estimate = read_estimate(task.estimate, view) if task.is_voted else _vote(task, view)
+    # A worker that was lost may have come so far.
+    is_voted = task.is_voted or is_estimate_there(task.estimate, task.vote_key, view)
+    estimate = read_estimate(task.estimate, view) if is_voted else _vote(task, view)
     normals, depth = fit_normals(view, estimate, task.normal_options)
     drop_other_depths(depth, task.depths)
     drop_outside(view, depth, region_of(task.focus))
