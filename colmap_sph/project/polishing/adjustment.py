@@ -22,6 +22,9 @@ _INSIST = "; --polish-poses always polishes them, too"
 # these bounds, pixels.
 _LEAST_USUAL = 0.1
 _MOST_USUAL = 1.0
+# An adjusted model is laid over the given one by centres, which may come from a survey, and so many times less by
+# what they look at: this tells the turn about centres in a row, and the scale where they are near each other.
+_CENTER_WEIGHT = 100
 # Standard deviation of a given centre, in what a pixel covers at the median depth of the image's points.
 _CENTER_PIXELS = 5.0
 _MAX_ITERATIONS = 100
@@ -194,16 +197,13 @@ def _points_of(model: pycolmap.Reconstruction, image_id: int) -> NDArray[np.floa
 def _lay_over(
     adjusted: pycolmap.Reconstruction, given: pycolmap.Reconstruction, own_points: Sequence[int]
 ) -> None:
-    """Move an adjusted model over the given one, by the similarity that fits centres and what they look at best.
-
-    Centres alone leave a turn about them open where they are in a row, and a scale where they are near each other.
-    """
+    """Move an adjusted model over the given one, by the similarity that fits both best."""
     places: list[list[NDArray[np.float64]]] = [[], []]
     own = set(own_points)
     for image_id in sorted(given.images):
         observed = [point for point in given.image(image_id).points2D if point.point3D_id in own]
         for model, there in zip((adjusted, given), places, strict=True):
-            there.append(model.image(image_id).projection_center())
+            there += [model.image(image_id).projection_center()] * _CENTER_WEIGHT
             if observed:
                 points = [model.point3D(point.point3D_id).xyz for point in observed]
                 there.append(np.median(points, axis=0))
