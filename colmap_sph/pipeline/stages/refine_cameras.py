@@ -1,7 +1,7 @@
 """With polishing, on request: the original model and ties → cameras that fit better, as a model for another run.
 
-First the distortion that an OPENCV camera can have, then a lens field of what that leaves. Each is taken where
-ties that had no part in it fit clearly better.
+First the distortion that an OPENCV camera can have, then a lens field. Each is taken where ties that had no part
+in it fit clearly better, the field where better than with the distortion.
 """
 
 from dataclasses import dataclass, replace
@@ -68,13 +68,14 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
     tried = np.inf
     options = task.options.for_colmap()
     for refine in (with_distortion, with_fields):
-        refined = refine(best, task.used, given, options)
+        refined = refine(given, task.used, options)
         if refined is None:
             continue
-        tried = min(tried, _error(task, given, refined))
-        if tried <= (1 - least_gain) * error:
+        fits = _error(task, given, refined)
+        tried = min(tried, fits)
+        if fits <= (1 - least_gain) * error:
             best = refined
-            error = tried
+            error = fits
     if best is given:
         found = f"({tried:.2f} px)" if np.isfinite(tried) else "(none could be found)"
         return f"The cameras are kept as given: refined ones are not clearly better {found}."

@@ -73,21 +73,17 @@ class Lenses:
         return ", ".join(words)
 
 
-def with_distortion(
-    lenses: Lenses, ties: Observations, given: Lenses, options: pycolmap.UndistortCameraOptions
-) -> Lenses | None:
+def with_distortion(given: Lenses, ties: Observations, options: pycolmap.UndistortCameraOptions) -> Lenses | None:
     """Adjust the distortion of each camera of a model, with its poses.
 
     Parameters
     ----------
-    lenses : Lenses
-        To start from.
+    given : Lenses
+        Without fields.
     ties : Observations
         Image coordinates in the undistorted images.
-    given : Lenses
-        With the cameras of which these were undistorted.
     options : pycolmap.UndistortCameraOptions
-        How they were.
+        How these were undistorted.
 
     Returns
     -------
@@ -95,26 +91,26 @@ def with_distortion(
         Of the original images; None where the adjustment does not converge.
     """
     original = _original_ties(given, ties, options)
-    model = submodel(lenses.model, set(image_names(lenses.model)))
+    model = submodel(given.model, set(image_names(given.model)))
     for camera in model.cameras.values():
         _as_opencv(camera)
     adjusted = adjusted_model(model, original, refine_distortion=True)
     return None if adjusted is None else Lenses(adjusted)
 
 
-def with_fields(
-    lenses: Lenses, ties: Observations, given: Lenses, options: pycolmap.UndistortCameraOptions
-) -> Lenses | None:
+def with_fields(given: Lenses, ties: Observations, options: pycolmap.UndistortCameraOptions) -> Lenses | None:
     """Give cameras of a model their lens fields; parameters and result as of `with_distortion`.
 
-    None, too, where no field is known well, and where the model's own points would fit worse.
+    None, too, where no field is known well, and where the model's own points would fit worse. It is the given
+    camera to which a field is added, not one with another distortion: what ties hardly tell, such as a focal
+    length that goes with it, stays as given.
     """
     original = _original_ties(given, ties, options)
-    found = found_fields(lenses.model, original, options)
-    known = Lenses(lenses.model, {number: one for number, one in found.items() if one.is_known})
+    found = found_fields(given.model, original, options)
+    known = Lenses(given.model, {number: one for number, one in found.items() if one.is_known})
     if not known.fields:
         return None
-    adjusted = adjusted_with_fields(lenses.model, known.plain_fields, original)
+    adjusted = adjusted_with_fields(given.model, known.plain_fields, original)
     if adjusted is None or sparse_error(adjusted, known.plain_fields) > (1 + _RISE) * sparse_error(given.model):
         return None
     return replace(known, model=adjusted)

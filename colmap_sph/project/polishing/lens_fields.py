@@ -114,7 +114,7 @@ def adjusted_with_fields(
         if image.camera_id in fields:
             camera = straight.camera(image.camera_id)
             _place(image, straightened_pixels(camera, fields[image.camera_id], observed[image_id]))
-    adjusted = adjusted_model(straight, straightened_ties(model, fields, ties))
+    adjusted = adjusted_model(straight, straightened_ties(model, fields, ties), trust_centers=True)
     if adjusted is not None:
         for image_id, image in adjusted.images.items():
             _place(image, observed[image_id])
