@@ -23,6 +23,9 @@ from colmap_sph.project.lens.field import Float, LensField
 _CELLS = 8
 _BEND = 1.0
 _NO_TURN = 1e-3
+# What poses and points can explain but for so small a share is left to them: no lens is needed for it, and systematic
+# errors of other kinds (a rolling shutter) would fill it.
+_MODESTY = 0.003
 _NODES = 25
 _STEPS = 12
 _CONVERGED = 1e-4
@@ -141,6 +144,8 @@ def _step(sights: Sights, bundle: Bundle, basis: csr_array, residuals: _Residual
     parts = _parts(sights, bundle, basis, residuals)
     normal, right = _reduced(parts, len(bundle.R))
     number = _POSE * len(bundle.R)
+    observed = diags_array(residuals.scale) @ basis
+    prior = prior + _MODESTY * block_diag(*[(observed.T @ observed).toarray()] * 2)
     normal[number:, number:] += prior
     right[number:] -= prior @ bundle.field.coefficients.ravel()
     diagonal = np.einsum("ii->i", normal)
