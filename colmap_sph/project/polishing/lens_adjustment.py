@@ -1,9 +1,9 @@
-"""Tracks, poses and a camera → the lens field that explains them best, adjusted together with poses and points.
+"""Tracks, poses and cameras → the lens fields that explain them best, adjusted together with poses and points.
 
-A field and the poses explain much of the same (a block that is domed hides a radial field), so that adjusting one
-after the other hardly moves: this is one adjustment of all by Gauss and Newton, with the points eliminated. What a
-turn of the camera and another focal length do to an image is no part of a field: these would change with it and
-nothing would tell.
+Fields and poses explain much of the same (a block that is domed hides a radial field), so that adjusting one after
+the other hardly moves: this is one adjustment of all by Gauss and Newton, with the points eliminated. What a turn
+of the camera and another focal length do to an image is no part of a field: these would change with it and nothing
+would tell.
 """
 
 from collections.abc import Sequence
@@ -13,18 +13,18 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag, cho_factor, cho_solve
-from scipy.sparse import block_array, csr_array, diags_array, eye_array, kron, vstack
+from scipy.sparse import block_array, csr_array, diags_array, eye_array, hstack, kron, vstack
 from scipy.spatial.transform import Rotation
 
 from colmap_sph.project.lens.field import Float, LensField
 
-# Cells along the longer side of a field. Its coefficients may bend by so many pixels from cell to cell where
+# Cells along each side of a field. Its coefficients may bend by so many pixels from cell to cell where
 # nothing else is known; by how few it may be turned or scaled.
 _CELLS = 8
 _BEND = 1.0
 _NO_TURN = 1e-3
-# What poses and points can explain but for so small a share is left to them: no lens is needed for it, and systematic
-# errors of other kinds (a rolling shutter) would fill it.
+# What poses and points can explain but for so small a share is left to them: it needs no lens, and other systematic
+# errors (a rolling shutter) would fill it.
 _MODESTY = 0.003
 _NODES = 25
 _STEPS = 12
@@ -38,7 +38,7 @@ _CHUNK = 2000
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """Observations of points by images of one camera.
+    """Observations of points by images.
 
     Attributes
     ----------
@@ -55,31 +55,49 @@ class Sights:
 
 @dataclass(frozen=True, eq=False)
 class Bundle:
-    """Poses, points and a field that explain some sights.
+    """Poses, points and fields that explain some sights.
 
     Attributes
     ----------
     R, t : (n, 3, 3) and (n, 3) float64 ndarray
         World to camera.
     points : (p, 3) float64 ndarray
-    field : LensField
+    fields : tuple of LensField
+        On grids of the same size.
+    field_of : (n,) int64 ndarray
+        Index of the field of each image; -1 without any.
+    focal : (n,) float64 ndarray
+        Pixels: makes residuals of rays those of images.
     """
 
     R: Float
     t: Float
     points: Float
-    field: LensField
+    fields: tuple[LensField, ...]
+    field_of: NDArray[np.int64]
+    focal: Float
+
+    @property
+    def coefficients(self) -> Float:
+        """(2, c) of x and y of all fields."""
+        return np.concatenate([field.coefficients.reshape(2, -1) for field in self.fields], axis=1)
+
+    def with_coefficients(self, coefficients: Float) -> tuple[LensField, ...]:
+        """Its fields with (2, c) others."""
+        parts = np.split(coefficients, len(self.fields), axis=1)
+        return tuple(
+            replace(field, coefficients=part.reshape(field.coefficients.shape))
+            for field, part in zip(self.fields, parts, strict=True)
+        )
 
 
-def fitted_field(sights: Sights, start: Bundle, focal: float, usual_error: float) -> Bundle:
-    """Adjust poses, points and lens field.
+def fitted_fields(sights: Sights, start: Bundle, usual_error: float) -> Bundle:
+    """Adjust poses, points and lens fields.
 
     Parameters
     ----------
     sights : Sights
     start : Bundle
-    focal : float
-        Pixels: makes residuals of rays those of images.
     usual_error : float
         Pixels: residuals beyond it count linearly.
 
@@ -88,11 +106,11 @@ def fitted_field(sights: Sights, start: Bundle, focal: float, usual_error: float
     Bundle
     """
     bundle = start
-    basis = start.field.basis(sights.rays)
-    prior = _prior(start.field, focal)
+    basis = _basis(sights, start)
+    prior = _priors(start)
     cost = np.inf
     for _ in range(_STEPS):
-        residuals = _Residuals.of(sights, bundle, focal, usual_error)
+        residuals = _Residuals.of(sights, bundle, basis, usual_error)
         if not residuals.cost < (1 - _CONVERGED) * cost:
             break
         cost = residuals.cost
@@ -101,10 +119,8 @@ def fitted_field(sights: Sights, start: Bundle, focal: float, usual_error: float
 
 
 def empty_field(low: Float, high: Float) -> LensField:
-    """A field without displacements on a domain of rays, with cells that are about as wide as high."""
-    size = high - low
-    cells = np.maximum(np.rint(_CELLS * size / size.max()), 1).astype(int)
-    return LensField.zero(low, high, (int(cells[1]), int(cells[0])))
+    """A field without displacements on a domain of rays."""
+    return LensField.zero(low, high, (_CELLS, _CELLS))
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,12 +143,13 @@ class _Residuals:
     cost: float
 
     @classmethod
-    def of(cls, sights: Sights, bundle: Bundle, focal: float, usual_error: float) -> "_Residuals":
+    def of(cls, sights: Sights, bundle: Bundle, basis: csr_array, usual_error: float) -> "_Residuals":
+        focal = bundle.focal[sights.image]
         points = bundle.points[sights.track]
         in_camera = np.einsum("mij,mj->mi", bundle.R[sights.image], points) + bundle.t[sights.image]
         in_front = in_camera[:, 2] > 0
         in_camera[~in_front] = (0, 0, 1)
-        left = bundle.field.straightened(sights.rays) - in_camera[:, :2] / in_camera[:, 2:]
+        left = sights.rays + basis @ bundle.coefficients.T - in_camera[:, :2] / in_camera[:, 2:]
         square = focal**2 * (left**2).sum(axis=1) / usual_error**2
         scale = np.where(in_front, focal * (1 + square) ** -0.25, 0)
         cost = float((2 * usual_error**2 * (np.sqrt(1 + square) - 1))[in_front].sum())
@@ -147,18 +164,18 @@ def _step(sights: Sights, bundle: Bundle, basis: csr_array, residuals: _Residual
     observed = diags_array(residuals.scale) @ basis
     prior = prior + _MODESTY * block_diag(*[(observed.T @ observed).toarray()] * 2)
     normal[number:, number:] += prior
-    right[number:] -= prior @ bundle.field.coefficients.ravel()
+    right[number:] -= prior @ bundle.coefficients.ravel()
     diagonal = np.einsum("ii->i", normal)
     diagonal += _DAMPING * diagonal + 1e-12 * diagonal.max()
     step = cho_solve(cho_factor(normal, lower=True, overwrite_a=True), right)
     turn, shift = np.split(step[:number].reshape(-1, _POSE), 2, axis=1)
     turned = np.asarray(Rotation.from_rotvec(turn).as_matrix())
-    coefficients = bundle.field.coefficients + step[number:].reshape(bundle.field.coefficients.shape)
-    return Bundle(
-        turned @ bundle.R,
-        np.einsum("nij,nj->ni", turned, bundle.t) + shift,
-        bundle.points + np.concatenate([part.moved(step) for part in parts]),
-        replace(bundle.field, coefficients=coefficients),
+    return replace(
+        bundle,
+        R=turned @ bundle.R,
+        t=np.einsum("nij,nj->ni", turned, bundle.t) + shift,
+        points=bundle.points + np.concatenate([part.moved(step) for part in parts]),
+        fields=bundle.with_coefficients(bundle.coefficients + step[number:].reshape(2, -1)),
     )
 
 
@@ -180,7 +197,7 @@ class _Part:
     ----------
     points : slice
     others : csr_array
-        Derivatives by poses and field.
+        Derivatives by poses and fields.
     whitened : csr_array
         Derivatives by the points, in coordinates in which their normal equations are 1.
     whitening : (p, 3, 3) float64 ndarray
@@ -195,13 +212,13 @@ class _Part:
     left: Float
 
     def moved(self, step: Float) -> Float:
-        """(p, 3) steps of the points where poses and field make theirs."""
+        """(p, 3) steps of the points where poses and fields make theirs."""
         rest = np.asarray(self.whitened.T @ (self.left - self.others @ step))
         return np.asarray(np.einsum("pij,pj->pi", self.whitening, rest.reshape(-1, 3)))
 
 
 def _reduced(parts: Sequence[_Part], number: int) -> tuple[Float, Float]:
-    """Normal equations of poses (`number` of them) and field, without the points: matrix and right side."""
+    """Normal equations of poses (`number` of them) and fields, without the points: matrix and right side."""
     size = parts[0].others.shape[1]
     poses = _POSE * number
     normal = np.zeros((size, size))
@@ -210,7 +227,7 @@ def _reduced(parts: Sequence[_Part], number: int) -> tuple[Float, Float]:
         mixed = (part.others.T @ part.whitened).tocsr()
         right += part.others.T @ part.left - mixed @ (part.whitened.T @ part.left)
         normal += (part.others.T @ part.others).toarray()
-        # Poses share points with few others, the field with all.
+        # Poses share points with few others, fields with most.
         of_poses = mixed[:poses]
         of_field = mixed[poses:].toarray()
         normal[:poses, :poses] -= (of_poses @ of_poses.T).toarray()
@@ -262,6 +279,34 @@ def _sparse(values: Float, block: NDArray[np.int64], number: int) -> csr_array:
     columns = width * block[:, None] + np.arange(width)
     starts = np.arange(0, values.size + 1, width)
     return csr_array((values.ravel(), columns.ravel(), starts), shape=(len(values), width * number))
+
+
+def _basis(sights: Sights, bundle: Bundle) -> csr_array:
+    """(m, c) what each coefficient of each field adds to the ray of each observation."""
+    field_of = bundle.field_of[sights.image]
+    size = bundle.fields[0].coefficients[0].size
+    rows = [np.flatnonzero(field_of < 0)]
+    parts = [csr_array((len(rows[0]), size * len(bundle.fields)))]
+    for number, field in enumerate(bundle.fields):
+        rows.append(np.flatnonzero(field_of == number))
+        basis = field.basis(sights.rays[rows[-1]])
+        before, after = size * number, size * (len(bundle.fields) - number - 1)
+        sides = [csr_array((len(rows[-1]), width)) for width in (before, after)]
+        parts.append(hstack([sides[0], basis, sides[1]], format="csr"))
+    return vstack(parts, format="csr")[np.argsort(np.concatenate(rows))]
+
+
+def _priors(bundle: Bundle) -> Float:
+    """What is known of all coefficients beforehand, as normal equations; x of all fields first, then y."""
+    size = bundle.fields[0].coefficients[0].size
+    total = size * len(bundle.fields)
+    priors = np.zeros((2 * total, 2 * total))
+    for number, field in enumerate(bundle.fields):
+        of_field = size * number + np.arange(size)
+        index = np.concatenate([of_field, total + of_field])
+        focal = float(np.median(bundle.focal[bundle.field_of == number]))
+        priors[np.ix_(index, index)] = _prior(field, focal)
+    return priors
 
 
 def _prior(field: LensField, focal: float) -> Float:

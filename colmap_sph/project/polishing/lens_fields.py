@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.project.lens.field import Float, LensField
 from colmap_sph.project.lens.straight import pixel_rays, straight_camera
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
-from colmap_sph.project.polishing.lens_adjustment import Bundle, Sights, empty_field, fitted_field
+from colmap_sph.project.polishing.lens_adjustment import Bundle, Sights, empty_field, fitted_fields
 from colmap_sph.project.sparse_model import image_names, submodel
 
 # A camera tells its field by so many images and observations; more do not tell more.
@@ -22,6 +22,8 @@ _FEWEST_SIGHTS = 2000
 _MOST_IMAGES = 400
 _MOST_PER_IMAGE = 1000
 _MOST_SIGHTS = 100_000
+# Of so many cameras, those with the most images; their equations are solved at once.
+_MOST_FIELDS = 8
 # Halves of the images must agree: a field is known to this share of itself. Larger ones, in shares of the image's
 # longer side, are no matter of what a camera model leaves.
 _KNOWN = 0.5
@@ -76,18 +78,52 @@ def found_fields(
     dict
         By camera id; of those with enough images and observations.
     """
+    images = _images_of_cameras(model)
+    fielded = sorted(images, key=lambda camera_id: (-len(images[camera_id]), camera_id))[:_MOST_FIELDS]
+    fielded = [camera_id for camera_id in fielded if len(images[camera_id]) >= _FEWEST_IMAGES]
+    if not fielded:
+        return {}
+    block = _Block.of(model, images, fielded, ties, options)
+    halves = [block.half(start) for start in (0, 1)]
+    if min(half.fewest_sights for half in halves) < _FEWEST_SIGHTS / 2:
+        return {}
+    fields, *others = [one.fitted() for one in (block, *halves)]
     found = {}
-    of_camera: dict[int, list[str]] = {}
-    camera_of = {image.name: image.camera_id for image in model.images.values()}
-    for name in image_names(model):
-        of_camera.setdefault(camera_of[name], []).append(name)
-    for camera_id, names in sorted(of_camera.items()):
-        if len(names) >= _FEWEST_IMAGES:
-            part = _CameraPart.of(model, names, ties, straight_camera(model.camera(camera_id), options))
-            field = part.found()
-            if field is not None:
-                found[camera_id] = field
+    for number, camera_id in enumerate(fielded):
+        rays = block.rays_of(number)
+        one = _measured([part[number] for part in (fields, *others)], rays, model.camera(camera_id))
+        if one is not None:
+            found[camera_id] = one
     return found
+
+
+def _images_of_cameras(model: pycolmap.Reconstruction) -> dict[int, list[str]]:
+    """Names of images by camera id, those in the middle where there are very many."""
+    images: dict[int, list[str]] = {}
+    camera_of = {image.name: image.camera_id for image in model.images.values()}
+    names = image_names(model)
+    for name in names:
+        images.setdefault(camera_of[name], []).append(name)
+    for camera_id, of_camera in images.items():
+        most = max(len(of_camera) * _MOST_IMAGES // max(len(names), _MOST_IMAGES), 1)
+        first = (len(of_camera) - most) // 2
+        images[camera_id] = of_camera[first : first + most]
+    return images
+
+
+def _measured(fields: Sequence[LensField], rays: Float, camera: pycolmap.Camera) -> FoundField | None:
+    """How large the first field is, and how well the others, of two halves, know it; None of what is no lens."""
+    if not all(field.is_sound for field in fields):
+        return None
+    focal = float(camera.mean_focal_length())
+    field, one, other = (focal * field.at(rays) for field in fields)
+    moved = np.linalg.norm(field, axis=1)
+    if moved.max() > _LARGEST * max(camera.width, camera.height):
+        return None
+    # The mean of both is known twice as well as their difference.
+    unsure = np.linalg.norm(one - other, axis=1) / 2
+    rms = [float(np.sqrt(np.mean(part**2))) for part in (moved, unsure)]
+    return FoundField(fields[0], rms[0], float(moved.max()), rms[1])
 
 
 def adjusted_with_fields(
@@ -160,129 +196,136 @@ def sparse_error(model: pycolmap.Reconstruction, fields: Mapping[int, LensField]
 
 
 @dataclass(frozen=True, eq=False)
-class _CameraPart:
-    """What the images of one camera observe, as they would be adjusted."""
+class _Block:
+    """What images observe, as it would be adjusted.
 
-    camera: pycolmap.Camera
-    domain: tuple[Float, Float]
+    Attributes
+    ----------
+    sights : Sights
+    start : Bundle
+    usual_error : float
+        Pixels.
+    parity : (n,) int64 ndarray
+        0 or 1: the half that each image belongs to.
+    """
+
     sights: Sights
-    R: Float
-    t: Float
-    points: Float
+    start: Bundle
     usual_error: float
+    parity: NDArray[np.int64]
 
     @classmethod
     def of(
         cls,
         model: pycolmap.Reconstruction,
-        names: Sequence[str],
+        images: Mapping[int, Sequence[str]],
+        fielded: Sequence[int],
         ties: Observations,
-        straight: pycolmap.Camera,
-    ) -> "_CameraPart":
-        middle = max(len(names) - _MOST_IMAGES, 0) // 2
-        names = names[middle : middle + _MOST_IMAGES]
-        images = {image.name: image for image in model.images.values()}
-        camera = model.camera(images[names[0]].camera_id)
-        own, points = _own_sights(model, [images[name] for name in names])
-        others = _tie_sights(ties, names, camera)
+        options: pycolmap.UndistortCameraOptions,
+    ) -> "_Block":
+        named = {image.name: image for image in model.images.values()}
+        chosen = [named[name] for names in images.values() for name in names]
+        parity = np.concatenate([np.arange(len(names)) % 2 for names in images.values()])
+        own, points = _own_sights(model, chosen)
+        others = _tie_sights(model, chosen, ties)
         sights = Sights(
             np.concatenate([own.track, others.track + len(points)]),
             np.concatenate([own.image, others.image]),
             np.concatenate([own.rays, others.rays]),
         )
-        low, high = pixel_rays(straight, np.array([[0, 0], [straight.width, straight.height]]))
-        margin = _BEYOND * (high - low)
-        domain = (low - margin, high + margin)
-        poses = np.stack([images[name].cam_from_world().matrix() for name in names])
-        part = cls(
-            camera,
-            domain,
-            sights,
+        poses = np.stack([image.cam_from_world().matrix() for image in chosen])
+        domains = {image.camera_id: _domain(model.camera(image.camera_id), options) for image in chosen}
+        numbers = {camera_id: number for number, camera_id in enumerate(fielded)}
+        start = Bundle(
             poses[:, :, :3],
             poses[:, :, 3],
             np.concatenate([points, ties.points]),
-            float(np.clip(ties.error, _LEAST_USUAL, _MOST_USUAL)),
+            tuple(empty_field(*domains[camera_id]) for camera_id in fielded),
+            np.array([numbers.get(image.camera_id, -1) for image in chosen]),
+            np.array([model.camera(image.camera_id).mean_focal_length() for image in chosen]),
         )
-        return part._thinned()
+        low, high = (np.stack([domains[image.camera_id][k] for image in chosen])[sights.image] for k in (0, 1))
+        # Those at infinity are not.
+        inside = np.asarray(((sights.rays >= low) & (sights.rays <= high)).all(axis=1))
+        usual = float(np.clip(ties.error, _LEAST_USUAL, _MOST_USUAL))
+        return cls(sights, start, usual, parity)._thinned(inside)
 
     @property
-    def _focal(self) -> float:
-        return float(self.camera.mean_focal_length())
+    def fewest_sights(self) -> int:
+        """Observations in the images of the field that has the fewest."""
+        return min(len(self.rays_of(number)) for number in range(len(self.start.fields)))
 
-    def _thinned(self) -> "_CameraPart":
-        """With points that are seen at least twice, inside of the undistorted image, and no more than needed."""
-        rays = self.sights.rays  # those at infinity are not inside
-        inside = np.asarray(((rays >= self.domain[0]) & (rays <= self.domain[1])).all(axis=1))
-        number = np.bincount(self.sights.track[inside], minlength=len(self.points))
-        usable = np.flatnonzero((number >= 2) & np.isfinite(self.points).all(axis=1))
-        most = min(_MOST_PER_IMAGE * len(self.R), _MOST_SIGHTS)
-        stride = max(-(-int(number[usable].sum()) // most), 1)
-        return self._only(usable[::stride], inside)
+    def rays_of(self, number: int) -> Float:
+        """(n, 2) rays observed in the images of a field."""
+        return np.asarray(self.sights.rays[self.start.field_of[self.sights.image] == number])
 
-    def _only(self, kept: NDArray[np.int64], seen: NDArray[np.bool_]) -> "_CameraPart":
-        """Some points, by ascending index, and those of their sights that are to count."""
-        numbers = np.full(len(self.points), -1)
-        numbers[kept] = np.arange(len(kept))
-        chosen = seen & (numbers[self.sights.track] >= 0)
-        order = np.argsort(numbers[self.sights.track[chosen]], kind="stable")
-        sights = Sights(
-            numbers[self.sights.track[chosen]][order],
-            self.sights.image[chosen][order],
-            self.sights.rays[chosen][order],
-        )
-        return replace(self, sights=sights, points=self.points[kept])
+    def fitted(self) -> tuple[LensField, ...]:
+        """The fields that explain it best."""
+        return fitted_fields(self.sights, self.start, self.usual_error).fields
 
-    def _half(self, start: int) -> "_CameraPart":
-        """Every other image alone."""
-        inside = np.equal(self.sights.image % 2, start)
-        number = np.bincount(self.sights.track[inside], minlength=len(self.points))
+    def half(self, parity: int) -> "_Block":
+        """Every other image of each camera alone."""
+        chosen = self.parity == parity
+        inside = chosen[self.sights.image]
+        number = np.bincount(self.sights.track[inside], minlength=len(self.start.points))
         half = self._only(np.flatnonzero(number >= 2), inside)
-        sights = replace(half.sights, image=half.sights.image // 2)
-        return replace(half, sights=sights, R=self.R[start::2], t=self.t[start::2])
+        numbers = np.cumsum(chosen) - 1
+        start = half.start
+        poses = {name: getattr(start, name)[chosen] for name in ("R", "t", "field_of", "focal")}
+        sights = replace(half.sights, image=numbers[half.sights.image])
+        return replace(half, sights=sights, start=replace(start, **poses), parity=self.parity[chosen])
 
-    def _field(self) -> LensField:
-        start = Bundle(self.R, self.t, self.points, empty_field(*self.domain))
-        return fitted_field(self.sights, start, self._focal, self.usual_error).field
+    def _thinned(self, seen: NDArray[np.bool_]) -> "_Block":
+        """With points that are seen at least twice, and no more of them than needed."""
+        points = self.start.points
+        number = np.bincount(self.sights.track[seen], minlength=len(points))
+        usable = np.flatnonzero((number >= 2) & np.isfinite(points).all(axis=1))
+        most = min(_MOST_PER_IMAGE * len(self.start.R), _MOST_SIGHTS)
+        stride = max(-(-int(number[usable].sum()) // most), 1)
+        return self._only(usable[::stride], seen)
 
-    def found(self) -> FoundField | None:
-        """The field, if there are enough observations, and they tell any."""
-        halves = [self._half(start) for start in (0, 1)]
-        if min(len(half.sights.track) for half in halves) < _FEWEST_SIGHTS / 2:
-            return None
-        field = self._field()
-        others = [half._field() for half in halves]
-        if not all(one.is_sound for one in (field, *others)):
-            return None
-        rays = self.sights.rays
-        moved = np.linalg.norm(field.at(rays), axis=1) * self._focal
-        apart = np.linalg.norm(others[0].at(rays) - others[1].at(rays), axis=1) * self._focal
-        if moved.max() > _LARGEST * max(self.camera.width, self.camera.height):
-            return None
-        # The mean of both is known twice as well as their difference.
-        rms, unsure = (float(np.sqrt(np.mean(part**2))) for part in (moved, apart / 2))
-        return FoundField(field, rms, float(moved.max()), unsure)
+    def _only(self, kept: NDArray[np.int64], seen: NDArray[np.bool_]) -> "_Block":
+        """Some points, by ascending index, and those of their sights that are to count."""
+        numbers = np.full(len(self.start.points), -1)
+        numbers[kept] = np.arange(len(kept))
+        track = numbers[self.sights.track]
+        chosen = np.flatnonzero(seen & (track >= 0))
+        chosen = chosen[np.argsort(track[chosen], kind="stable")]
+        sights = Sights(track[chosen], self.sights.image[chosen], self.sights.rays[chosen])
+        return replace(self, sights=sights, start=replace(self.start, points=self.start.points[kept]))
+
+
+def _domain(camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions) -> tuple[Float, Float]:
+    """Corners of the rays of an undistorted image, and a little beyond."""
+    straight = straight_camera(camera, options)
+    low, high = pixel_rays(straight, np.array([[0, 0], [straight.width, straight.height]]))
+    margin = _BEYOND * (high - low)
+    return low - margin, high + margin
 
 
 def _own_sights(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image]) -> tuple[Sights, Float]:
-    """What images of one camera observe of the model's own points, and these."""
-    tracks, numbers, pixels = [], [], []
+    """What images observe of the model's own points, and these."""
     rows = {point_id: row for row, point_id in enumerate(sorted(model.points3D))}
-    for number, image in enumerate(images):
+    tracks = []
+    rays = []
+    for image in images:
         seen = [point for point in image.points2D if point.has_point3D()]
-        tracks += [rows[point.point3D_id] for point in seen]
-        numbers += [number] * len(seen)
-        pixels += [point.xy for point in seen]
+        tracks.append(np.array([rows[point.point3D_id] for point in seen], np.int64))
+        pixels = np.array([point.xy for point in seen]).reshape(-1, 2)
+        rays.append(_rays(model.camera(image.camera_id), pixels))
+    numbers = np.repeat(np.arange(len(images)), [len(track) for track in tracks])
     points = np.array([model.point3D(point_id).xyz for point_id in rows]).reshape(-1, 3)
-    rays = _rays(model.camera(images[0].camera_id), np.array(pixels).reshape(-1, 2))
-    return Sights(np.array(tracks, np.int64), np.array(numbers, np.int64), rays), points
+    return Sights(np.concatenate(tracks), numbers, np.concatenate(rays)), points
 
 
-def _tie_sights(ties: Observations, names: Sequence[str], camera: pycolmap.Camera) -> Sights:
-    """Ties in some images of one camera."""
-    numbers = {name: number for number, name in enumerate(names)}
-    number = np.array([numbers.get(name, -1) for name in ties.names], np.int64)[ties.image]
-    here = number >= 0
-    return Sights(ties.track[here], number[here], _rays(camera, ties.pixels[here]))
+def _tie_sights(model: pycolmap.Reconstruction, images: Sequence[pycolmap.Image], ties: Observations) -> Sights:
+    """Ties in some images."""
+    indices = {name: index for index, name in enumerate(ties.names)}
+    here = [np.flatnonzero(ties.image == indices.get(image.name, -1)) for image in images]
+    cameras = [model.camera(image.camera_id) for image in images]
+    rays = [_rays(camera, ties.pixels[some]) for camera, some in zip(cameras, here, strict=True)]
+    numbers = np.repeat(np.arange(len(images)), [len(some) for some in here])
+    return Sights(ties.track[np.concatenate(here)], numbers, np.concatenate(rays))
 
 
 def _rays(camera: pycolmap.Camera, pixels: Float) -> Float:
