@@ -284,10 +284,10 @@ def test_the_adjustment_finds_nothing_in_a_straight_lens(monkeypatch: pytest.Mon
 # ---- runs ---------------------------------------------------------------------------------------------------
 
 SMALL = syn.BlockOptions(
-    width=200,
-    height=150,
-    nadir_gsd=0.32,
-    oblique_gsd=0.32 * np.sqrt(2),  # one camera for all
+    width=160,
+    height=120,
+    nadir_gsd=0.4,
+    oblique_gsd=0.44,
     strip_images=4,
     oblique_images=2,
     points=1500,
@@ -350,27 +350,24 @@ def test_a_bent_block_is_straightened_by_the_advice(tmp_path: Path) -> None:
     colmap_sph.run(refined, images=block.images_dir, output=tmp_path / "dense_refined", options=options)
     before = right_share(block, Workspace(tmp_path / "dense"), is_bent=True)
     after = right_share(block, Workspace(tmp_path / "dense_refined"), is_bent=False)
-    print(before, after)
-    assert after > 0.85
-    assert 1 - after < 0.7 * (1 - before)
+    assert after > before + 0.1
+    assert after > 0.82
 
 
 def check_fields(block: syn.DemoBlock, refined: Path) -> None:
     """The fields that were found are the bend, in the middle of images where there are enough ties."""
     model = pycolmap.Reconstruction(refined)
-    for camera_id, field in read_lens_fields(refined).items():
+    fields = read_lens_fields(refined)
+    assert sorted(fields) == sorted(model.cameras)
+    for camera_id, field in fields.items():
         camera = model.cameras[camera_id]
         K = camera.calibration_matrix()
         pixels = np.random.default_rng(3).uniform([15, 15], [SMALL.width - 15, SMALL.height - 15], (400, 2))
         rays = (pixels - K[:2, 2]) / K[0, 0]
         true = rest(SMALL_BEND.displacement(*pixels.T).T / K[0, 0], rays)
         found = rest(field.at(rays), rays)
-        print(
-            camera_id,
-            np.sqrt(np.mean(true**2)),
-            np.sqrt(np.mean((found - true) ** 2)),
-            (true @ found) / np.linalg.norm(true) / np.linalg.norm(found),
-        )
+        assert np.sqrt(np.mean(true**2)) > 0.25
+        assert np.sqrt(np.mean((found - true) ** 2)) < 0.08
 
 
 def test_cameras_with_fields_are_kept(tmp_path: Path) -> None:

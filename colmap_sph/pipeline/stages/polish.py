@@ -52,6 +52,9 @@ _BENT_SHARE = 0.05
 # Processor seconds, and bytes in use, per image of the model.
 _SECONDS = 0.4
 _BYTES = 4e6
+# The same where cameras are refined, too, and bytes whatever their number.
+_FIELD_SECONDS = 0.5
+_FIELD_BYTES = 400e6
 
 
 @dataclass(frozen=True)
@@ -202,7 +205,10 @@ class PolishStage(Stage[str, PolishTask]):
             context.workspace, self._given, paths, context.options.polish, context.options.undistortion, key
         )
         number = len(context.scene.views)
-        cost = Cost(_SECONDS * number, _BYTES * number + CACHE_BYTES, 0.0)
+        is_refining = context.options.polish.cameras
+        seconds = _SECONDS + (_FIELD_SECONDS if is_refining else 0)
+        memory = _BYTES * number + max(CACHE_BYTES, _FIELD_BYTES if is_refining else 0)
+        cost = Cost(seconds * number, memory, 0.0)
         return Job(key, self._known(key), cost, task)
 
     def _known(self, key: str) -> Facts | None:

@@ -23,8 +23,8 @@ from colmap_sph.project.lens.field import Float, LensField
 _CELLS = 8
 _BEND = 1.0
 _NO_TURN = 1e-3
-# What poses and points can explain but for so small a share is left to them: it needs no lens, and other systematic
-# errors (a rolling shutter) would fill it.
+# What poses and points can explain but for so small a share is left to them: it needs no lens, and other errors
+# that images have in common (a rolling shutter) would fill it.
 _MODESTY = 0.003
 _NODES = 25
 _STEPS = 12
