@@ -28,6 +28,8 @@ _AS_OPENCV = {
     "RADIAL": (0, 0, 1, 2, 3, 4),
 }
 _OPENCV_PARAMETERS = 8
+# Pixels: smaller changes of a camera are roundings.
+_TOLD = 0.005
 # The model's own tracks may fit worse by this share: a rounding.
 _RISE = 0.02
 
@@ -63,7 +65,7 @@ class Lenses:
         """How its cameras differ from those of the given model."""
         words = []
         for number, pixels in bends(given.model, self.model).items():
-            if pixels > 0:
+            if pixels >= _TOLD:
                 words.append(f"camera {number} by {pixels:.2f} px")
         for number, found in self.fields.items():
             words.append(
