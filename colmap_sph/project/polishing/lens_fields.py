@@ -26,7 +26,7 @@ _MOST_SIGHTS = 100_000
 _MOST_FIELDS = 8
 # Halves of the images must agree: a field is known to this share of itself. Larger ones, in shares of the image's
 # longer side, are no matter of what a camera model leaves.
-_KNOWN = 0.5
+_KNOWN = 0.25
 _LARGEST = 0.03
 # Sights outside of the undistorted image tell little: shares of its size.
 _BEYOND = 0.02
@@ -55,7 +55,7 @@ class FoundField:
 
     @property
     def is_known(self) -> bool:
-        """Whether it is more than what is not known of it."""
+        """Whether it is much more than what is not known of it."""
         return self.uncertainty < _KNOWN * self.rms
 
 
