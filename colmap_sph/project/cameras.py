@@ -74,13 +74,6 @@ def undistorted_camera(
     return None if same_size and camera.is_undistorted() else undistorted
 
 
-def undistort_cameras(model: pycolmap.Reconstruction, options: pycolmap.UndistortCameraOptions) -> None:
-    """Give a model, in place, the cameras that its undistorted images will have."""
-    for camera in model.cameras.values():
-        plain = plain_camera(camera)
-        change_camera(camera, undistorted_camera(plain, options) or plain)
-
-
 def change_camera(camera: pycolmap.Camera, other: pycolmap.Camera) -> None:
     """Give a camera, in place, the model, size and parameters of another."""
     camera.model = other.model

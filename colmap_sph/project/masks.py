@@ -19,6 +19,8 @@ from colmap_sph.project.files import atomic_file, make_dir, real_path
 from colmap_sph.project.images.decoding import read_pixels
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.reading import fitted, image_problem
+from colmap_sph.project.images.undistorting import undistorted_pixels
+from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.workspace import mask_path
 from colmap_sph.scene import View
 
@@ -146,7 +148,11 @@ def _told(names: list[str], kind: str, place: str = "") -> str:
 
 
 def undistort_mask(
-    source: Path, camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions, target: Path
+    source: Path,
+    camera: pycolmap.Camera,
+    options: pycolmap.UndistortCameraOptions,
+    target: Path,
+    field: LensField | None = None,
 ) -> None:
     """Undistort a mask as COLMAP undistorts its image.
 
@@ -159,6 +165,8 @@ def undistort_mask(
         Of the original image.
     options : pycolmap.UndistortCameraOptions
         With which the image is undistorted.
+    field : LensField, optional
+        Of this camera.
 
     Raises
     ------
@@ -170,8 +178,11 @@ def undistort_mask(
     mask = read_mask(source, camera.width, camera.height)
     if mask is None:
         raise InputError(f"The mask {source} has disappeared; start again.")
-    undistorted, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(mask), camera)
-    whole = np.where(undistorted.to_array() == 255, np.uint8(255), np.uint8(0))
+    if field is None:
+        undistorted = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(mask), camera)[0].to_array()
+    else:
+        undistorted = undistorted_pixels(mask[:, :, None], camera, options, field)[:, :, 0]
+    whole = np.where(undistorted == 255, np.uint8(255), np.uint8(0))
     make_dir(target.parent)
     with atomic_file(target) as file:
         file.write(cv2.imencode(".png", whole)[1].tobytes())

@@ -4,7 +4,7 @@ What is accepted is decided by ties that had no part in the adjustment, and by t
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,10 +13,10 @@ import numpy as np
 
 from colmap_sph.pipeline.stages.facts import Facts, Polish
 from colmap_sph.pipeline.stages.fine_ties import CACHE_BYTES, fine_ties
+from colmap_sph.pipeline.stages.refine_cameras import CamerasToRefine, refine_cameras
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
 from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
-from colmap_sph.project.polishing.cameras import bends, refined_cameras, straightened
 from colmap_sph.project.polishing.options import PolishOptions
 from colmap_sph.project.polishing.polished import (
     keep_given,
@@ -40,12 +40,7 @@ from colmap_sph.stereo.poses.quality import (
     sound_tracks,
     usual_error,
 )
-from colmap_sph.stereo.poses.tracks import (
-    Tracks,
-    track_errors,
-    tracks_of_ties,
-    triangulated,
-)
+from colmap_sph.stereo.poses.tracks import Tracks, tracks_of_ties, triangulated
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -57,6 +52,9 @@ _BENT_SHARE = 0.05
 # Processor seconds, and bytes in use, per image of the model.
 _SECONDS = 0.4
 _BYTES = 4e6
+# The same where cameras are refined, too, and bytes whatever their number.
+_FIELD_SECONDS = 0.5
+_FIELD_BYTES = 400e6
 
 
 @dataclass(frozen=True)
@@ -157,28 +155,11 @@ def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement
 def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
     """Refine the cameras of the original model, and leave it in the workspace where it is better."""
     used, held_out = _divided(tracks)
-    given = load_model(task.given.model_dir)
-    options = task.undistortion.for_colmap()
-    refined = refined_cameras(given, _observations(used, scene), options)
-    error = np.inf
-    if refined is not None:
-        calibrations = [view.K for view in scene.views]
-        poses, pixels = straightened(given, refined, _observations(held_out, scene), calibrations, options)
-        views = [replace(view, R=pose[:, :3], t=pose[:, 3]) for view, pose in zip(scene.views, poses, strict=True)]
-        moved = Tracks(held_out.track, held_out.view, pixels)
-        error = float(np.nanmedian(track_errors(moved, triangulated(moved, views), views)))
-    before = min(judgement.before, judgement.after)
-    if refined is None or error > (1 - task.options.least_gain) * before:
-        return f"The cameras are kept as given: refined ones are not clearly better ({error:.2f} px)."
-    target = task.workspace.refined_model_dir
-    write_model(refined, target)
-    bent = ", ".join(f"camera {number} by {pixels:.2f} px" for number, pixels in bends(given, refined).items())
-    return (
-        f"Cameras were refined ({bent}): ties that had no part in it fit to {error:.2f} px, before "
-        f"{before:.2f} px. "
-        f"Use them in another run: colmap_sph run --model {target} --images {task.given.image_dir} --output "
-        f"{task.workspace.root.with_name(task.workspace.root.name + '_refined')}"
+    to_refine = CamerasToRefine(
+        task.given.model_dir, task.given.image_dir, task.undistortion, scene, _observations(used, scene), held_out
     )
+    before = min(judgement.before, judgement.after)
+    return refine_cameras(to_refine, before, task.options.least_gain, task.workspace.refined_model_dir)
 
 
 def _success(judgement: Judgement, moved: Mapping[str, float]) -> str:
@@ -224,7 +205,10 @@ class PolishStage(Stage[str, PolishTask]):
             context.workspace, self._given, paths, context.options.polish, context.options.undistortion, key
         )
         number = len(context.scene.views)
-        cost = Cost(_SECONDS * number, _BYTES * number + CACHE_BYTES, 0.0)
+        is_refining = context.options.polish.cameras
+        seconds = _SECONDS + (_FIELD_SECONDS if is_refining else 0)
+        memory = _BYTES * number + max(CACHE_BYTES, _FIELD_BYTES if is_refining else 0)
+        cost = Cost(seconds * number, memory, 0.0)
         return Job(key, self._known(key), cost, task)
 
     def _known(self, key: str) -> Facts | None:

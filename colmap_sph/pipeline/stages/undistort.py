@@ -191,6 +191,7 @@ class UndistortStage(Stage[str, UndistortTask]):
         self._values = values
         self._verify = verify
         self._cameras = cameras_of_images(originals.model)
+        self._fields = {name: originals.fields.get(camera.camera_id) for name, camera in self._cameras.items()}
         self._numbers = {name: number for number, name in enumerate(self.items)}
 
     def job(self, item: str) -> Job[UndistortTask]:
@@ -199,15 +200,16 @@ class UndistortStage(Stage[str, UndistortTask]):
         workspace = context.workspace
         options = context.options.undistortion
         camera = plain_camera(self._cameras[item])
+        field = self._fields[item]
         values = self._values.get(item)
         mask = self._originals.mask_of(item)
         # Of its own for each image, as its name may be another's without the folders; and for each run, as the
         # process of one that was killed may still be at work.
         scratch = workspace.undistortion_scratch_dir / f"{os.getpid()}-{self._numbers[item]}"
         image = ImageToUndistort(
-            self._originals.image_path(item), values, mask, camera, options, scratch, scratch / "masks"
+            self._originals.image_path(item), values, mask, camera, options, scratch, scratch / "masks", field
         )
-        camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params))
+        camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params), field)
         key = context.keys.undistorted(self._digests[item], camera_parts, values, mask)
         target = workspace.image_path(item)
         record = undistorted_place(workspace, item).record
@@ -221,7 +223,7 @@ class UndistortStage(Stage[str, UndistortTask]):
         )
         known = self._is_as_made(task) or self._is_changed_by_user(task)
         pixels = camera.width * camera.height
-        memory = (_BYTES if values is None else _DEEP_BYTES) * pixels
+        memory = (_BYTES if values is None and field is None else _DEEP_BYTES) * pixels
         if image.is_colmaps:
             memory += _PROCESS_BYTES
         cost = Cost(_SECONDS * pixels, memory, _FILE_BYTES * pixels)

@@ -1,6 +1,7 @@
 """Original image → undistorted one in the same place of the workspace, for what COLMAP cannot do itself.
 
-COLMAP cuts images to 8 bits, and cannot write under names whose ending says no kind of image.
+COLMAP cuts images to 8 bits, knows no lens fields, and cannot write under names whose ending says no kind of
+image.
 """
 
 import os
@@ -21,6 +22,8 @@ from colmap_sph.project.images.decoding import is_jpeg, read_pixels
 from colmap_sph.project.images.depth import ValueRange, stretched
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.orientation import copy_without_orientation
+from colmap_sph.project.lens.field import LensField
+from colmap_sph.project.lens.straight import place_in_original, straight_camera
 
 # Pixels that are floating-point numbers at a time.
 _BAND_PIXELS = 1 << 18
@@ -35,6 +38,7 @@ def undistort_deep(
     options: pycolmap.UndistortCameraOptions,
     target: Path,
     values: ValueRange,
+    field: LensField | None = None,
 ) -> None:
     """Undistort an image of more than 8 bits as COLMAP undistorts others, to 16 bits.
 
@@ -49,6 +53,8 @@ def undistort_deep(
         File to write: a TIFF image where it is called so, else PNG, whatever it is called.
     values : ValueRange
         What becomes black and white, as `common_ranges` has found for images of its kind.
+    field : LensField, optional
+        Of this camera.
 
     Raises
     ------
@@ -57,19 +63,37 @@ def undistort_deep(
     OutputError
         `target` cannot be written.
     """
+    image = _stretched(_read(source, camera, deep=True), values)
+    # Else COLMAP would copy it.
+    if field is not None or not (camera.is_undistorted() and options.max_image_size < 0):
+        image = undistorted_pixels(image, camera, options, field)
+    kind = ".tif" if target.suffix.lower() in (".tif", ".tiff") else ".png"
+    make_dir(target.parent)
+    with atomic_file(target) as file:
+        file.write(cv2.imencode(kind, image[..., ::-1])[1].data)
+
+
+def undistort_bent(
+    source: Path,
+    camera: pycolmap.Camera,
+    options: pycolmap.UndistortCameraOptions,
+    target: Path,
+    field: LensField,
+) -> None:
+    """Undistort an image of 8 bits whose camera has a lens field; otherwise as `undistort_deep`."""
+    image = undistorted_pixels(_read(source, camera, deep=False), camera, options, field)
+    write_undistorted(pycolmap.Bitmap.from_array(np.squeeze(image)), source, target)
+
+
+def _read(source: Path, camera: pycolmap.Camera, *, deep: bool) -> NDArray[Any]:
     try:
-        image = _stretched(read_pixels(source), values)
+        image = read_pixels(source, deep=deep)
     except (OSError, DamagedError) as error:
         reason = reason_of(error) if isinstance(error, OSError) else error
         raise InputError(f"{source} cannot be read as an image ({reason}); mend or remove it.") from error
     if image.shape[:2] != (camera.height, camera.width):
         raise InputError(f"{source} is not of its camera's size; start again.")
-    if not (camera.is_undistorted() and options.max_image_size < 0):  # else COLMAP would copy it
-        image = _undistorted(image, camera, options)
-    kind = ".tif" if target.suffix.lower() in (".tif", ".tiff") else ".png"
-    make_dir(target.parent)
-    with atomic_file(target) as file:
-        file.write(cv2.imencode(kind, image[..., ::-1])[1].data)
+    return image
 
 
 def write_undistorted(bitmap: pycolmap.Bitmap, source: Path, target: Path) -> None:
@@ -113,33 +137,45 @@ def _bands(height: int, width: int) -> Iterator[slice]:
     return (slice(first, min(first + step, height)) for first in range(0, height, step))
 
 
-def _undistorted(
-    image: NDArray[np.uint16], camera: pycolmap.Camera, options: pycolmap.UndistortCameraOptions
-) -> NDArray[np.uint16]:
-    """An image as its undistorted camera sees it; reduced by half or more only after the warp, as COLMAP does."""
-    target = pycolmap.undistort_camera(options, camera)
+def undistorted_pixels(
+    image: NDArray[Any],
+    camera: pycolmap.Camera,
+    options: pycolmap.UndistortCameraOptions,
+    field: LensField | None = None,
+) -> NDArray[Any]:
+    """An image as its undistorted camera sees it; reduced by half or more only after the warp, as COLMAP does.
+
+    Parameters
+    ----------
+    image : (H, W, channels) uint8 or uint16 ndarray
+        Original.
+    camera : pycolmap.Camera
+        Its camera.
+    options : pycolmap.UndistortCameraOptions
+    field : LensField, optional
+        Of this camera.
+
+    Returns
+    -------
+    (h, w, channels) ndarray
+        Black where it shows what lies beyond the border of the original.
+    """
+    target = straight_camera(camera, options, field)
     size = (target.height, target.width)
     scale = min(target.width / camera.width, target.height / camera.height)
     reduce = size != image.shape[:2] and scale < options.warp_options.direct_warp_min_scale
     if reduce:
         target.rescale(camera.width, camera.height)
-    warped = np.empty((target.height, target.width, image.shape[2]), np.uint16)
+    warped = np.empty((target.height, target.width, image.shape[2]), image.dtype)
     for rows in _bands(target.height, target.width):
-        warped[rows] = _warped_rows(image, camera, target, rows)
+        warped[rows] = _warped_rows(image, place_in_original(camera, target, field, rows), target.width)
     return _resized(warped, size) if reduce else warped
 
 
-def _warped_rows(
-    image: NDArray[np.uint16], camera: pycolmap.Camera, target: pycolmap.Camera, rows: slice
-) -> NDArray[np.uint16]:
-    """Some rows of what `target` sees, between four pixels each; black where one of them is beyond the border."""
-    K = target.calibration_matrix()
-    column, row = np.meshgrid(np.arange(target.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
-    rays = np.ones((column.size, 3))
-    rays[:, 0] = ((column - K[0, 2]) / K[0, 0]).ravel()
-    rays[:, 1] = ((row - K[1, 2]) / K[1, 1]).ravel()
+def _warped_rows(image: NDArray[Any], seen: NDArray[np.float64], width: int) -> NDArray[Any]:
+    """Some rows of `width` pixels, from where they lie in the original, between four pixels; black beyond."""
     # Images without distortion must not lose their border to the last digit.
-    place = np.round(np.asarray(camera.img_from_cam(rays), np.float64) - 0.5, 9)
+    place = np.round(seen - 0.5, 9)
     place[~np.isfinite(place).all(axis=1)] = -1
     low = np.floor(place)
     inside = ((low >= 0) & (low < (image.shape[1] - 1, image.shape[0] - 1))).all(axis=1)
@@ -147,16 +183,16 @@ def _warped_rows(
     left, top = low[inside].astype(np.intp).T
     above = image[top, left] * (1 - x) + image[top, left + 1] * x
     below = image[top + 1, left] * (1 - x) + image[top + 1, left + 1] * x
-    warped = np.zeros((len(place), image.shape[2]), np.uint16)
+    warped = np.zeros((len(place), image.shape[2]), image.dtype)
     warped[inside] = np.rint(above * (1 - y) + below * y)
-    return warped.reshape(*column.shape, image.shape[2])
+    return warped.reshape(-1, width, image.shape[2])
 
 
-def _resized(image: NDArray[np.uint16], size: tuple[int, int]) -> NDArray[np.uint16]:
+def _resized(image: NDArray[Any], size: tuple[int, int]) -> NDArray[Any]:
     """Reduce an image to (height, width) by the filter that COLMAP uses."""
     height, width = size
-    spec = oiio.ImageSpec(width, height, image.shape[2], "uint16")
+    spec = oiio.ImageSpec(width, height, image.shape[2], image.dtype.name)
     reduced = oiio.ImageBuf(spec)
     if not oiio.ImageBufAlgo.resize(reduced, oiio.ImageBuf(image), "triangle", nthreads=1):
         raise MemoryError(reduced.geterror())
-    return np.asarray(reduced.get_pixels("uint16"), np.uint16).reshape(height, width, image.shape[2])
+    return np.asarray(reduced.get_pixels(image.dtype.name), image.dtype).reshape(height, width, image.shape[2])

@@ -22,6 +22,8 @@ _INSIST = "; --polish-poses always polishes them, too"
 # these bounds, pixels.
 _LEAST_USUAL = 0.1
 _MOST_USUAL = 1.0
+# Centres that are trusted count so many times more than what they look at.
+_CENTER_WEIGHT = 100
 # Standard deviation of a given centre, in what a pixel covers at the median depth of the image's points.
 _CENTER_PIXELS = 5.0
 _MAX_ITERATIONS = 100
@@ -70,7 +72,11 @@ def reason_to_keep(model: pycolmap.Reconstruction, polishing: Polishing) -> str:
 
 
 def adjusted_model(
-    given: pycolmap.Reconstruction, observations: Observations, *, refine_distortion: bool = False
+    given: pycolmap.Reconstruction,
+    observations: Observations,
+    *,
+    refine_distortion: bool = False,
+    trust_centers: bool = False,
 ) -> pycolmap.Reconstruction | None:
     """Adjust the poses and points of a model.
 
@@ -81,6 +87,9 @@ def adjusted_model(
     observations : Observations
     refine_distortion : bool
         Whether the distortion of each camera is adjusted, too; focal length and principal point stay.
+    trust_centers : bool
+        Whether the result is laid over the given centres rather than over what they look at as well: where cameras
+        were wrong, so were the points.
 
     Returns
     -------
@@ -102,7 +111,7 @@ def adjusted_model(
         summary = adjuster.solve()
     if not summary.is_solution_usable():
         return None
-    _lay_over(with_ties, model, own_points)
+    _lay_over(with_ties, model, own_points, _CENTER_WEIGHT if trust_centers else 1)
     _take_over(model, with_ties, own_points)
     return model if _is_finite(model) else None
 
@@ -192,7 +201,10 @@ def _points_of(model: pycolmap.Reconstruction, image_id: int) -> NDArray[np.floa
 
 
 def _lay_over(
-    adjusted: pycolmap.Reconstruction, given: pycolmap.Reconstruction, own_points: Sequence[int]
+    adjusted: pycolmap.Reconstruction,
+    given: pycolmap.Reconstruction,
+    own_points: Sequence[int],
+    center_weight: int,
 ) -> None:
     """Move an adjusted model over the given one, by the similarity that fits centres and what they look at best.
 
@@ -203,7 +215,7 @@ def _lay_over(
     for image_id in sorted(given.images):
         observed = [point for point in given.image(image_id).points2D if point.point3D_id in own]
         for model, there in zip((adjusted, given), places, strict=True):
-            there.append(model.image(image_id).projection_center())
+            there += [model.image(image_id).projection_center()] * center_weight
             if observed:
                 points = [model.point3D(point.point3D_id).xyz for point in observed]
                 there.append(np.median(points, axis=0))

@@ -18,8 +18,8 @@ class PolishOptions:
     this helps (on, or the option without a value), or also those of rigs, of models in map coordinates and of
     models without tracks (always)."""
     cameras: bool = False
-    """Also adjust the lens distortion of each camera, and write that model to
-    colmap_sph/refined in the workspace, for another run."""
+    """Also adjust the lens distortion of each camera, or find what it does beyond any camera model, and write that
+    model to colmap_sph/refined in the workspace, for another run."""
     least_residual: float = 0.15
     """Poses are left as they are where rows of the pairs disagree by fewer pixels than this."""
     least_gain: float = 0.05

@@ -11,7 +11,9 @@ from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.images.reading import image_problem
-from colmap_sph.project.images.undistorting import undistort_deep, write_undistorted
+from colmap_sph.project.images.undistorting import undistort_bent, undistort_deep, write_undistorted
+from colmap_sph.project.lens.field import LensField
+from colmap_sph.project.lens.straight import straight_camera
 from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.undistortion.options import UndistortionOptions
 
@@ -35,6 +37,8 @@ class ImageToUndistort:
         Where the undistorted image is written, under the name of `source` without its folders.
     mask_folder : Path
         Where its mask is, as ``NAME.png``.
+    field : LensField or None
+        Of its camera.
     """
 
     source: Path
@@ -44,6 +48,7 @@ class ImageToUndistort:
     options: UndistortionOptions
     folder: Path
     mask_folder: Path
+    field: LensField | None = None
 
     @property
     def image_path(self) -> Path:
@@ -58,12 +63,14 @@ class ImageToUndistort:
     @property
     def undistorted_camera(self) -> pycolmap.Camera:
         """Camera of the undistorted image."""
-        return undistorted_camera(self.camera, self.options.for_colmap()) or self.camera
+        return straight_camera(self.camera, self.options.for_colmap(), self.field)
 
     @property
     def is_colmaps(self) -> bool:
-        """Whether COLMAP reads, undistorts and writes it: not where it is only copied, or has more than 8 bits."""
-        return self.values is None and undistorted_camera(self.camera, self.options.for_colmap()) is not None
+        """Whether COLMAP undistorts it: not where it is only copied, has more than 8 bits or a lens field."""
+        if self.values is not None or self.field is not None:
+            return False
+        return undistorted_camera(self.camera, self.options.for_colmap()) is not None
 
 
 def undistort(task: ImageToUndistort) -> None:
@@ -78,7 +85,9 @@ def undistort(task: ImageToUndistort) -> None:
     """
     options = task.options.for_colmap()
     if task.values is not None:
-        undistort_deep(task.source, task.camera, options, task.image_path, task.values)
+        undistort_deep(task.source, task.camera, options, task.image_path, task.values, task.field)
+    elif task.field is not None:
+        undistort_bent(task.source, task.camera, options, task.image_path, task.field)
     elif task.is_colmaps:
         _undistort_by_colmap(task)
     else:
@@ -86,7 +95,7 @@ def undistort(task: ImageToUndistort) -> None:
     if task.is_colmaps:
         _check(task)
     if task.mask is not None:
-        undistort_mask(task.mask, task.camera, options, task.mask_path)
+        undistort_mask(task.mask, task.camera, options, task.mask_path, task.field)
 
 
 def _check(task: ImageToUndistort) -> None:

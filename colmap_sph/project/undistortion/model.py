@@ -7,16 +7,20 @@ model it writes; that is mended here.
 import errno
 import os
 import tempfile
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.project.cameras import change_camera, make_pinhole, plain_camera, undistort_cameras
+from colmap_sph.project.cameras import change_camera, make_pinhole, plain_camera
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import free_space, make_dir
+from colmap_sph.project.lens.field import LensField
+from colmap_sph.project.lens.files import read_lens_fields
+from colmap_sph.project.lens.straight import pixel_rays, ray_pixels, straight_camera
 from colmap_sph.project.scene_reader import scene_of_model
 from colmap_sph.project.sparse_model import cameras_of_images, load_model, model_files, submodel
 from colmap_sph.project.undistortion.options import UndistortionOptions
@@ -31,7 +35,8 @@ _SPACE_FACTOR = 2
 def foreseen_scene(originals: Originals, names: Collection[str], options: UndistortionOptions) -> Scene:
     """Return the scene of the undistorted images `names`, before they are there."""
     model = submodel(originals.model, set(names))
-    undistort_cameras(model, options.for_colmap())
+    for camera_id, camera in model.cameras.items():
+        change_camera(camera, straight_camera(camera, options.for_colmap(), originals.fields.get(camera_id)))
     return scene_of_model(model, originals.model_dir)
 
 
@@ -88,7 +93,29 @@ def undistort_model(task: ModelToUndistort) -> None:
     except (RuntimeError, ValueError, OSError) as error:
         raise_if_disk_is_full(task.folder)
         raise InputError(f"COLMAP cannot undistort {task.model_dir}: {reason_of(error)}") from error
-    _write_final_model(task.folder / "sparse", task.final_dir, task.names)
+    undistorted = _load_written_model(task.folder / "sparse")
+    _straighten(undistorted, load_model(task.model_dir), read_lens_fields(task.model_dir), task.options)
+    _write_final_model(undistorted, task.final_dir, task.names)
+
+
+def _straighten(
+    undistorted: pycolmap.Reconstruction,
+    original: pycolmap.Reconstruction,
+    fields: Mapping[int, LensField],
+    options: UndistortionOptions,
+) -> None:
+    """Take lens fields out of a model, in place, that COLMAP undistorted without."""
+    for camera_id in sorted(fields.keys() & undistorted.cameras.keys()):
+        field = fields[camera_id]
+        bent = undistorted.camera(camera_id)
+        straight = straight_camera(original.camera(camera_id), options.for_colmap(), field)
+        for image in undistorted.images.values():
+            if image.camera_id == camera_id and image.num_points2D():
+                pixels = np.array([point.xy for point in image.points2D])
+                moved = ray_pixels(straight, field.straightened(pixel_rays(bent, pixels)))
+                for point, xy in zip(image.points2D, moved, strict=True):
+                    point.xy = xy
+        change_camera(bent, straight)
 
 
 def _write_plain_model(model: pycolmap.Reconstruction, folder: Path) -> None:
@@ -100,9 +127,8 @@ def _write_plain_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     _load_written_model(folder)
 
 
-def _write_final_model(source: Path, target: Path, names: Collection[str]) -> None:
-    """Write the model that COLMAP left in `source` with images `names` alone, and PINHOLE cameras."""
-    model = _load_written_model(source)
+def _write_final_model(model: pycolmap.Reconstruction, target: Path, names: Collection[str]) -> None:
+    """Write a model with images `names` alone, and PINHOLE cameras."""
     if len(names) < model.num_reg_images():
         model = submodel(model, set(names))
     for camera in model.cameras.values():

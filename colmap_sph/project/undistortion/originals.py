@@ -1,8 +1,8 @@
 """What is to be undistorted: a sparse model, its images and their masks, found."""
 
 import hashlib
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pycolmap
@@ -11,6 +11,8 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import refuse_panoramas
 from colmap_sph.project.files import real_path
 from colmap_sph.project.given.image_places import find_images
+from colmap_sph.project.lens.field import LensField
+from colmap_sph.project.lens.files import LENS_FIELDS_NAME, read_lens_fields
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import image_names, load_model, model_files
 from colmap_sph.project.workspace import Workspace, checked_name, mask_path
@@ -27,17 +29,21 @@ class Originals:
         None: without masks.
     model : pycolmap.Reconstruction
         What is in `model_dir`.
+    fields : mapping of int to LensField
+        What lenses do beyond their camera models, by camera id.
     """
 
     model_dir: Path
     image_dir: Path
     mask_dir: Path | None
     model: pycolmap.Reconstruction
+    fields: Mapping[int, LensField] = field(default_factory=dict)
 
     def model_digest(self) -> str:
         """Digest of the content of the model's files."""
         digest = hashlib.sha256()
-        for path in model_files(self.model_dir):
+        lens_fields = [self.model_dir / LENS_FIELDS_NAME] if self.fields else []
+        for path in [*model_files(self.model_dir), *lens_fields]:
             with path.open("rb") as file:
                 digest.update(path.name.encode() + hashlib.file_digest(file, "sha256").digest())
         return digest.hexdigest()
@@ -92,7 +98,7 @@ def read_originals(project: Project) -> Originals:
     Raises
     ------
     InputError
-        No readable model, a camera without pinhole equivalent, or no images.
+        No readable model, a camera without pinhole equivalent, damaged lens fields, or no images.
     """
     assert project.model is not None
     model = load_model(project.model)
@@ -105,4 +111,4 @@ def read_originals(project: Project) -> Originals:
         raise InputError(
             f"The image folder {images} {'is a file' if is_file else 'does not exist'}; check --images."
         )
-    return Originals(project.model, images, project.masks, model)
+    return Originals(project.model, images, project.masks, model, read_lens_fields(project.model))

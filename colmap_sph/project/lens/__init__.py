@@ -1,0 +1,1 @@
+"""What a lens does to images beyond its camera model: a free field of displacements, on disk and applied."""
