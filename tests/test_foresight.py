@@ -10,10 +10,10 @@ from projects import make_context, prepare
 import colmap_sph
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import Silent, StageEstimate
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.project.project import Project
 

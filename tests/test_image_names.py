@@ -15,9 +15,9 @@ from test_undistortion import HEIGHT, NAMES, WIDTH, make_project
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace

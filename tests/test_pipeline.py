@@ -19,12 +19,12 @@ from colmap_sph.errors import InputError, NoResultError, OptionError, OutputErro
 from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Silent
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.match import _MATCH_BYTES, MatchStage
 from colmap_sph.pipeline.stages.stage import keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage

@@ -12,10 +12,10 @@ from projects import read_picture
 
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages import check_images
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.match import _PAIR_SECONDS, MatchStage
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace

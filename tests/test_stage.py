@@ -18,6 +18,7 @@ import colmap_sph
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.options import RunOptions
@@ -25,7 +26,6 @@ from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
 from colmap_sph.pipeline.stages.fusion_parts import PartsStage
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Job, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage

@@ -19,9 +19,9 @@ from projects import make_context, prepare
 
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.project import Project, open_workspace

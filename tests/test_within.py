@@ -22,11 +22,11 @@ from colmap_sph.pipeline.forecast import sizes, within
 from colmap_sph.pipeline.forecast.ladder import BEST, LADDER, NORMAL, Settings, choices
 from colmap_sph.pipeline.forecast.ranks import ranks_of
 from colmap_sph.pipeline.forecast.time_limit import SIZE, TimeLimit, format_time, parse_time
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.presets import preset
 from colmap_sph.pipeline.reconstruct import go_through_stages_within
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.project.project import Project

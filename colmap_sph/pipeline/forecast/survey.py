@@ -7,13 +7,13 @@ from typing import TypeVar
 
 from colmap_sph.errors import ColmapSphError
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions, num_cores
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.good_images import with_good_images
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage

@@ -1,0 +1,1 @@
+"""What of a workspace a run works on."""
