@@ -2,6 +2,9 @@
 
 import logging
 import os
+import platform
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -19,12 +22,12 @@ from colmap_sph.pipeline.engine.group import Group, Piece, RunSeen, folders_of
 from colmap_sph.pipeline.engine.lag import made_with_patience
 from colmap_sph.pipeline.engine.worker import Workplace, budget_of
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.keys import Keys, program_digests
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.memory import resident
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import versions
-from colmap_sph.pipeline.reconstruct import with_good_images
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Stage
@@ -315,3 +318,29 @@ def test_temporary_files_carry_the_host(tmp_path: Path, host: str) -> None:
         (tmp_path / name).touch()
     remove_temporary_files(tmp_path)
     assert {path.name for path in tmp_path.iterdir()} == {"a", "b", "x.tmp", ".mine.tmp", ".n-1.tmp"}
+
+
+_ALLOCATES = """
+import sys
+import numpy as np
+from colmap_sph.pipeline.engine.worker import Workplace
+if sys.argv[1] == "worker":
+    Workplace(1 << 33, 1)
+place = np.ones(1 << 20).ctypes.data
+heap = [line.split()[0].split("-") for line in open("/proc/self/maps") if line.rstrip().endswith("[heap]")]
+print(any(int(first, 16) <= place < int(end, 16) for first, end in heap))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
+def test_workers_keep_freed_memory() -> None:
+    """As glibc does without what Dask tells it: 8 MB come from the heap, and not from the system each time."""
+
+    def is_in_heap(who: str) -> bool:
+        environment = {**os.environ, "MALLOC_TRIM_THRESHOLD_": "65536"}
+        command = [sys.executable, "-c", _ALLOCATES, who]
+        said = subprocess.run(command, env=environment, capture_output=True, check=True, text=True).stdout
+        return said.strip() == "True"
+
+    assert is_in_heap("worker")
+    assert not is_in_heap("other")
