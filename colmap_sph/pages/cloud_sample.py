@@ -10,7 +10,7 @@ from colmap_sph.errors import InputError
 from colmap_sph.pages.content import CloudSample
 from colmap_sph.pages.samples import MapSamples
 from colmap_sph.project.cloud_reader import read_some_of_tiles, read_some_points
-from colmap_sph.project.cloud_tiles import INDEX, read_index
+from colmap_sph.project.cloud_tiles import INDEX, index_of
 from colmap_sph.project.state.cloud_marks import is_cloud_of
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Scene
@@ -35,11 +35,9 @@ def read_cloud(workspace: Workspace, scene: Scene, samples: Mapping[str, MapSamp
     CloudSample
         Without points, and with the reason in words, where there is no cloud, or one of other maps.
     """
-    path = workspace.fused_path
-    index = None if path.exists() else read_index(workspace.tiles_dir)
-    if index is not None:
-        path = workspace.tiles_dir / INDEX
-    if not path.exists() or (path.name == INDEX and index is None):
+    index = index_of(workspace)
+    path = workspace.fused_path if index is None else workspace.tiles_dir / INDEX
+    if not path.exists():
         return _none("There is no cloud yet: colmap_sph run makes one, and stereo_fusion fuses maps.")
     maps = [(name, kind) for name, each in samples.items() for kind in get_args(MapKind) if each.has(kind)]
     is_known = is_cloud_of(workspace, maps)
@@ -50,10 +48,10 @@ def read_cloud(workspace: Workspace, scene: Scene, samples: Mapping[str, MapSamp
             is_of_others=True,
         )
     try:
-        read = (
-            read_some_points(path, _SAMPLE) if index is None else read_some_of_tiles(path.parent, index, _SAMPLE)
-        )
-        points, colours, total = read
+        if index is None:
+            points, colours, total = read_some_points(path, _SAMPLE)
+        else:
+            points, colours, total = read_some_of_tiles(path.parent, index, _SAMPLE)
     except InputError as error:
         return _none(str(error))
     doubt = ""

@@ -2,6 +2,7 @@
 
 import re
 import resource
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -63,6 +64,12 @@ def resident() -> int:
     with suppress(OSError, psutil.Error):
         return int(psutil.Process().memory_info().rss)
     return _UNKNOWN_USED
+
+
+def most_resident() -> int:
+    """The most bytes of memory that this process had in use."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 def _free() -> int:

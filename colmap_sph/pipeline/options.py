@@ -89,6 +89,11 @@ class RunOptions:
         return self.threads or num_cores()
 
     @property
+    def num_busy(self) -> int:
+        """Of them, as many as there are cores for."""
+        return min(self.num_threads, num_cores())
+
+    @property
     def memory_budget(self) -> int:
         """Bytes of memory the run may use."""
         return budget(parse_memory(self.memory))

@@ -2,8 +2,6 @@
 
 import json
 import logging
-import resource
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
@@ -19,6 +17,7 @@ from colmap_sph.pages import write_page
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.pipeline.known.table import stamp_of_files
+from colmap_sph.pipeline.memory import most_resident
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import program_digest, versions
 from colmap_sph.project.files import atomic_file, make_dir, remove
@@ -57,8 +56,7 @@ def command_of(project: Project, options: RunOptions) -> str:
 def write_report(context: Context) -> None:
     """Write `report.json`: versions, options, and what the run tells of itself."""
     report = context.report
-    unit = 1 if sys.platform == "darwin" else 1024
-    report.peak_memory = max(report.peak_memory, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit)
+    report.peak_memory = max(report.peak_memory, most_resident())
     with atomic_file(context.workspace.report_path) as file:
         file.write(json.dumps(_content(context), indent=1, default=str).encode())
 

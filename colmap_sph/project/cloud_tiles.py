@@ -70,6 +70,11 @@ def read_index(folder: Path) -> TileIndex | None:
     return read_json(folder / INDEX, TileIndex, max_bytes=_MAX_BYTES)
 
 
+def index_of(workspace: Workspace) -> TileIndex | None:
+    """The index of a workspace's cloud where that is in tiles, and not in one file."""
+    return None if workspace.fused_path.exists() else read_index(workspace.tiles_dir)
+
+
 @dataclass(frozen=True)
 class Part:
     """A part of a cloud as `write_part` left it: its path less suffixes, and its number of points."""

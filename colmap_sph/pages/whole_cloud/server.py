@@ -16,7 +16,7 @@ from colmap_sph.pages.markup import from_template, style_and_script
 from colmap_sph.pages.vertical import map_axes
 from colmap_sph.pages.whole_cloud.blocks import FAN, LEAVES, CloudBlocks, CloudFrame
 from colmap_sph.project.cloud_reader import read_some_points
-from colmap_sph.project.cloud_tiles import read_index
+from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import real_path
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -56,7 +56,7 @@ class CloudServer:
     def __init__(
         self, workspace: Workspace, *, port: int = 0, looked_at: Callable[[int], None] | None = None
     ) -> None:
-        index = None if workspace.fused_path.exists() else read_index(workspace.tiles_dir)
+        index = index_of(workspace)
         if index is not None:
             raise InputError(
                 f"The cloud of {workspace.root} is in {len(index.tiles)} tiles, and --full shows one file: leave "

@@ -21,14 +21,14 @@ from colmap_sph.pipeline.engine.connection import connected, dashboard_of
 from colmap_sph.pipeline.engine.division import Asked, Division
 from colmap_sph.pipeline.engine.group import Answer, Group, Piece, RunSeen, folders_of
 from colmap_sph.pipeline.engine.lag import PATIENCE, look_again
-from colmap_sph.pipeline.engine.worker import WorkerFacts
+from colmap_sph.pipeline.engine.worker import WorkerFacts, sees_token, unseen
 from colmap_sph.pipeline.execute import execute, tell_counts
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import Kept, Result, Stage
 from colmap_sph.project.claim import remove_leftovers
-from colmap_sph.project.files import atomic_file, read_small, remove
+from colmap_sph.project.files import atomic_file, remove
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,6 @@ _WAITING_SHARE = 4
 _LEAST_WAITING = 2
 # Seconds after which to look whether workers have come or gone.
 _LOOK_SECONDS = 2.0
-_TOKEN_BYTES = 1000
 
 
 @contextmanager
@@ -72,7 +71,7 @@ def on_cluster(scheduler: str, workspace: Workspace) -> Iterator["Cluster"]:
         finally:
             # Without it workers begin nothing more. It may be another run's by now.
             with suppress(OSError):
-                if read_small(path, _TOKEN_BYTES, follow=False).decode() == run.token:
+                if sees_token(run, 0.0):
                     remove(path)
 
 
@@ -154,7 +153,8 @@ class Cluster:
             if facts and not blind:
                 break
             if blind and time.monotonic() > deadline:
-                raise InputError(unseen(blind, self._run.path.parent))
+                others = f" and {_counted(len(blind) - 1, 'other')} do" if len(blind) > 1 else " does"
+                raise InputError(unseen(f"The worker at {blind[0]}{others}", self._run.path.parent))
             time.sleep(0.2)
         self._announce(context)
         return WorkerFacts(
@@ -245,15 +245,6 @@ def scheduler_lost() -> LostWorkersError:
     return LostWorkersError(
         "The connection to the scheduler is lost; start it and its workers again, and run the same command to go "
         "on."
-    )
-
-
-def unseen(addresses: list[str], folder: Path) -> str:
-    """What to say where workers do not see a run's files."""
-    others = f" and {_counted(len(addresses) - 1, 'other')} do" if len(addresses) > 1 else " does"
-    return (
-        f"The worker at {addresses[0]}{others} not see {folder}; images and workspace must lie on a disk that all "
-        "machines share, under the same path."
     )
 
 

@@ -2,9 +2,7 @@
 
 import ctypes
 import logging
-import resource
 import socket
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -21,7 +19,7 @@ from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemo
 from colmap_sph.pipeline.engine.group import Answer, Group, Outcome, Piece, RunSeen, folders_of
 from colmap_sph.pipeline.engine.lag import PATIENCE, look_again, made_with_patience
 from colmap_sph.pipeline.keys import program_digests
-from colmap_sph.pipeline.memory import MemoryGate, resident
+from colmap_sph.pipeline.memory import MemoryGate, most_resident, resident
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import holding_caches
 from colmap_sph.pipeline.workers import is_memory_error
@@ -108,7 +106,8 @@ class Workplace:
         """
         refuse_other_programs(group.run)
         if not sees_token(group.run, patience):
-            raise InputError(unseen_files(group.run))
+            who = f"The worker on {socket.gethostname()} does"
+            raise InputError(unseen(who, group.run.path.parent))
         # In a thread of its own, so that scratch memory and processes of a thread end with the group.
         with self._at_stage(group), ThreadPoolExecutor(1) as pool:
             return pool.submit(self._work, group, patience).result()
@@ -127,7 +126,7 @@ class Workplace:
                         outcomes.append(self._made(group, piece, patience))
             finally:
                 group.stage.end_thread()
-        return Answer(outcomes, words, _peak_memory())
+        return Answer(outcomes, words, most_resident())
 
     def _made(self, group: Group[Any], piece: Piece[Any], patience: float) -> Outcome:
         found = group.stage.found(piece.task)
@@ -260,17 +259,12 @@ def sees_token(run: RunSeen, patience: float) -> bool:
         look_again([run.path.parent])
 
 
-def unseen_files(run: RunSeen) -> str:
-    """What to say where a worker does not see a run's files."""
+def unseen(who: str, folder: Path) -> str:
+    """What to say where one worker or more do not see a run's files; `who` ends with "does" or "do"."""
     return (
-        f"The worker on {socket.gethostname()} does not see {run.path.parent}; images and workspace must lie on a "
-        "disk that all machines share, under the same path."
+        f"{who} not see {folder}; images and workspace must lie on a disk that all machines share, under the same "
+        "path."
     )
-
-
-def _peak_memory() -> int:
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
 class _Words(logging.Handler):

@@ -13,7 +13,7 @@ from colmap_sph.pipeline.forecast.pace import measured_speed
 from colmap_sph.pipeline.forecast.survey import Survey, foresee
 from colmap_sph.pipeline.forecast.time_limit import SIZE, TimeLimit, format_time
 from colmap_sph.pipeline.forecast.within import Within, widest
-from colmap_sph.pipeline.options import RunOptions, num_cores
+from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.project.project import Project
 from colmap_sph.project.undistortion.marker import read_marker
@@ -33,8 +33,7 @@ def with_affordable_size(
     project: Project, options: RunOptions, limit: TimeLimit, *, overwrite: bool = False
 ) -> RunOptions:
     """What `affordable_size` returns, with the speed of this machine measured; tells of it in the log."""
-    workers = min(options.num_threads, num_cores())
-    options, words = affordable_size(project, options, limit, measured_speed(workers), overwrite=overwrite)
+    options, words = affordable_size(project, options, limit, overwrite=overwrite, is_timed=True)
     if words:
         logger.info("%s", words)
     return options
@@ -44,9 +43,9 @@ def affordable_size(
     project: Project,
     options: RunOptions,
     limit: TimeLimit,
-    speed: float | None = None,
     *,
     overwrite: bool = False,
+    is_timed: bool = False,
 ) -> tuple[RunOptions, str]:
     """Reduce the images as far as the time demands; those that are undistorted stay as they are.
 
@@ -55,10 +54,10 @@ def affordable_size(
     project : Project
     options : RunOptions
     limit : TimeLimit
-    speed : float, optional
-        See `Within`.
     overwrite : bool
         Everything would be done again.
+    is_timed : bool
+        Whether to measure the speed of this machine where that matters, and not to trust in estimates.
 
     Returns
     -------
@@ -70,7 +69,11 @@ def affordable_size(
     if project.model is None or SIZE in limit.kept:
         return options, ""
     there = None if overwrite else read_marker(Workspace(project.root))
-    size = there.options.get("max_image_size") if there is not None else _size_for(project, options, limit, speed)
+    if there is not None:
+        size = there.options.get("max_image_size")
+    else:
+        speed = measured_speed(options.num_busy) if is_timed else 1 / options.num_busy
+        size = _size_for(project, options, limit, speed)
     if not isinstance(size, int) or size == -1:
         return options, ""
     undistortion = replace(options.undistortion, max_image_size=size)
@@ -81,14 +84,13 @@ def affordable_size(
     return replace(options, undistortion=undistortion), words
 
 
-def _size_for(project: Project, options: RunOptions, limit: TimeLimit, speed: float | None) -> int:
+def _size_for(project: Project, options: RunOptions, limit: TimeLimit, speed: float) -> int:
     """Longest side of the images, pixels; -1 where they keep it."""
     survey = Survey()
     options = widest(options, limit)
     with _unheard():  # the run itself tells of what is wrong
         foreseen = foresee(project, options, survey, RunReport(), overwrite=True)
-        before = survey.seconds * survey.workers * (1 / survey.workers if speed is None else speed)
-        begun = limit.begun(limit.elapsed + before)
+        begun = limit.begun(limit.elapsed + survey.seconds * options.num_busy * speed)
         whole = foreseen.context.scene
         largest = max((max(view.width, view.height) for view in whole.views), default=0)
         size = -1

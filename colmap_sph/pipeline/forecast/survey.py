@@ -10,7 +10,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
-from colmap_sph.pipeline.options import RunOptions, num_cores
+from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Facts
@@ -83,7 +83,7 @@ class Survey:
         Of items whose results are not there, an even part is asked, where they are very many; the others are
         taken to be like these.
         """
-        self.workers = min(stage.context.options.num_threads, num_cores())
+        self.workers = stage.context.options.num_busy
         missing = [item for item in stage.items if stage.is_missing(item)]
         asked = set(missing[:: -(-len(missing) // _ASKED) or 1])
         results: dict[Item, Result] = {item: _TO_MAKE for item in missing if item not in asked}

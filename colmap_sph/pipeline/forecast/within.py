@@ -19,7 +19,7 @@ from colmap_sph.pipeline.forecast.ladder import BEST, Choice, Settings, choices
 from colmap_sph.pipeline.forecast.pace import Pace
 from colmap_sph.pipeline.forecast.ranks import MoreRanksStage, ProbeStage, Progressed, RankStage, ranks_of
 from colmap_sph.pipeline.forecast.time_limit import SIZE, TimeLimit, format_time
-from colmap_sph.pipeline.options import RunOptions, num_cores
+from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.confirm import ConfirmStage, confirm_seconds
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage
@@ -87,7 +87,7 @@ class Within:
     ) -> None:
         self._limit = limit
         self._context = context
-        self._workers = min(context.options.num_threads, num_cores())
+        self._workers = context.options.num_busy
         self._pace = Pace(1 / self._workers if speed is None else speed)
         self._later_pace = Pace(1 / self._workers)
         self._ranks = ranks_of(selection)

@@ -11,9 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.project.cameras import plain_camera, undistorted_camera
-from colmap_sph.project.lens.field import LensField
-
-Float = NDArray[np.float64]
+from colmap_sph.project.lens.field import Float, LensField
 
 # Pixels that are cut off on a side at most, of a field that this program found.
 _CUTS = 64
