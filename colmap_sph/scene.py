@@ -78,6 +78,9 @@ class View:
         project; NaN where that is not known.
     full_size : (int, int), optional
         Width and height of its image's file, where the view is smaller: the image is reduced when it is read.
+    original : str
+        Name of the photograph that it was cut from together with other views, which have the same centre; empty
+        where it is a photograph of its own.
     """
 
     image_id: int
@@ -90,6 +93,12 @@ class View:
     point_indices: NDArray[np.int64]
     reprojection_error: float = math.nan
     full_size: tuple[int, int] | None = None
+    original: str = ""
+
+    @property
+    def photograph(self) -> str:
+        """The photograph that it shows: views of one see the scene from one place, and agree for nothing."""
+        return self.original or self.name
 
     @property
     def num_pixels(self) -> int:
