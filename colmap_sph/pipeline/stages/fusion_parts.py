@@ -5,7 +5,6 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,7 @@ from colmap_sph.project.images.reading import bytes_to_reduce
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.scene import Region
 from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.partners.reads import best_order
 from colmap_sph.stereo.region.inside import pixels_inside
 
 if TYPE_CHECKING:
@@ -127,6 +127,7 @@ class PartsStage(Stage[str, FuseTask]):
         super().__init__(context, context.order.sorted(names))
         self._names = names
         self._is_open = False
+        self._needed: dict[str, tuple[float, ...]] = {}
         self._scratch = context.workspace.fusion_scratch_dir
         self._key = ""
 
@@ -134,17 +135,6 @@ class PartsStage(Stage[str, FuseTask]):
     @abstractmethod
     def partners(self) -> Partners:
         """Of each image."""
-
-    @cached_property
-    def needed(self) -> dict[str, tuple[float, ...]]:
-        """When the maps of each image and of its partners are needed next, as numbers of items."""
-        needed = {}
-        next_of: dict[str, float] = {}
-        for number, item in reversed(list(enumerate(self.items))):
-            names = [item, *self.partners[item][0]]
-            needed[item] = tuple(next_of.get(name, math.inf) for name in names)
-            next_of |= dict.fromkeys(names, float(number))
-        return needed
 
     @property
     @abstractmethod
@@ -167,7 +157,7 @@ class PartsStage(Stage[str, FuseTask]):
             scene.anchor,
             self._stem(item),
             self.region,
-            self.needed[item] if self._is_open else (),
+            self._needed.get(item, ()),
             self.with_visibility,
         )
         return Job(self._key, None, cost, task)
@@ -185,16 +175,23 @@ class PartsStage(Stage[str, FuseTask]):
     @contextmanager
     def in_scratch(self) -> Iterator[None]:
         """Parts are made in a folder that is there until this ends."""
-        self._is_open = bool(self.needed)  # found once, and not by every worker at a time
+        self._is_open = True
         with scratch_folder(self._scratch):
             yield
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
-        """See `Stage.kept_memory`."""
-        pixels = [view.num_pixels for view in map(self.context.scene.view, self.items)]
-        filled = _MAPS_BYTES * sum(pixels)
-        spare = gate.spare(2 * _FUSE_BYTES * max(pixels, default=0)) / 2
-        return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
+        """See `Stage.kept_memory`; where maps are to be made, the order of the work is chosen for it."""
+        sizes = {name: _MAPS_BYTES * self.context.scene.view(name).num_pixels for name in self.items}
+        filled = sum(sizes.values())
+        spare = gate.spare(2 * _FUSE_BYTES / _MAPS_BYTES * max(sizes.values(), default=0.0)) / 2
+        cache = int(min(filled, spare))
+        if self._is_open:  # once, and not by every worker at a time
+            partners = {name: self.partners[name][0] for name in self.items}
+            if cache < filled:
+                orders = (self.items, *self.context.order.in_strips(self.items))
+                self.items = best_order(orders, partners, sizes, cache)
+            self._needed = _next_uses(self.items, partners)
+        return Kept(cache=cache, caches=1, filled=filled)
 
     def _report_unread(self, results: Mapping[str, Result]) -> bool:
         """Report images whose maps could not be read while others were fused; whether there are any."""
@@ -204,6 +201,17 @@ class PartsStage(Stage[str, FuseTask]):
                 continue
             self.context.leave_incomplete(name, f"the cloud lacks its agreement with other images: {reason}")
         return bool(unread)
+
+
+def _next_uses(items: Sequence[str], partners: Mapping[str, Sequence[str]]) -> dict[str, tuple[float, ...]]:
+    """When the maps of each image and of its partners are needed next, as numbers of items."""
+    needed = {}
+    next_of: dict[str, float] = {}
+    for number, item in reversed(list(enumerate(items))):
+        names = [item, *partners[item]]
+        needed[item] = tuple(next_of.get(name, math.inf) for name in names)
+        next_of |= dict.fromkeys(names, float(number))
+    return needed
 
 
 def index_in_model(context: "Context") -> dict[str, int]:
