@@ -9,8 +9,8 @@ from colmap_sph.stereo.partners.pairs import Overlap, PairOptions, select_pairs
 from colmap_sph.stereo.partners.places import Places
 from colmap_sph.stereo.partners.reads import best_order
 
-# Bytes per pixel in memory: of the maps of a view with its image, and of an estimate with the grey image.
-_FUSED_BYTES = 19
+# Bytes per pixel in memory: of the packed maps of a view with its image, and of an estimate with the grey image.
+_FUSED_BYTES = 16
 _CHECKED_BYTES = 10
 _PARTNERS = 50
 
