@@ -22,6 +22,7 @@ from colmap_sph.app.events import Events
 from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.part_command import part_command
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of
@@ -162,6 +163,8 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
     except OSError as error:
         raise InputError(f"The current folder cannot be used ({reason_of(error)}); change to another.") from error
     if isinstance(command, RunCommand):
+        if command.stage is not None or command.shard is not None:
+            return part_command(command, terminal, arguments, events)
         return run_command(command, terminal, arguments, events, started)
     if isinstance(command, DemoCommand):
         return demo_command(command, terminal, arguments)

@@ -223,6 +223,12 @@ class Preparation:
             return f"{self.workspace.sparse_dir} was changed since this program made it"
         return reason_to_keep(self._originals.model, self.options.polish.poses)
 
+    @property
+    def is_finished(self) -> bool:
+        """Whether the workspace is there, as far as can be told without looking at its images."""
+        found = self._found
+        return found is not None and found.is_finished and self._is_model_there(found.images)
+
     def scene(self, results: Mapping[str, Result]) -> Scene | None:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
         if not self._overwrite and self._is_model_there(sorted(results)):

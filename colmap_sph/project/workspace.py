@@ -88,6 +88,10 @@ class Workspace:
         """The log of all runs."""
         return self.state_dir / "log.txt"
 
+    def part_log_path(self, name: str) -> Path:
+        """The log of one of the jobs that share the workspace."""
+        return self.state_dir / "logs" / f"{name}.txt"
+
     @property
     def report_path(self) -> Path:
         """What the last run did."""
