@@ -113,6 +113,11 @@ class Workspace:
         return self.state_dir / "within.json"
 
     @property
+    def georeference_path(self) -> Path:
+        """Where the model lies on the map, where that is known."""
+        return self.state_dir / "georeference.json"
+
+    @property
     def given_model_dir(self) -> Path:
         """The model of the undistorted images as it was given, where `sparse` holds a polished one."""
         return self.state_dir / "given"
