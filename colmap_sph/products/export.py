@@ -13,12 +13,18 @@ from colmap_sph.products.clouds.copc import write_copc
 from colmap_sph.products.clouds.las import write_las
 from colmap_sph.products.clouds.las_points import Extent, extent_of
 from colmap_sph.products.clouds.source import Cloud, open_cloud
+from colmap_sph.products.clouds.thinning import ThinCloud, thinned
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.maps.files import write_exr, write_npz, write_png
+from colmap_sph.products.maps.reading import MappedScene, mapped_scene
+from colmap_sph.products.scenes.mvsnet import write_mvsnet
+from colmap_sph.products.scenes.nerfstudio import write_nerfstudio
+from colmap_sph.products.scenes.splats import write_splats
 from colmap_sph.project.claim import check_ways_out
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.workspace import Workspace
 
-ExportFormat = Literal["las", "laz", "copc"]
+ExportFormat = Literal["las", "laz", "copc", "exr", "png", "npz", "nerfstudio", "splats", "mvsnet"]
 
 Status = Callable[[object], AbstractContextManager[None]]
 """Shows what is being made, as `Terminal.status`."""
@@ -29,10 +35,13 @@ class ExportOptions:
     """What is made of a workspace, and how."""
 
     formats: tuple[ExportFormat, ...] = ("laz",)
-    """What to write. The cloud: las, laz, or copc, which map viewers and web pages stream."""
+    """What to write. The cloud: las, laz, or copc, which map viewers and web pages stream. Depth maps: exr, png
+    (16 bits), npz. Folders for other programs: nerfstudio, splats (Gaussian splatting), mvsnet."""
     las_scale: float | None = None
     """Step between coordinates in LAS, LAZ and COPC files, in units of the map, such as 0.001: coarser files are
     smaller. Default: so fine that nothing is lost."""
+    splat_points: int = 500_000
+    """Points that splats and nerfstudio begin with, at most: the cloud is thinned to one point of each voxel."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of its bounds."""
@@ -40,6 +49,8 @@ class ExportOptions:
             raise OptionError("formats must name at least one format, such as laz.", "formats")
         if self.las_scale is not None and not 1e-9 <= self.las_scale <= 1e3:
             raise OptionError(f"las_scale must be from 1e-9 to 1000, not {self.las_scale:g}.", "las_scale")
+        if self.splat_points < 1:
+            raise OptionError(f"splat_points must be at least 1, not {self.splat_points}.", "splat_points")
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +72,16 @@ class Exporter:
         """Of the cloud, on the map."""
         return extent_of(self.cloud, self.georeference)
 
+    @cached_property
+    def thin_cloud(self) -> ThinCloud:
+        """The cloud, thinned."""
+        return thinned(self.cloud, self.options.splat_points)
+
+    @cached_property
+    def mapped(self) -> MappedScene:
+        """The views that have maps."""
+        return mapped_scene(self.workspace)
+
     def las(self, path: Path) -> None:
         """The cloud as LAS or LAZ."""
         write_las(self.cloud, self.extent, self.georeference, path, scale=self.options.las_scale)
@@ -69,11 +90,41 @@ class Exporter:
         """The cloud as COPC."""
         write_copc(self.cloud, self.extent, self.georeference, path, scale=self.options.las_scale)
 
+    def exr(self, path: Path) -> None:
+        """Depth maps as EXR."""
+        write_exr(self.mapped, self.georeference, path)
+
+    def png(self, path: Path) -> None:
+        """Depth maps as PNG."""
+        write_png(self.mapped, self.georeference, path)
+
+    def npz(self, path: Path) -> None:
+        """Depth and normal maps as NPZ."""
+        write_npz(self.mapped, self.georeference, path)
+
+    def nerfstudio(self, path: Path) -> None:
+        """A folder for nerfstudio."""
+        write_nerfstudio(self.mapped, self.thin_cloud, path)
+
+    def splats(self, path: Path) -> None:
+        """A folder for Gaussian splatting."""
+        write_splats(self.workspace, self.thin_cloud, path)
+
+    def mvsnet(self, path: Path) -> None:
+        """A folder for MVSNet."""
+        write_mvsnet(self.workspace, path)
+
 
 _MAKERS: dict[ExportFormat, tuple[str, Callable[[Exporter, Path], None]]] = {
     "las": ("cloud.las", Exporter.las),
     "laz": ("cloud.laz", Exporter.las),
     "copc": ("cloud.copc.laz", Exporter.copc),
+    "exr": ("depth_exr", Exporter.exr),
+    "png": ("depth_png", Exporter.png),
+    "npz": ("depth_npz", Exporter.npz),
+    "nerfstudio": ("nerfstudio", Exporter.nerfstudio),
+    "splats": ("splats", Exporter.splats),
+    "mvsnet": ("mvsnet", Exporter.mvsnet),
 }
 
 
