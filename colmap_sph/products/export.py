@@ -156,7 +156,7 @@ def export(exporter: Exporter, status: Status, *, overwrite: bool = False) -> Se
     formats = list(dict.fromkeys(exporter.options.formats))
     paths = [exporter.folder / _MAKERS[each][0] for each in formats]
     if exporter.folder.is_relative_to(exporter.workspace.root):
-        check_ways_out(exporter.workspace.root, [exporter.folder])
+        check_ways_out(exporter.workspace.root, [exporter.folder], unlinked={exporter.folder})
     for path in paths:
         if os.path.lexists(path) and not overwrite:
             raise OutputError(f"{path} is there already; give --overwrite, or another --output.")

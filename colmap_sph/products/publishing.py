@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 from colmap_sph.errors import OutputError, reason_of
-from colmap_sph.project.files import make_dir, process_name, sync_file, sync_folder
+from colmap_sph.project.files import make_dir, sync_file, sync_folder
 
 MARK = "made_by_colmap_sph.txt"
 """A file in each folder that an export made, and may replace."""
@@ -24,8 +24,9 @@ def published(path: Path) -> Iterator[Path]:
         It cannot be written: a full disk, permissions, a folder in the way.
     """
     make_dir(path.parent)
-    temporary = path.parent / f".{process_name()}-{path.name}"
+    temporary = path.parent / f".{path.name}.part"
     try:
+        temporary.unlink(missing_ok=True)  # of a process that was killed
         if path.is_dir():
             raise OutputError(f"{path} is a folder, and a file goes there; remove it or choose another --output.")
         yield temporary
@@ -46,7 +47,7 @@ def published(path: Path) -> Iterator[Path]:
 def scratch_beside(path: Path) -> Iterator[Path]:
     """An empty folder beside a temporary path, which is removed with all that is in it."""
     folder = path.with_name(f"{path.name}.parts")
-    shutil.rmtree(folder, ignore_errors=True)  # of a process with the same number that was killed
+    shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
     folder.mkdir()
     try:
         yield folder
@@ -67,7 +68,7 @@ def published_folder(path: Path) -> Iterator[Path]:
     """
     check_replaceable(path)
     make_dir(path.parent)
-    with scratch_beside(path.parent / f".{process_name()}-{path.name}") as scratch:
+    with scratch_beside(path.parent / f".{path.name}") as scratch:
         made = scratch / "made"
         try:
             made.mkdir()
