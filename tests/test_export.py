@@ -26,6 +26,7 @@ from colmap_sph.products.crs import read_crs, utm_zone_of, wkt_of
 from colmap_sph.products.export import Exporter, ExportFormat, ExportOptions, export
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.project.cloud_tiles import INDEX, Tile, TileIndex
+from colmap_sph.project.map_files import write_depth_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
@@ -242,6 +243,37 @@ def test_coordinates_are_as_fine_as_32_bit_floats_where_these_fit(
     (path,) = exported(workspace, tmp_path / "out", "las")
     error = np.abs(laspy.read(path).xyz - points["xyz"]).max()
     assert error <= max(np.spacing(np.float32(max(size / 2, 1e-5))), 1e-4 if size > 1000 else 0) * 3
+
+
+def test_deviation_is_that_of_the_maps_along_the_normal(workspace: Workspace, tmp_path: Path) -> None:
+    """Maps of a level ground, each some centimetres too deep, and a point of it that all images see."""
+    offsets = {"a/0.png": 0.00, "a/1.png": 0.03, "b.png": 0.05, "c.png": 5.0}
+    for name, offset in offsets.items():
+        write_depth_map(
+            workspace.depth_map_path(name, "geometric"), np.full((HEIGHT, WIDTH), ALTITUDE + offset, np.float32)
+        )
+    points = np.zeros(3, POINT)
+    points["xyz"] = UTM + np.array([[30, 0, 0.0], [31, 2, 0.0], [1000, 0, 0]])
+    points["normal"] = [[0, 0, 1], [0, 0.6, 0.8], [0, 0, 1]]
+    write_far_cloud(workspace.fused_path, points, [[0, 1, 2, 3], [0, 1, 2], [0, 1]])
+    (path,) = exported(workspace, tmp_path / "out", "laz", georeference=Georeference(scale=2.0))
+    found = laspy.read(path).StdDev
+    # The fourth image shows another surface, and nothing shows the third point.
+    assert found[0] == pytest.approx(2 * np.std([0.0, 0.03, 0.05], ddof=1), rel=1e-3)
+    assert found[1] == pytest.approx(deviation_on_a_slope(points["xyz"][1] - UTM), rel=1e-3)
+    assert found[2] == -1
+
+
+def deviation_on_a_slope(point: np.ndarray) -> float:
+    """The same for a point with a tilted normal, from the map's pixels nearest to where it is seen."""
+    distances = []
+    for number, offset in enumerate((0.0, 0.03, 0.05)):
+        center = np.array([20.0 * number, 0, ALTITUDE])
+        seen = (point - center) * [1, -1, -1]
+        pixel = np.rint(FOCAL * seen[:2] / seen[2] + [WIDTH / 2, HEIGHT / 2])
+        ray = np.append((pixel - [WIDTH / 2, HEIGHT / 2]) / FOCAL, 1.0) * [1, -1, -1]
+        distances.append((center + ray * (ALTITUDE + offset) - point) @ [0, 0.6, 0.8])
+    return float(2 * np.std(distances, ddof=1))
 
 
 # ---- maps ---------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Literal
@@ -13,6 +13,7 @@ from colmap_sph.products.clouds.copc import write_copc
 from colmap_sph.products.clouds.las import write_las
 from colmap_sph.products.clouds.las_points import Extent, extent_of
 from colmap_sph.products.clouds.source import Cloud, open_cloud
+from colmap_sph.products.clouds.spread import DepthSpread
 from colmap_sph.products.clouds.thinning import ThinCloud, thinned
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.maps.files import write_exr, write_npz, write_png
@@ -64,8 +65,10 @@ class Exporter:
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The fused cloud."""
-        return open_cloud(self.workspace)
+        """The fused cloud; what the maps say of its points is measured where there are maps."""
+        cloud = open_cloud(self.workspace)
+        spread = DepthSpread(self.workspace)
+        return replace(cloud, measure=spread.of) if cloud.has_images and spread.has_maps else cloud
 
     @cached_property
     def extent(self) -> Extent:

@@ -112,7 +112,7 @@ def _divided(
     level = 0
     while level < CELLS_LOG2 and extent.count > _POINTS_IN_MEMORY * _CUBES_A_LEVEL**level:
         level += 1
-    pieces = (las_points(piece, root.header, georeference).array for piece in cloud.pieces())
+    pieces = (las_points(piece, root.header, georeference).array for piece in cloud.measured_pieces())
     waiting = _distributed(pieces, level, root, scratch)
     while waiting:
         cube = waiting.pop()

@@ -44,7 +44,7 @@ def write_las(
             with laspy.LasWriter(
                 file, header, do_compress=is_compressed, laz_backend=backend, closefd=False
             ) as writer:
-                for piece in cloud.pieces():
+                for piece in cloud.measured_pieces():
                     writer.write_points(las_points(piece, header, georeference))
         except LazrsError as error:
             raise OSError(str(error)) from error

@@ -1,7 +1,7 @@
 """Pieces of a cloud → LAS points: how fine coordinates are, the header, and what stands in a point.
 
 LAS 1.4 with point format 7 [1]_: coordinates are 32-bit integers times a scale, plus an offset, colours have 16
-bits. Normals and the number of images are extra dimensions of their own.
+bits. Normals, the number of images and the deviation of their maps are extra dimensions.
 
 References
 ----------
@@ -18,13 +18,14 @@ from laspy.vlrs.known import WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError, OptionError
-from colmap_sph.products.clouds.source import Cloud, CloudPiece
+from colmap_sph.products.clouds.source import UNKNOWN, Cloud, CloudPiece
 from colmap_sph.products.georeference import Georeference
 
 _POINT_FORMAT = 7
 # Names that PDAL and CloudCompare know.
 _NORMALS = ("NormalX", "NormalY", "NormalZ")
 _IMAGES = "Images"
+_DEVIATION = "StdDev"
 # Coordinates of a cloud are computed in 32-bit floats, of which 24 bits are digits.
 _STEPS = 2.0**23
 _LARGEST = 2.0**31 - 1
@@ -110,6 +111,9 @@ def las_header(cloud: Cloud, extent: Extent, georeference: Georeference, scale: 
         header.add_extra_dims([laspy.ExtraBytesParams(name, "float32", "unit normal") for name in _NORMALS])
     if cloud.has_images:
         header.add_extra_dims([laspy.ExtraBytesParams(_IMAGES, "uint16", "images that see the point")])
+    if cloud.measure is not None:
+        words = "std of the maps, along normal"
+        header.add_extra_dim(laspy.ExtraBytesParams(_DEVIATION, "float32", words, no_data=[UNKNOWN]))
     if georeference.wkt:
         header.vlrs.append(WktCoordinateSystemVlr(georeference.wkt))
     header.global_encoding.wkt = True  # as this point format asks for, with a system or without
@@ -142,4 +146,7 @@ def las_points(
             points[name] = values
     if piece.counts is not None:
         points[_IMAGES] = np.minimum(piece.counts, 65535).astype(np.uint16)
+    if piece.deviation is not None:
+        known = piece.deviation >= 0
+        points[_DEVIATION] = np.where(known, piece.deviation * georeference.scale, UNKNOWN)
     return points

@@ -1,9 +1,9 @@
 """A workspace's fused cloud → its points piece by piece, in 64-bit floats, with the images that see them."""
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import BufferedReader
 from pathlib import Path
 
@@ -20,6 +20,8 @@ from colmap_sph.project.workspace import Workspace
 logger = logging.getLogger(__name__)
 
 POINTS_AT_A_TIME = 1 << 18
+UNKNOWN = -1.0
+"""Deviation of a point that fewer than two maps show."""
 _COLOURS = ("red", "green", "blue")
 _NORMALS = ("nx", "ny", "nz")
 _WORDS_AT_A_TIME = 1 << 20
@@ -40,6 +42,8 @@ class CloudPiece:
         Number of images that see each point; None where that is not known.
     images : (sum of counts,) uint32 ndarray or None
         Places of these in the list of the model's registered images, those of one point after the other.
+    deviation : (n,) float32 ndarray or None
+        Standard deviation of what the images' maps say of the surface, model units; `UNKNOWN` where they do not.
     """
 
     xyz: NDArray[np.float64]
@@ -47,6 +51,7 @@ class CloudPiece:
     rgb: NDArray[np.uint8] | None
     counts: NDArray[np.uint32] | None
     images: NDArray[np.uint32] | None
+    deviation: NDArray[np.float32] | None = None
 
     def only(self, kept: NDArray[np.bool_]) -> "CloudPiece":
         """The points of a mask."""
@@ -76,12 +81,15 @@ class Cloud:
         Of a point in them.
     has_images : bool
         Whether it is known which images see each point.
+    measure : callable or None
+        Finds the deviation of a piece's points.
     """
 
     paths: tuple[Path, ...]
     count: int
     kind: np.dtype[np.void]
     has_images: bool
+    measure: Callable[[CloudPiece], NDArray[np.float32]] | None = None
 
     @property
     def has_normals(self) -> bool:
@@ -107,6 +115,11 @@ class Cloud:
                 yield from self._pieces_of(path)
             except OSError as error:
                 raise InputError(f"The cloud {path} cannot be read ({reason_of(error)}); fuse again.") from error
+
+    def measured_pieces(self) -> Iterator[CloudPiece]:
+        """The same, with their deviation where it can be measured."""
+        for piece in self.pieces():
+            yield piece if self.measure is None else replace(piece, deviation=self.measure(piece))
 
     def _pieces_of(self, path: Path) -> Iterator[CloudPiece]:
         with ExitStack() as opened:

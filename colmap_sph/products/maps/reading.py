@@ -75,7 +75,7 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
     for view in scene.views:
         path = workspace.depth_map_path(view.name, "geometric")
         if path.is_file() and has_depth(path):
-            views.append(_at_map_size(view, path))
+            views.append(at_map_size(view, path))
     if not views:
         raise InputError(
             f"{workspace.root} has no geometric depth map; run `colmap_sph run --workspace {workspace.root}` "
@@ -86,7 +86,8 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
     return MappedScene(workspace, replace(scene, views=tuple(views)))
 
 
-def _at_map_size(view: View, path: Path) -> View:
+def at_map_size(view: View, path: Path) -> View:
+    """A view with as many pixels as its depth map has; `InputError` where that has another shape."""
     width, height = map_size(path)
     if not view.may_be_reduced_to(width, height):
         raise InputError(f"{path} has another shape than its image; delete it and compute it again.")
