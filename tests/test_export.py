@@ -485,6 +485,12 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
     assert (folder / "cloud.laz").read_text() == "mine"
     with pytest.raises(OptionError, match="las_scale"):
         exported(workspace, tmp_path / "other", "las", las_scale=1e-9)
+    write_far_cloud(workspace.fused_path, make_cloud(1)[0], [])
+    for seen, words in (([1, 9], "more than"), ([0xFFFFFFFF, 0], "damaged"), ([2, 0], "cut off")):
+        data = struct.pack("<Q", 1) + np.array(seen, "<u4").tobytes()
+        workspace.visibility_path.write_bytes(data)
+        with pytest.raises(InputError, match=words):
+            exported(workspace, tmp_path / "other", "splats")
     workspace.visibility_path.unlink()
     with pytest.raises(InputError, match="which images see"):
         exported(workspace, tmp_path / "other", "splats")

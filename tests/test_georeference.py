@@ -220,6 +220,7 @@ def test_what_cannot_be_is_refused(workspace: Workspace, tmp_path: Path) -> None
         (GeoreferenceOptions(crs="EPSG:99999"), OptionError, "EPSG:99999"),
         (GeoreferenceOptions(crs="EPSG:4326"), OptionError, "degrees"),
         (GeoreferenceOptions(crs="EPSG:25832"), InputError, "--align"),
+        (GeoreferenceOptions(crs="EPSG:4978"), InputError, "--align"),
     ]
     for options, kind, words in refused:
         with pytest.raises(kind, match=words):
@@ -240,6 +241,20 @@ def test_another_model_does_not_get_the_place_of_the_last(workspace: Workspace) 
     workspace.georeference_path.write_text("{}")
     with pytest.raises(InputError, match="damaged"):
         read_georeference(workspace)
+
+
+def test_what_was_said_is_kept_until_something_else_is_said(workspace: Workspace, tmp_path: Path) -> None:
+    table = write_lines(tmp_path / "cameras.csv", "image,x,y,z", *position_lines(on_map(centers())))
+    aligned = align(workspace, table, "EPSG:25832")
+    assert georeferenced(workspace, GeoreferenceOptions()).scale == aligned.scale
+    assert georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25832")).scale == aligned.scale
+    with pytest.raises(OptionError, match="align again"):
+        georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25833"))
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    model.transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(ROTATION), SHIFT))
+    model.write_binary(workspace.sparse_dir)
+    own = georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25832"))
+    assert own.is_identity and own.crs == "EPSG:25832" and not own.aligned_by
 
 
 def test_similarity_of_a_third_gross_errors() -> None:

@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 _MISSING = "needs PROJ, which is not installed; install it by `pip install 'colmap_sph[geo]'`"
 # WGS 84 with heights above its ellipsoid: what GPS gives.
 _GPS = "EPSG:4979"
+# Metres from the ellipsoid: what is farther, as a local model is, lies in no geocentric system.
+_HIGHEST = 1e5
 _FIRST_UTM_NORTH = 32601
 _FIRST_UTM_SOUTH = 32701
 
@@ -107,9 +109,12 @@ def is_in_area(crs: "pyproj.CRS", place: NDArray[np.float64]) -> bool:
     area = crs.area_of_use
     if area is None:
         return True
-    transformer = _pyproj("--crs").Transformer.from_crs(crs, _GPS, always_xy=True)
-    longitude, latitude, _ = transformer.transform(*place)
-    if not np.isfinite([longitude, latitude]).all():
+    try:
+        transformer = _pyproj("--crs").Transformer.from_crs(crs, _GPS, always_xy=True)
+    except RuntimeError:  # ProjError: a local grid, of which PROJ does not know where it is
+        return True
+    longitude, latitude, height = transformer.transform(*place)
+    if not np.isfinite([longitude, latitude]).all() or (crs.is_geocentric and abs(height) > _HIGHEST):
         return False
     width = (area.east - area.west) % 360 or 360
     beyond = max(width, area.north - area.south) / 2

@@ -143,7 +143,7 @@ def read_georeference(workspace: Workspace) -> Georeference:
     if not os.path.lexists(path):
         return Georeference()
     found = read_json(path, _File, max_bytes=_MAX_BYTES)
-    again = "remove it, and give --crs and --align again"
+    again = "say anew where the model lies, by --crs and, for a local model, --align"
     if found is None or not _is_possible(found):
         raise InputError(f"{path} is damaged; {again}.")
     if found.poses != _digest_of_poses(workspace):

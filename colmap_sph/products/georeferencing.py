@@ -69,7 +69,10 @@ def _in_own_coordinates(workspace: Workspace, name: str | None) -> Georeference:
     if name is None:
         return read_georeference(workspace)
     crs = read_crs(name)
-    kept = read_georeference(workspace)
+    try:
+        kept = read_georeference(workspace)
+    except InputError:  # of another model, or damaged: it is written anew
+        kept = Georeference()
     if kept.aligned_by:
         if kept.crs == name:
             return kept

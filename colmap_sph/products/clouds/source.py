@@ -25,6 +25,8 @@ UNKNOWN = -1.0
 _COLOURS = ("red", "green", "blue")
 _NORMALS = ("nx", "ny", "nz")
 _WORDS_AT_A_TIME = 1 << 20
+# More see no point.
+_MOST_IMAGES = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,6 +224,10 @@ class _Visibility:
         words = self._words.data
         for index in range(number):
             while position >= len(words) or position + words[position] >= len(words):
+                if position < len(words) and words[position] > _MOST_IMAGES:
+                    raise InputError(
+                        f"{_visibility_path(self._path)} is damaged; fuse again, or remove that file."
+                    )
                 self._read_on()
                 words = self._words.data
             starts[index] = position

@@ -85,22 +85,23 @@ class DepthSpread:
         self, piece: CloudPiece, rows: NDArray[np.int64], view: View, depth_map: NDArray[np.float32]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Which of these points a map shows, and how far its surface is from each, along the normal."""
-        camera = (piece.xyz[rows] - self._scene.origin) @ view.R.T + view.t
-        depth = camera[:, 2]
+        places = piece.xyz[rows] - self._scene.origin
+        projected = places @ (view.K @ view.R).T + view.K @ view.t
+        depth = projected[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
-            seen = camera @ view.K[:2].T / depth[:, None]
-        # Where COLMAP's maps have their depth; what is not finite lies outside.
-        columns, lines = np.rint(seen).T
-        inside = (columns >= 0) & (columns < view.width) & (lines >= 0) & (lines < view.height) & (depth > 0)
-        rows = rows[inside]
-        camera = camera[inside]
-        columns = columns[inside]
-        lines = lines[inside]
-        there = depth_map[lines.astype(np.int64), columns.astype(np.int64)].astype(np.float64)
-        shown = np.abs(there - camera[:, 2]) <= _SAME_SURFACE * camera[:, 2]
-        normals = -camera if piece.normals is None else piece.normals[rows] @ view.R.T
-        rays = np.column_stack([columns, lines, np.ones(len(columns))]) @ np.linalg.inv(view.K).T
-        distances = np.einsum("ij,ij->i", rays * there[:, None] - camera, normals)
+            # Where COLMAP's maps have their depth; what is not finite lies outside.
+            columns = np.rint(projected[:, 0] / depth)
+            lines = np.rint(projected[:, 1] / depth)
+        inside = (columns >= 0) & (columns < view.width) & (lines >= 0) & (lines < view.height)
+        columns = np.where(inside, columns, 0)
+        lines = np.where(inside, lines, 0)
+        there = depth_map[lines.astype(np.int32), columns.astype(np.int32)].astype(np.float64)
+        shown = inside & (np.abs(there - depth) <= _SAME_SURFACE * depth)
+        rays = np.stack([columns * there, lines * there, there], axis=1) @ (np.linalg.inv(view.K).T @ view.R)
+        away = rays + view.center - places
         if piece.normals is None:
-            distances /= np.linalg.norm(camera, axis=1)
+            normals = places - view.center
+            distances = np.einsum("ij,ij->i", away, normals) / np.linalg.norm(normals, axis=1)
+        else:
+            distances = np.einsum("ij,ij->i", away, piece.normals[rows])
         return rows[shown], distances[shown]

@@ -14,7 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, printable
 from colmap_sph.products.publishing import published_folder
 from colmap_sph.products.scenes.links import relative
 from colmap_sph.project.scene_reader import read_scene
@@ -54,7 +54,7 @@ def write_mvsnet(workspace: Workspace, folder: Path) -> None:
             (made / "cams" / f"{number:08d}_cam.txt").write_text(camera)
             _put_image(workspace, view, made, folder, number)
         (made / "pair.txt").write_text(_pairs(scene, selection))
-        names = "".join(f"{number:08d} {view.name}\n" for number, view in enumerate(scene.views))
+        names = "".join(f"{number:08d} {printable(view.name)}\n" for number, view in enumerate(scene.views))
         (made / "names.txt").write_text(names, encoding="utf-8")
 
 

@@ -19,6 +19,7 @@ from colmap_sph.products.publishing import published_folder, scratch_beside
 from colmap_sph.products.scenes.links import link_images
 from colmap_sph.project.cloud_output import cloud_as_model
 from colmap_sph.project.map_coordinates import local_origin, move_model
+from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import Workspace
 
 _POINT = np.dtype(
@@ -51,6 +52,11 @@ def write_splats(workspace: Workspace, cloud: ThinCloud, folder: Path) -> None:
         raise InputError(
             f"It is not known which images see the points of {workspace.fused_path}, whose file "
             f"{workspace.fused_path.name}.vis is missing; fuse again."
+        )
+    if len(cloud.images) and cloud.images.max() >= load_model(workspace.sparse_dir).num_reg_images():
+        raise InputError(
+            f"The images that see the points of {workspace.fused_path} are more than {workspace.sparse_dir} has; "
+            "fuse again."
         )
     with published_folder(folder) as made:
         link_images(workspace, made, folder)
