@@ -140,11 +140,12 @@ def report_lines(georeference: Georeference) -> Iterator[str]:
         yield f"{len(others)} {kind}: {_summary(others)}"
     if len(used) == 3:
         yield "three places determine a similarity: what is left at them says little of how right it is"
+    unused = "left out" if georeference.aligned_by == "positions" else "check"
     largest = sorted(georeference.residuals, key=lambda each: -each.length)[:_SHOWN]
     yield f"{'largest residuals':<32}{'dx':>10}{'dy':>10}{'dz':>10}"
     for each in largest:
         marks = "" if each.pixels is None else f"  {each.pixels:.2f} px"
-        note = "  not used" if each.is_check else ""
+        note = f"  {unused}" if each.is_check else ""
         yield f"{each.name[-32:]:<32}" + "".join(f"{value:>10.3f}" for value in each.difference) + marks + note
 
 
