@@ -527,7 +527,7 @@ def test_the_command_says_what_is_wrong(
     monkeypatch.setitem(sys.modules, "pyproj", None)
     capsys.readouterr()
     assert cli.main(["export", root, "--crs", "EPSG:25832", "--overwrite"]) == 2
-    assert "pip install 'colmap_sph[geo]'" in capsys.readouterr().err.replace("\n", " ")
+    assert "pip install '.[geo]'" in capsys.readouterr().err.replace("\n", " ")
     assert cli.main(["export", root, "--formats", "las"]) == 0  # what is known needs no library
 
 

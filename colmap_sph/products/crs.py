@@ -11,7 +11,7 @@ from colmap_sph.errors import InputError, OptionError, reason_of
 if TYPE_CHECKING:
     import pyproj
 
-_MISSING = "needs PROJ, which is not installed; install it by `pip install 'colmap_sph[geo]'`"
+_MISSING = "needs PROJ, which is not installed; install this program with it: pip install '.[geo]'"
 # WGS 84 with heights above its ellipsoid: what GPS gives.
 _GPS = "EPSG:4979"
 # Metres from the ellipsoid: what is farther, as a local model is, lies in no geocentric system.
