@@ -27,6 +27,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.match import MatchStage, MatchTask
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.claim import claimed, shared
+from colmap_sph.project.polishing import PolishOptions
 from colmap_sph.project.project import Project
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.matching import MatchingOptions
@@ -141,6 +142,24 @@ def test_shards_make_what_one_run_makes(whole: Whole, prepared: Project) -> None
         "fuse": 1,
     }
     assert report.reused["match pairs"] == made["match"]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        RunOptions(threads=1, pairs=OPTIONS.pairs, region="auto"),
+        RunOptions(threads=1, pairs=OPTIONS.pairs, polish=PolishOptions(poses="on")),
+    ],
+    ids=["region", "polish"],
+)
+def test_what_is_found_out_before_the_first_pair_is_found_once(options: RunOptions, prepared: Project) -> None:
+    """What a region is, and poses: all shards have the same, and the last run."""
+    run_part(prepared, options, "prepare", Part())
+    for stage in STAGES:
+        run_part(prepared, options, stage, Part())
+    report = colmap_sph.run(prepared.model, output=prepared.root, options=options)
+    assert [report.made[name] for name in ("match pairs", "vote on depth", "confirm depth")] == [0, 0, 0]
+    assert report.points > 0
 
 
 def test_shards_at_the_same_time(whole: Whole, prepared: Project) -> None:
