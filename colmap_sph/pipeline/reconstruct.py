@@ -184,7 +184,7 @@ def check_input(project: Project, options: RunOptions, limit: TimeLimit | None =
             raise OptionError("--within knows this machine alone; leave out it or --scheduler.")
     project.check()
     check_links(Workspace(project.root), is_given=project.workspace is not None)
-    if project.model is None and options.undistortion != UndistortionOptions():
+    if project.model is None and options.undistortion.max_image_size != UndistortionOptions().max_image_size:
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
     if project.model is None and options.polish.is_wanted:
         raise OptionError(
