@@ -25,6 +25,7 @@ _MAKERS = {
         "polish": "polish",
         "vote": "vote",
         "geometric": "confirm",
+        "range": "wide.range_maps",
         "cloud": "fuse",
     }.items()
 }
@@ -184,6 +185,10 @@ class Keys:
         options = (self._options.confirm, self._options.normals, self._options.refinement, *self._depths)
         options += tuple(cut)
         return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)
+
+    def range_map(self, maps: Sequence[str], cuts: Sequence[object]) -> str:
+        """Of the range map of a wide image, from the keys of its views' geometric maps and how they were cut."""
+        return self._key("range", maps, cuts)
 
     def cloud(self, maps: Mapping[str, str], pairs: object, scene: Scene) -> str:
         """Of the cloud, from the keys of the geometric maps of the images to fuse.

@@ -141,6 +141,12 @@ class Preparation:
         self.options = part.options
         return tuple(view.name for view in part.scene.views)
 
+    def expected(self) -> list[str]:
+        """Of `names`, those whose original images were not left out."""
+        left_out = self._report.skipped_images
+        original = self._originals.cuts.original
+        return [name for name in self.names if name == original(name) or original(name) not in left_out]
+
     def run(self, executor: "Executor") -> None:
         """Make the workspace.
 

@@ -33,6 +33,7 @@ from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
+from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.files import make_dir
@@ -156,7 +157,7 @@ def run_project(
         preparation.run(executor)
         given = preparation.given_model()
         options = preparation.options
-        names = preparation.names
+        names = preparation.expected()
         del preparation  # the model takes much memory
         if given.reason_to_keep or not options.polish.is_wanted:
             restore_given(dense)
@@ -332,6 +333,7 @@ def go_through_stages(
         report_photometric(context, votes)
         return
     maps = _by_name(executor(ConfirmStage(context, matched, votes)))
+    _join_views(context, maps, executor)
     if until == "cloud":
         executor(fuse_stage(context, keys_of(matched), maps))
 
@@ -342,8 +344,16 @@ def go_through_stages_within(within: Within, executor: Executor) -> Context:
     _judge_rows(context, matched)
     context = within.refined(context, matched, votes)
     maps = _by_name(executor(ConfirmStage(context, matched, _by_name(votes))))
+    _join_views(context, maps, executor)
     executor(fuse_stage(context, keys_of(matched), maps))
     return context
+
+
+def _join_views(context: Context, maps: Mapping[str, Result], executor: Executor) -> None:
+    """Make the range maps of wide images, where there are any."""
+    stage = RangeStage(context, maps)
+    if stage.items:
+        executor(stage)
 
 
 def _judge_rows(context: Context, matched: Mapping[Pair, Result]) -> None:

@@ -4,8 +4,8 @@ COLMAP's formulas, but written with the angle between ray and axis in place of q
 beyond 90 degrees, where its library has no rays or wrong ones.
 
 Sources: COLMAP, `src/colmap/sensor/models.h`; J. Kannala, S. Brandt, A Generic Camera Model, PAMI 2006; F.
-Devernay, O. Faugeras, Straight Lines Have to Be Straight, MVA 2001; B. Khomutenko et al., An Enhanced Unified Camera Model,
-RA-L 2016; A. Fitzgibbon, Simultaneous Linear Estimation of Multiple View Geometry and Lens Distortion, CVPR 2001.
+Devernay, O. Faugeras, Straight Lines Have to Be Straight, 2001; B. Khomutenko et al., An Enhanced Unified Camera
+Model, 2016; A. Fitzgibbon, Simultaneous Linear Estimation of Multiple View Geometry and Lens Distortion, 2001.
 """
 
 from collections.abc import Callable
@@ -25,6 +25,7 @@ _STEPS = 6
 _DELTA = 1e-6
 # Pixels by which what was found may miss what was asked for.
 _MISS = 1e-6
+_CLOSE = 1e-10
 _TINY = 1e-12
 
 
@@ -242,6 +243,8 @@ def _undistorted(lens: Lens, points: Float) -> Float:
     with np.errstate(all="ignore"):
         for _ in range(_STEPS):
             miss = _distorted(lens, found) - points
+            if not (np.abs(miss) > _CLOSE).any():
+                break
             columns = [
                 (_distorted(lens, found + step) - _distorted(lens, found - step)) / (2 * _DELTA)
                 for step in np.eye(2) * _DELTA
