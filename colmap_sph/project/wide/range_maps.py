@@ -151,7 +151,7 @@ def write_range_map(path: Path, distance: Pixels, normals: Pixels) -> str:
 
 
 def read_range_map(path: Path) -> tuple[Pixels, Pixels]:
-    """Read what `write_range_map` wrote: range (H, W), normals (H, W, 3); `InputError` where it is no such file."""
+    """Read the range (H, W) and normals (H, W, 3) of `write_range_map`; `InputError` where it is no such file."""
     image = oiio.ImageBuf(str(path))
     if image.has_error or tuple(image.spec().channelnames) != CHANNELS:
         raise InputError(f"{path} is no range map, or damaged; run again.")
