@@ -115,7 +115,8 @@ class Keys:
             Of the original, where there is one.
         """
         mask_digest = None if mask is None or self.fresh else file_digest(mask)
-        return self._key("undistorted", image, camera, values, mask_digest, self._options.undistortion)
+        size = self._options.undistortion.max_image_size
+        return self._key("undistorted", image, camera, values, mask_digest, size)
 
     def pair(self, left: View, right: View, geometry: RectifiedPair, seeds: Seeds, trial: float) -> str:
         """Of a disparity map.

@@ -257,7 +257,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         if failures and not report.images:
             raise NoResultError(f"No image has a depth map ({failures[0]})")
         for name in (name for name, share in report.coverage.items() if share == 0):
-            if name in report.skipped_images:
+            if name in report.skipped_images or self._is_one_of_many(name):
                 continue
             if self._shows_enough(name):
                 report.skipped_images[name] = self._why_empty(name)
@@ -268,6 +268,13 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
                 )
         if not report.images:
             raise NoResultError(self._why_nothing())
+
+    def _is_one_of_many(self, name: str) -> bool:
+        """Whether a view is cut from an image of which others have a depth: it may show the sky alone."""
+        original = self.context.scene.view(name).original
+        coverage = self.context.report.coverage
+        views = self.context.scene.views
+        return bool(original) and any(view.original == original and coverage[view.name] > 0 for view in views)
 
     def _shows_enough(self, name: str) -> bool:
         """Whether an image shows so much of the region, where there is one, that it ought to have some depth."""
