@@ -99,6 +99,8 @@ class _Maker:
         for frame_id in sorted(frames):
             self._add_frame(self._model.frame(frame_id))
         self._add_points()
+        # Those of the original model are senseless where COLMAP has no rays.
+        self._new.update_point_3d_errors()
         return self._new
 
     def _faces(self, camera_id: int) -> tuple[Face | None, ...]:
