@@ -384,6 +384,9 @@ def test_wide_images_from_end_to_end(
         covered += ((exact > 0) & (distance > 0)).sum()
         good += ((exact > 0) & (np.abs(distance - exact) < 0.03 * exact)).sum()
     assert covered > 0.7 * seen
+    report = json.loads((dense / "colmap_sph" / "report.json").read_text())
+    assert set(report["originals"]) == {path.stem for path in (root / "truth").iterdir()}
+    assert 0.3 < min(report["originals"].values()) < max(report["originals"].values()) < 0.9  # there is sky
     assert good > 0.7 * covered  # with few pixels, many lie at the border of something
     assert len(CHANNELS) == 4
     # A second run, and a plan, find all there.

@@ -105,6 +105,11 @@ def _looked_up(view: ViewMaps, rays: NDArray[np.float64]) -> tuple[NDArray[np.fl
     return np.where(is_plane, plane, distance), normals
 
 
+def pixels_shown(lens: Lens) -> int:
+    """Number of an image's pixels that show something: the others lie beyond the lens."""
+    return int(np.count_nonzero(~np.isnan(_rays(lens)[:, :, 0])))
+
+
 @lru_cache(maxsize=1)
 def _rays(lens: Lens) -> Pixels:
     """(H, W, 3) rays of the centres of a lens's pixels; NaN where it shows nothing."""

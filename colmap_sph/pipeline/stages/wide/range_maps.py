@@ -15,7 +15,12 @@ from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.state.ownership import range_place
 from colmap_sph.project.state.records import begin, vouch_when_on_disk, vouched_facts
 from colmap_sph.project.wide.cuts import Cut
-from colmap_sph.project.wide.range_maps import ViewMaps, range_and_normals, write_range_map
+from colmap_sph.project.wide.range_maps import (
+    ViewMaps,
+    pixels_shown,
+    range_and_normals,
+    write_range_map,
+)
 from colmap_sph.project.wide.table import read_cuts
 from colmap_sph.scene import View
 
@@ -32,7 +37,7 @@ _FILE_BYTES = 8.0
 
 @dataclass(frozen=True)
 class RangeFacts:
-    """What the record of a range map says of it: the share of the image's pixels that have a range."""
+    """What the record of a range map says of it: the share of what the lens shows that has a range."""
 
     coverage: Annotated[float, Meta(ge=0, le=1)]
 
@@ -60,7 +65,7 @@ def make_range_map(task: RangeTask) -> Facts:
         digest = write_range_map(task.target, distance, normals)
     except OSError as error:
         raise OutputError(f"{task.target} cannot be written ({reason_of(error)}); check space.") from error
-    facts = RangeFacts(float(np.count_nonzero(distance) / distance.size))
+    facts = RangeFacts(int(np.count_nonzero(distance)) / max(pixels_shown(first.lens), 1))
     vouch_when_on_disk(task.record, task.key, {task.target: digest}, facts)
     return Facts(coverage=facts.coverage)
 
@@ -111,3 +116,7 @@ class RangeStage(Stage[str, RangeTask]):
         pixels = views[0][1].lens.width * views[0][1].lens.height if views else 0
         memory = _BYTES * pixels + _VIEW_BYTES * sum(view.num_pixels for view in self._views[item]) + _BAND_BYTES
         return Job(key, done, Cost(_SECONDS * pixels * len(views), memory, _FILE_BYTES * pixels), task)
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """See `Stage.close`."""
+        self.context.report.originals = {name: result.facts.coverage for name, result in results.items()}
