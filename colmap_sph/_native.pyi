@@ -543,6 +543,33 @@ def find_gates(
     distance : (POINTS) float32, written
     """
 
+def pack_normals(
+    normals: NDArray[np.float32],
+    pair: NDArray[np.float32],
+    codes: NDArray[np.uint8],
+    /,
+) -> None:
+    """Two components of each unit vector, and a code from which the largest follows to the bit; code 3: it does
+    not.
+
+    normals : (3, H, W) float32
+    pair : (2, H, W) float32, written
+    codes : (H, W) uint8, written
+    """
+
+def unpack_normals(
+    pair: NDArray[np.float32],
+    codes: NDArray[np.uint8],
+    normals: NDArray[np.float32],
+    /,
+) -> None:
+    """What was packed.
+
+    pair : (2, H, W) float32
+    codes : (H, W) uint8
+    normals : (3, H, W) float32, written
+    """
+
 def count_points(
     depth: NDArray[np.float32],
     normals: NDArray[np.float32],

@@ -221,6 +221,22 @@ def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:
     )
 
 
+def observed_by(first: View, second: View) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Sparse points that one of two views observes, and those that both do: rows of `Scene.points`, ascending.
+
+    Examples
+    --------
+    >>> views = [View(k, "", 1, 1, np.eye(3), np.eye(3), np.zeros(3), np.array(rows)) for k, rows in enumerate(
+    ...     ([1, 2, 5], [2, 3, 5]))]
+    >>> [rows.tolist() for rows in observed_by(*views)]
+    [[1, 2, 3, 5], [2, 5]]
+    """
+    rows = np.concatenate([first.point_indices, second.point_indices])
+    rows.sort(kind="stable")  # two ascending runs are merged
+    is_repeated = rows[1:] == rows[:-1]
+    return np.concatenate([rows[:1], rows[1:][~is_repeated]]), rows[1:][is_repeated]
+
+
 @dataclass(frozen=True, eq=False)
 class Scene:
     """Views, sorted by name, and the sparse points they observe.

@@ -241,6 +241,17 @@ def find_gates(rng: Random) -> Arguments:
     return [*reference, *partner, *matrices, number(rng), number(rng), *places, *outputs]
 
 
+def pack_normals(rng: Random) -> Arguments:
+    normals = fused_maps(rng)[1]
+    h, w = normals.shape[1:]
+    return [normals, np.zeros((2, h, w), np.float32), np.zeros((h, w), np.uint8)]
+
+
+def unpack_normals(rng: Random) -> Arguments:
+    h, w = size(rng)
+    return [filled(rng, (2, h, w), np.float32), filled(rng, (h, w), np.uint8), np.zeros((3, h, w), np.float32)]
+
+
 def count_points(rng: Random) -> Arguments:
     maps = fused_maps(rng)
     first, end = sorted(int(row) for row in rng.integers(0, maps[0].shape[0] + 1, 2))
@@ -344,6 +355,8 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         compare_depths,
         fuse_partner,
         find_gates,
+        pack_normals,
+        unpack_normals,
         count_points,
         write_points,
         confirm_depth,

@@ -115,3 +115,104 @@ def test_without_its_surroundings(recipe: str, place: Path, monkeypatch: pytest.
     done = subprocess.run([RECIPES / recipe], capture_output=True, text=True, timeout=30, check=False)
     assert done.returncode != 0
     assert "submit with" in done.stderr or "usage: ssh.sh" in done.stderr
+
+
+# ---- shards ------------------------------------------------------------------------------------------------
+
+SHARD_STAND_INS = {
+    # Fails where a file says so.
+    "colmap_sph": f"""#!/bin/bash
+{LOG}
+case "$*" in
+    *"--stage prepare") exit $(cat "$CALLS.prepare" 2>/dev/null || echo 0) ;;
+    *"--shard 2/3") [ ! -e "$CALLS.second" ] || exit $(cat "$CALLS.second") ;;
+esac
+""",
+    # Does at once what it is given, but for jobs that wait for one that failed.
+    "sbatch": """#!/bin/bash
+job=$(($(cat "$CALLS.job" 2>/dev/null || echo 40) + 1))
+echo $job > "$CALLS.job"
+tasks=("")
+while [[ $1 == --* ]]; do
+    case $1 in
+        --array=*-*) tasks=($(seq "${1#--array=1-}")) ;;
+        --array=*) tasks=("${1#--array=}") ;;
+        --dependency=afterok:*) if [ -e "$CALLS.failed-${1##*:}" ]; then touch "$CALLS.failed-$job"; fi ;;
+    esac
+    shift
+done
+for task in "${tasks[@]}"; do
+    [ -e "$CALLS.failed-$job" ] && break
+    SLURM_ARRAY_TASK_ID=$task bash "$@" >> "$CALLS.said" 2>&1 || touch "$CALLS.failed-$job"
+done
+echo "$job;some cluster"
+""",
+    "parallel": """#!/bin/bash
+while [[ $1 == --* ]]; do [ "$1" = --halt ] && shift; shift; done
+while read -r item; do "${@//\\{\\}/$item}" || exit 1; done
+""",
+}
+SHARD_OPTIONS = ["--model", "sparse/0", "--masks", "black & white"]
+
+
+@pytest.fixture
+def shard_place(place: Path) -> Path:
+    for name, text in SHARD_STAND_INS.items():
+        program = place.parent / "some bin" / name
+        program.write_text(text)
+        program.chmod(0o755)
+    return place
+
+
+def shard_calls(*command: object, code: int = 0) -> list[list[str]]:
+    """What followed the options in each call of the program."""
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == code, done.stderr
+    calls = [shlex.split(line) for line in Path(os.environ["CALLS"]).read_text().splitlines()]
+    begin = ["colmap_sph", "run", *SHARD_OPTIONS]
+    assert all(call[: len(begin)] == begin for call in calls)
+    return [call[len(begin) :] for call in calls]
+
+
+STAGES = ["match", "vote", "confirm"]
+ALL_SHARDS = [
+    ["--stage", "prepare"],
+    *(["--stage", stage, "--shard", f"{number}/3"] for stage in STAGES for number in (1, 2, 3)),
+    [],
+]
+
+
+@pytest.mark.parametrize("recipe", ["slurm_shards.sh", "parallel_shards.sh"])
+def test_shards(recipe: str, shard_place: Path) -> None:
+    assert shard_calls(RECIPES / recipe, 3, *SHARD_OPTIONS) == ALL_SHARDS
+
+
+@pytest.mark.parametrize("recipe", ["slurm_shards.sh", "parallel_shards.sh"])
+def test_images_that_cannot_be_used_end_no_shards(recipe: str, shard_place: Path) -> None:
+    Path(f"{os.environ['CALLS']}.prepare").write_text("5")
+    assert shard_calls(RECIPES / recipe, 3, *SHARD_OPTIONS) == ALL_SHARDS
+
+
+@pytest.mark.parametrize("recipe", ["slurm_shards.sh", "parallel_shards.sh"])
+@pytest.mark.parametrize("code", ["5", "6"])
+def test_nothing_follows_a_shard_that_failed(code: str, recipe: str, shard_place: Path) -> None:
+    Path(f"{os.environ['CALLS']}.second").write_text(code)
+    calls = shard_calls(RECIPES / recipe, 3, *SHARD_OPTIONS, code=recipe.startswith("parallel"))
+    assert calls == ALL_SHARDS[:3]
+
+
+def test_nothing_follows_a_preparation_that_failed(shard_place: Path) -> None:
+    Path(f"{os.environ['CALLS']}.prepare").write_text("2")
+    assert shard_calls(RECIPES / "slurm_shards.sh", 3, *SHARD_OPTIONS) == ALL_SHARDS[:1]
+
+
+def test_one_shard_again(shard_place: Path) -> None:
+    again = ["sbatch", "--array=2", RECIPES / "slurm_shards.sh", "vote", 3, *SHARD_OPTIONS]
+    assert shard_calls(*again) == [["--stage", "vote", "--shard", "2/3"]]
+
+
+@pytest.mark.parametrize("recipe", ["slurm_shards.sh", "parallel_shards.sh"])
+def test_shards_without_a_number(recipe: str, shard_place: Path) -> None:
+    done = subprocess.run([RECIPES / recipe], capture_output=True, text=True, timeout=30, check=False)
+    assert done.returncode != 0
+    assert f"usage: {recipe} SHARDS" in done.stderr

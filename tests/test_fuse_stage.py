@@ -34,7 +34,7 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
 from colmap_sph.stereo.anchor import anchored
-from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.fusion import FusionOptions, PackedMaps
 
 UTM = np.array([5e5 + 1 / 3, 5e6 + 1 / 7, 300.0])
 
@@ -514,3 +514,31 @@ def test_colmaps_fusion_still_warns_of_its_memory(workspace, caplog, monkeypatch
     caplog.clear()
     fuse(workspace)
     assert caplog.text == ""
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_packed_maps_in_another_order_make_the_same_cloud(workspace, threads, monkeypatch):
+    """As where there is room for few."""
+    fuse(workspace)
+    expected = cloud_bytes(workspace)
+    orders = []
+
+    def turned(given, *_):
+        orders.extend(given)
+        return given[0][::-1]
+
+    unpacked = []
+    usual = PackedMaps.unpacked
+
+    def counting(self):
+        unpacked.append(self)
+        return usual(self)
+
+    monkeypatch.setattr(parts_module, "best_order", turned)
+    monkeypatch.setattr(PackedMaps, "unpacked", counting)
+    monkeypatch.setattr(memory, "resident", lambda: 100 << 20)
+    shutil.rmtree(workspace.state_dir)
+    monkeypatch.setattr(parts_module, "_UNPACKING_BYTES", 0.0)
+    fuse(workspace, threads=threads, memory=f"{(100 << 20) + int(2.6 * NEEDED)}B")
+    assert unpacked and orders and all(sorted(order) == sorted(orders[0]) for order in orders)
+    assert cloud_bytes(workspace) == expected

@@ -20,7 +20,7 @@ from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import POINT, View, pixel_transfer
 from colmap_sph.stereo import fusion
-from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, PackedMaps, ViewMaps, fuse_view
 from colmap_sph.stereo.fusion_losses import explain_losses
 
 STONE = syn.Mottled(syn.Noise(0.1, seed=1))
@@ -498,3 +498,44 @@ def test_reprojection_takes_no_points_from_us(workspace):
 def test_mask_folder_must_exist():
     with pytest.raises(OptionError, match="/nowhere/masks"):
         RunOptions(fusion=FusionOptions(mask_path=Path("/nowhere/masks"))).check()
+
+
+# ---- less memory -------------------------------------------------------------------------------------------
+
+
+def unit_vectors(rng, count):
+    """(count, 3) float32: in all directions, along axes and planes, nearly so, and none."""
+    vectors = rng.normal(size=(count, 3)) * 10.0 ** rng.integers(-9, 1, (count, 3))
+    vectors[::7] = rng.integers(-1, 2, vectors[::7].shape)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    return (vectors / np.where(length > 0, length, 1)).astype(np.float32)
+
+
+def maps_with(normals):
+    """Maps with (H, W, 3) normals, of no other meaning."""
+    shape = normals.shape[:2]
+    planes = np.ascontiguousarray(np.moveaxis(normals, 2, 0))
+    view = View(1, "a.png", shape[1], shape[0], np.eye(3), np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    return ViewMaps(view, 0, np.ones(shape, np.float32), planes, np.zeros((*shape, 3), np.uint8))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_packed_maps_are_the_same_to_the_bit(seed):
+    rng = np.random.default_rng(seed)
+    normals = unit_vectors(rng, 300 * 200).reshape(300, 200, 3)
+    normals[5:9] = 0
+    maps = maps_with(normals)
+    packed = PackedMaps.of(maps)
+    assert packed is not None
+    assert packed.nbytes == 16 * normals.size // 3 < maps.nbytes
+    assert packed.maps.depth is maps.depth
+    np.testing.assert_array_equal(packed.unpacked().normals.view(np.uint32), maps.normals.view(np.uint32))
+
+
+@pytest.mark.parametrize(
+    "normal", [(0, 0, -1.001), (0.5, 0, 0), (-0.0, 0, 0), (np.nan, 0, 1), (np.inf, 0, 0), (0, 2, 0)]
+)
+def test_what_is_no_unit_vector_is_not_packed(normal):
+    normals = unit_vectors(np.random.default_rng(0), 200).reshape(20, 10, 3)
+    normals[7, 3] = normal
+    assert PackedMaps.of(maps_with(normals)) is None

@@ -198,6 +198,16 @@ def arguments(function):
             "out gate": np.zeros(3, u8),
             "out distance": np.zeros(3, f32),
         },
+        "pack_normals": {
+            "normals": np.ones((3, H, W), f32),
+            "out pair": np.zeros((2, H, W), f32),
+            "out codes": np.zeros((H, W), u8),
+        },
+        "unpack_normals": {
+            "pair": np.ones((2, H, W), f32),
+            "codes": np.zeros((H, W), u8),
+            "out normals": np.zeros((3, H, W), f32),
+        },
         "count_points": {
             **fused_maps(),
             **verdicts(),
@@ -306,6 +316,8 @@ FUNCTIONS = [
     "compare_depths",
     "fuse_partner",
     "find_gates",
+    "pack_normals",
+    "unpack_normals",
     "count_points",
     "write_points",
     "confirm_depth",

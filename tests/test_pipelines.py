@@ -8,6 +8,7 @@ import sys
 from contextlib import suppress
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
+from types import NoneType
 from typing import Any, Literal, get_args, get_origin
 
 import pytest
@@ -192,10 +193,10 @@ def test_a_configuration_of_every_kind(tmp_path: Path) -> None:
 
 
 def some_value(kind: Any, rng: random.Random) -> Any:
+    if NoneType in get_args(kind):
+        kind = get_args(kind)[0]
     if get_origin(kind) is Literal:
         return rng.choice(get_args(kind))
-    if get_args(kind):
-        kind = get_args(kind)[0]
     values = {
         bool: rng.random() < 0.5,
         int: rng.randint(-5, 5),

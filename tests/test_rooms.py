@@ -17,9 +17,10 @@ MAY_IMPORT = {
     "project": GROUND,
     "pages": {*GROUND, "stereo", "project"},
     "pipeline": {*GROUND, "_native", "stereo", "project", "pages"},
+    "products": {*GROUND, "stereo", "project"},
     "evaluation": {"errors"},
     "synthetic": {"errors"},
-    "app": {*GROUND, "stereo", "project", "pages", "pipeline", "evaluation", "synthetic"},
+    "app": {*GROUND, "stereo", "project", "pages", "pipeline", "products", "evaluation", "synthetic"},
 }
 # Loads the rooms when they are asked for, by name.
 FRONT_DOOR = {"__init__", "__main__"}

@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import tyro
@@ -22,6 +23,8 @@ from colmap_sph.app.events import Events
 from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.part_command import part_command
+from colmap_sph.app.products.commands import PRODUCTS
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of
@@ -46,7 +49,8 @@ class DemoCommand:
     """Worker threads; 0: as many as the process may use cores."""
 
 
-Command = RunCommand | DemoCommand | EvaluateCommand | ReportCommand | ViewCommand
+# Or of one of PRODUCTS.
+Command = RunCommand | DemoCommand | EvaluateCommand | ReportCommand | ViewCommand | Any
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -146,6 +150,7 @@ def _parsed(arguments: Sequence[str]) -> Command:
                 "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
                 "report": ReportCommand,
                 "view": ViewCommand,
+                **{name: options for name, (options, _) in PRODUCTS.items()},
             },
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU. COLMAP's own commands are taken, too: "
@@ -162,6 +167,8 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
     except OSError as error:
         raise InputError(f"The current folder cannot be used ({reason_of(error)}); change to another.") from error
     if isinstance(command, RunCommand):
+        if command.stage is not None or command.shard is not None:
+            return part_command(command, terminal, arguments, events)
         return run_command(command, terminal, arguments, events, started)
     if isinstance(command, DemoCommand):
         return demo_command(command, terminal, arguments)
@@ -169,7 +176,9 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
         return report_command(command, terminal)
     if isinstance(command, ViewCommand):
         return view_command(command, terminal)
-    return evaluate_command(command, terminal)
+    if isinstance(command, EvaluateCommand):
+        return evaluate_command(command, terminal)
+    return next(answer for options, answer in PRODUCTS.values() if isinstance(command, options))(command, terminal)
 
 
 def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str]) -> int:

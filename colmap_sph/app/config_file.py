@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, Union, get_args, get_origin
 
 from colmap_sph.app.option_list import Option
 from colmap_sph.app.spelling import full_flag
@@ -107,7 +107,7 @@ def _argument(path: Path, key: str, option: Option, value: Any) -> list[str]:
 
 
 def _fits(kind: Any, value: Any) -> bool:
-    if isinstance(kind, UnionType):
+    if get_origin(kind) in (UnionType, Union):
         return any(_fits(each, value) for each in get_args(kind))
     if get_origin(kind) is Literal:
         return value in get_args(kind)
@@ -117,7 +117,7 @@ def _fits(kind: Any, value: Any) -> bool:
 
 
 def _words(kind: Any) -> str:
-    if isinstance(kind, UnionType):
+    if get_origin(kind) in (UnionType, Union):
         return " or ".join(_words(each) for each in get_args(kind) if each is not type(None))
     if get_origin(kind) is Literal:
         return "one of " + ", ".join(map(str, get_args(kind)))

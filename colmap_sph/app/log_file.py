@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_sph.errors import ColmapSphError, OutputError, printable, reason_of
+from colmap_sph.project.files import make_dir
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -64,14 +65,15 @@ class _LogFile(logging.FileHandler):
 
 
 class _WorkspaceLog(logging.Handler):
-    """Keeps records until the workspace is complete, then appends them to ``colmap_sph/log.txt`` in it.
+    """Keeps records until the workspace is complete, then appends them to a log in it.
 
     So a run that ends before, for want of a model or a writable folder, leaves nothing behind.
     """
 
-    def __init__(self, workspace: Workspace, header: str) -> None:
+    def __init__(self, workspace: Workspace, header: str, path: Path) -> None:
         super().__init__(logging.INFO)
         self._workspace = workspace
+        self._path = path
         self._file: logging.FileHandler | None = None
         first = {"name": __name__, "levelno": logging.INFO, "levelname": "INFO", "msg": header}
         self._early = [logging.makeLogRecord(first)]
@@ -86,7 +88,8 @@ class _WorkspaceLog(logging.Handler):
             self._file.emit(record)
 
     def _open(self) -> logging.FileHandler:
-        path = self._workspace.log_path
+        path = self._path
+        make_dir(path.parent)
         if path.exists() and not path.is_file():
             raise OutputError(f"{path} cannot be written: it is not a regular file; remove it.")
         try:
@@ -112,7 +115,7 @@ class _WorkspaceLog(logging.Handler):
 
 
 @contextmanager
-def workspace_log(workspace: Workspace, header: str) -> Iterator[None]:
+def workspace_log(workspace: Workspace, header: str, part: str = "") -> Iterator[None]:
     """Append all that the package logs, and the error that ends it, to ``colmap_sph/log.txt`` in the workspace.
 
     Parameters
@@ -121,6 +124,8 @@ def workspace_log(workspace: Workspace, header: str) -> Iterator[None]:
         May not exist yet; what is logged until it does is written then.
     header : str
         First line.
+    part : str
+        Which of several jobs in the workspace it is, where it is one: its log goes to ``colmap_sph/logs``.
 
     Raises
     ------
@@ -128,7 +133,8 @@ def workspace_log(workspace: Workspace, header: str) -> Iterator[None]:
         The file cannot be written.
     """
     package = logging.getLogger("colmap_sph")
-    handler = _WorkspaceLog(workspace, header)
+    path = workspace.part_log_path(part) if part else workspace.log_path
+    handler = _WorkspaceLog(workspace, header, path)
     package.addHandler(handler)
     try:
         yield

@@ -7,7 +7,7 @@ from dataclasses import MISSING, dataclass, fields, is_dataclass
 from pathlib import Path
 from textwrap import dedent
 from types import NoneType, UnionType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 from colmap_sph.app.spelling import flag_of
 
@@ -112,7 +112,7 @@ def _option(place: str, kind: Any, default: object, text: str) -> Option:
 def _values_of(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return "{" + ",".join(map(str, get_args(kind))) + "}"
-    if isinstance(kind, UnionType):
+    if get_origin(kind) in (UnionType, Union):
         return "|".join(_values_of(each) for each in get_args(kind) if each is not NoneType)
     return {int: "N", float: "X", bool: "{True,False}", Path: "PATH", str: "TEXT"}[kind]
 

@@ -31,6 +31,7 @@ from colmap_sph.pipeline.plan import Plan, make_plan
 from colmap_sph.pipeline.presets import Quality
 from colmap_sph.pipeline.reconstruct import check_input, run_project
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.shards.part import StageName
 from colmap_sph.project.project import Project
 from colmap_sph.project.workspace import Workspace
 
@@ -60,6 +61,11 @@ class RunCommand:
     """Preview takes a quarter of the time of normal, best about twice as much. Options given beside it win."""
     within: str = ""
     """Time to end within, such as 20min: it chooses size and settings accordingly."""
+    stage: StageName | None = None
+    """Make the results of one stage alone, as the jobs of a cluster's arrays do: prepare, then match, vote and
+    confirm, and at last all that is left without this option."""
+    shard: str | None = None
+    """Part of the stage, I/N: of so many jobs this one, counted from 1, such as 3/16."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Write nothing: say what is to do, and about how much time, memory and disk it takes."""
     overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
@@ -97,7 +103,7 @@ def run_command(
         events.plan(plan)
         print_plan(plan, workspace, terminal)
         return 0
-    with workspace_log(workspace, header(arguments)), _progress(command, terminal, events) as progress:
+    with workspace_log(workspace, header(arguments)), progress_of(command, terminal, events) as progress:
         logger.info("Options: %s", command)
         report = run_project(
             project,
@@ -135,7 +141,8 @@ def _print_arrival(limit: TimeLimit, terminal: Terminal) -> None:
 
 
 @contextmanager
-def _progress(command: RunCommand, terminal: Terminal, events: Events) -> Iterator[Progress]:
+def progress_of(command: RunCommand, terminal: Terminal, events: Events) -> Iterator[Progress]:
+    """How a run tells how far it is, as the command asks for."""
     if command.progress == "json":
         yield events
     elif command.progress == "none":

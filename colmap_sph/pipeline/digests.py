@@ -11,6 +11,7 @@ from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import open_regular
 
 _DIGEST_BYTES = 16
+_PLAIN = {bool, int, float, str, type(None)}
 
 
 def new_digest() -> "hashlib.blake2b":
@@ -32,6 +33,11 @@ def digest(*parts: object) -> str:
 
 
 def _feed(state: "hashlib.blake2b", value: object) -> None:
+    kind = type(value)
+    if kind in _PLAIN:  # most are: the rest asks many questions
+        text = f"{kind.__name__} {value!r}".encode()
+        state.update(b"%d %b" % (len(text), text))
+        return
     if isinstance(value, np.generic):
         value = value.item()
     if isinstance(value, np.ndarray):

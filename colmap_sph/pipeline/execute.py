@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import Any, Protocol, TypeVar
@@ -59,7 +59,17 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
         A wrong option, an output that cannot be written, or nothing to go on with.
     """
     context = stage.context
-    gate = MemoryGate(context.options.memory_budget, context.options.num_threads)
+    with stage.opened(), context.stage(stage.name, len(stage.items)):
+        results = made_by_threads(stage)
+        stage.close(results)
+    tell_counts(stage, results)
+    return results
+
+
+def made_by_threads(stage: Stage[Item, Task], items: Sequence[Item] | None = None) -> dict[Item, Result]:
+    """Make the results of a stage that is open and announced, or of some of its items; see `execute`."""
+    options = stage.context.options
+    gate = MemoryGate(options.memory_budget, options.num_threads)
     kept = stage.kept_memory(gate)
 
     def work(item: Item) -> Result | None:
@@ -73,12 +83,9 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
         with gate.reserve(job.cost.memory, stage.label(item)):
             return _made(stage, job)
 
-    with stage.opened(), context.stage(stage.name, len(stage.items)):
-        with gate.keeping(kept.total(gate.threads)), stage.holding(kept), vouching_in_background():
-            results = _one_by_one(work, stage) if stage.whole else _by_threads(work, stage)
-        stage.close(results)
-    tell_counts(stage, results)
-    return results
+    with gate.keeping(kept.total(gate.threads)), stage.holding(kept), vouching_in_background():
+        items = stage.items if items is None else items  # not before: what is kept may tell the best order
+        return _one_by_one(work, stage, items) if stage.whole else _by_threads(work, stage, items)
 
 
 def tell_counts(stage: Stage[Item, Task], results: Mapping[Item, Result]) -> None:
@@ -98,20 +105,24 @@ def _made(stage: Stage[Item, Task], job: Job[Task]) -> Result:
     return Result(job.key, True, facts, seconds=job.cost.seconds, taken=time.perf_counter() - start)
 
 
-def _by_threads(work: Callable[[Item], Result | None], stage: Stage[Item, Task]) -> dict[Item, Result]:
+def _by_threads(
+    work: Callable[[Item], Result | None], stage: Stage[Item, Task], items: Sequence[Item]
+) -> dict[Item, Result]:
     context = stage.context
 
     def advance(result: Result | None) -> None:
         context.progress.advance(0.0 if result is None else result.seconds)
 
-    results = for_all(work, stage.items, threads=context.options.num_threads, advance=advance, skip=stage.skip)
+    results = for_all(work, items, threads=context.options.num_threads, advance=advance, skip=stage.skip)
     return {item: result for item, result in results.items() if result is not None}
 
 
-def _one_by_one(work: Callable[[Item], Result | None], stage: Stage[Item, Task]) -> dict[Item, Result]:
+def _one_by_one(
+    work: Callable[[Item], Result | None], stage: Stage[Item, Task], items: Sequence[Item]
+) -> dict[Item, Result]:
     """In the calling thread, the only one in which COLMAP's library heeds Ctrl-C."""
     results = {}
-    for item in stage.items:
+    for item in items:
         result = work(item)
         if result is not None:
             results[item] = result

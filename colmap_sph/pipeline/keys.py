@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from colmap_sph.pipeline.digests import digest, file_digest
-from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import program_digest
 from colmap_sph.project.sparse_model import model_files
@@ -67,7 +66,9 @@ class Keys:
         self._options = options
         self._images = images or {}
         self._programs = program_digests()
-        self._masks: LoadCache[str | None] = LoadCache(lambda _: 0)
+        self._masks: dict[str, str | None] = {}
+        self._cameras: dict[View, str] = {}
+        self._matching = digest(options.matching)
 
     def of(self, options: RunOptions) -> "Keys":
         """The same for a run with other options."""
@@ -77,8 +78,15 @@ class Keys:
         return self._images.get(name)
 
     def _mask(self, name: str) -> str | None:
-        path = self._workspace.mask_path(name)
-        return self._masks.get(name, lambda: None if self.fresh else _digest_if_there(path))
+        if name not in self._masks:  # by two threads at a time, at worst
+            self._masks[name] = None if self.fresh else _digest_if_there(self._workspace.mask_path(name))
+        return self._masks[name]
+
+    def _camera(self, view: View) -> str:
+        """Digest of all that its camera is: of each there are many pairs."""
+        if view not in self._cameras:
+            self._cameras[view] = digest(view.name, view.width, view.height, view.K, view.R, view.t)
+        return self._cameras[view]
 
     @property
     def _depths(self) -> tuple[float, ...]:
@@ -133,8 +141,8 @@ class Keys:
         """
         images = [self._image(view.name) for view in (left, right)]
         masks = [self._mask(view.name) for view in (left, right)]
-        cameras = [_camera(view) for view in (left, right)]
-        return self._key("pair", images, masks, cameras, geometry, seeds, trial, self._options.matching)
+        cameras = [self._camera(view) for view in (left, right)]
+        return self._key("pair", images, masks, cameras, geometry, seeds, trial, self._matching)
 
     def polish(self, pairs: Sequence[tuple[str, str]], model_dir: Path) -> str:
         """Of the polished model, from the pairs to match and the folder of the given model."""
@@ -163,7 +171,7 @@ class Keys:
         """
         mask = self._mask(view.name)
         options = (self._options.vote, *self._depths, *cut)
-        return self._key("vote", _camera(view), mask, pair_keys, stations, residuals, *options)
+        return self._key("vote", self._camera(view), mask, pair_keys, stations, residuals, *options)
 
     def photometric(self, vote: str) -> str:
         """Of the photometric maps of the view with this vote."""
@@ -216,10 +224,6 @@ class Keys:
             self._options.fusion,
             [_digest_if_there(mask_path(folder, name)) for name in maps] if folder else [],
         )
-
-
-def _camera(view: View) -> tuple[object, ...]:
-    return view.name, view.width, view.height, view.K, view.R, view.t
 
 
 def _digest_if_there(path: Path) -> str | None:

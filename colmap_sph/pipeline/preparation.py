@@ -141,11 +141,11 @@ class Preparation:
         self.options = part.options
         return tuple(view.name for view in part.scene.views)
 
-    def expected(self) -> list[str]:
+    def expected(self) -> tuple[str, ...]:
         """Of `names`, those whose original images were not left out."""
         left_out = self._report.skipped_images
         original = self._originals.cuts.original
-        return [name for name in self.names if name == original(name) or original(name) not in left_out]
+        return tuple(name for name in self.names if name == original(name) or original(name) not in left_out)
 
     def run(self, executor: "Executor") -> None:
         """Make the workspace.
@@ -236,6 +236,12 @@ class Preparation:
         if not is_replaced and is_users_model(self.workspace):
             return f"{self.workspace.sparse_dir} was changed since this program made it"
         return reason_to_keep(self._originals.model, self.options.polish.poses)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether the workspace is there, as far as can be told without looking at its images."""
+        found = self._found
+        return found is not None and found.is_finished and self._is_model_there(found.images)
 
     def scene(self, results: Mapping[str, Result]) -> Scene | None:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""

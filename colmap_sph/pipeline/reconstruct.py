@@ -4,25 +4,22 @@ Stages talk through files in the workspace: disparity maps of pairs, photometric
 deviations, geometric maps, the cloud. What an earlier run finished with the same input is used as it is.
 """
 
-import logging
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from colmap_sph.errors import InputError, NoResultError, OptionError
-from colmap_sph.pipeline.context import Context, Until, timed_stage
+from colmap_sph.errors import NoResultError, OptionError
+from colmap_sph.pipeline.context import Context, Until
 from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import Executor, execute, executor_of
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.forecast.sizes import with_affordable_size
 from colmap_sph.pipeline.forecast.time_limit import TimeLimit, time_limit
 from colmap_sph.pipeline.forecast.within import Within, widest
-from colmap_sph.pipeline.input.good_images import with_good_images
-from colmap_sph.pipeline.keys import Keys, program_digests
+from colmap_sph.pipeline.input.prepared import prepare
+from colmap_sph.pipeline.input.start import start
+from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
-from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.report_files import command_of, keep_or_make_page, write_report
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
@@ -30,23 +27,15 @@ from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel
-from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
-from colmap_sph.project.files import make_dir
-from colmap_sph.project.polishing.polished import restore_given, starting_model
 from colmap_sph.project.project import Project, open_workspace
-from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.state.ownership import damaged_files, discard_results, named, results_of, take_places
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
-
-logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item", str, Pair)
 
@@ -134,42 +123,20 @@ def run_project(
     program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
     report = RunReport(command=command_of(project, options))
-    dense = Workspace(project.root)
-    if project.model is None:
-        dense = open_workspace(project)
-        with claimed(dense), executor_of(options, dense) as executor:
-            if overwrite:
-                discard_results(dense)
-            return reconstruct(
-                dense,
-                options,
-                executor=executor,
-                progress=progress,
-                report=report,
-                overwrite=overwrite,
-                verify=verify,
-                limit=limit,
-            )
+    dense = open_workspace(project) if project.model is None else Workspace(project.root)
     with claimed(dense), executor_of(options, dense) as executor:
-        preparation = Preparation(
-            project, options, overwrite=overwrite, verify=verify, progress=progress, report=report
+        prepared = prepare(
+            project, options, dense, executor, overwrite=overwrite, verify=verify, progress=progress, report=report
         )
-        preparation.run(executor)
-        given = preparation.given_model()
-        options = preparation.options
-        names = preparation.expected()
-        del preparation  # the model takes much memory
-        if given.reason_to_keep or not options.polish.is_wanted:
-            restore_given(dense)
         return reconstruct(
             dense,
-            options,
+            prepared.options,
             executor=executor,
-            expected=names,
+            expected=prepared.names,
             progress=progress,
             report=report,
             database=project.database(),
-            given=given,
+            given=prepared.given,
             overwrite=overwrite,
             verify=verify,
             limit=limit,
@@ -250,37 +217,22 @@ def reconstruct(
     report = report or RunReport()
     report.until = until
     options = options if limit is None else widest(options, limit)
-    make_dir(workspace.state_dir)
     with one_opencv_thread():
-        is_polishing = given is not None and options.polish.is_wanted
-        scene = read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir)
-        # Images that this program undistorted are no larger.
-        scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
-        context = Context(workspace, scene, options, Keys(workspace, options), progress, report).in_region()
-        options = context.options
-        for name in sorted({*expected} - scene.index_of.keys()):
-            if name not in report.skipped_images:
-                report.skipped_images[name] = "the model has no possible pose or calibration of it"
-                progress.leave_out("image", name, report.skipped_images[name])
-        context = with_good_images(context, executor, verify=verify)
-        scene = context.scene
-        if needs_all and report.skipped_images:
-            reason = next(iter(sorted(report.skipped_images.items())))[1]
-            raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
-        workspace.create_stereo_dirs(scene.index_of)
-        with timed_stage("select pairs", 1, progress, report):
-            key = context.keys.stage("selection", context.scene_key)
-            selection = choose_pairs(workspace, scene, options, database, pair_list, scene_key=key, keep=True)
-            report.pair_source = selection.source
-            progress.advance()
-        context = replace(context, scene=wanted_scene(scene, selection))
-        take_places(context.places_until(until), overwrite=overwrite)
-        if verify:
-            _verify(context)
-        if given is not None and is_polishing:
-            first = (MatchToPolishStage(context, selection.unique_pairs()),)
-            progress.foresee(foreseen_stages(context, selection.unique_pairs(), first))
-            context = with_polished_poses(context, selection.unique_pairs(), executor, given)
+        context, selection = start(
+            workspace,
+            options,
+            executor,
+            progress=progress,
+            report=report,
+            database=database,
+            expected=expected,
+            given=given,
+            overwrite=overwrite,
+            verify=verify,
+            until=until,
+            pair_list=pair_list,
+            needs_all=needs_all,
+        )
         judge_reprojection(report, context.scene)
         if limit is None:
             progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
@@ -294,20 +246,6 @@ def reconstruct(
     if until == "cloud" and not report.points:
         raise NoResultError(f"No point survived fusion. {report.advice}")
     return report
-
-
-def _verify(context: Context) -> None:
-    """Look at every byte of earlier results; what is damaged is not there for the stages that follow."""
-    results = list(results_of(context.workspace))
-    damaged = []
-    with timed_stage("verify", len(results), context.progress, context.report):
-        for result in results:
-            damaged += damaged_files(result)
-            context.progress.advance()
-    if damaged:
-        logger.warning("Damaged, and made again: %s", named(damaged))
-    else:
-        logger.info("No earlier result is damaged")
 
 
 def go_through_stages(
@@ -326,13 +264,13 @@ def go_through_stages(
         The last results to make.
     """
     check_numbers(context, pairs)
-    matched = _by_name(executor(MatchStage(context, context.order.sorted_pairs(pairs))))
+    matched = by_name(executor(MatchStage(context, context.order.sorted_pairs(pairs))))
     _judge_rows(context, matched)
-    votes = _by_name(executor(VoteStage(context, matched)))
+    votes = by_name(executor(VoteStage(context, matched)))
     if until == "photometric":
         report_photometric(context, votes)
         return
-    maps = _by_name(executor(ConfirmStage(context, matched, votes)))
+    maps = by_name(executor(ConfirmStage(context, matched, votes)))
     _join_views(context, maps, executor)
     if until == "cloud":
         executor(fuse_stage(context, keys_of(matched), maps))
@@ -343,7 +281,7 @@ def go_through_stages_within(within: Within, executor: Executor) -> Context:
     context, matched, votes = within.match_and_vote(executor)
     _judge_rows(context, matched)
     context = within.refined(context, matched, votes)
-    maps = _by_name(executor(ConfirmStage(context, matched, _by_name(votes))))
+    maps = by_name(executor(ConfirmStage(context, matched, by_name(votes))))
     _join_views(context, maps, executor)
     executor(fuse_stage(context, keys_of(matched), maps))
     return context
@@ -361,6 +299,6 @@ def _judge_rows(context: Context, matched: Mapping[Pair, Result]) -> None:
     judge_rows(context.report, context.scene, measured)
 
 
-def _by_name(results: Mapping[Item, Result]) -> dict[Item, Result]:
+def by_name(results: Mapping[Item, Result]) -> dict[Item, Result]:
     """Results in the order of their items' names, whatever the order in which they were worked on."""
     return {item: results[item] for item in sorted(results)}

@@ -1,4 +1,4 @@
-"""A workspace for one run alone: no link in it leads out, no other run is at work, nothing half-written left."""
+"""A workspace for one run, or for jobs that share it: no link leads out, and no other is at work there."""
 
 import fcntl
 import os
@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from colmap_sph.errors import OutputError
+from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.project.files import make_dir, remove, remove_temporary_files
 from colmap_sph.project.workspace import Workspace
 
@@ -37,6 +37,30 @@ def claimed(workspace: Workspace) -> Iterator[None]:
         for path in created:
             with suppress(OSError):  # not empty
                 path.rmdir()
+
+
+@contextmanager
+def shared(workspace: Workspace) -> Iterator[None]:
+    """Hold a workspace together with others that do so, but with nobody who holds it alone.
+
+    What other processes have not finished is left alone.
+
+    Raises
+    ------
+    OutputError
+        A run holds the workspace for itself, or its folder ``colmap_sph`` is not there.
+    """
+    try:
+        descriptor = os.open(workspace.state_dir, os.O_RDONLY)
+    except OSError as error:
+        raise OutputError(
+            f"{workspace.state_dir} cannot be used ({reason_of(error)}); check permissions."
+        ) from error
+    try:
+        _lock(descriptor, workspace, fcntl.LOCK_SH)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def check_links(workspace: Workspace, *, is_given: bool) -> None:
@@ -103,9 +127,9 @@ def _folders_and_links(folder: Path) -> list[Path]:
     return []
 
 
-def _lock(descriptor: int, workspace: Workspace) -> None:
+def _lock(descriptor: int, workspace: Workspace, kind: int = fcntl.LOCK_EX) -> None:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
     except BlockingIOError as error:
         raise OutputError(
             f"Another run is at work in {workspace.root}; wait for its end or choose another --output."

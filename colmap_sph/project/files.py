@@ -1,6 +1,7 @@
 """Folders and files made, read and removed for the user: errors are sentences, no file is ever half-written."""
 
 import errno
+import fcntl
 import os
 import re
 import shutil
@@ -221,6 +222,18 @@ def set_aside(path: Path) -> Path:
     except OSError as error:
         raise OutputError(f"{path} cannot be set aside ({reason_of(error)}); check permissions.") from error
     return backup
+
+
+@contextmanager
+def folder_locked(folder: Path) -> Iterator[None]:
+    """Wait until nobody else who calls this is at work in a folder; at once on disks that know no locks."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        with suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def remove_temporary_files(folder: Path) -> None:

@@ -171,11 +171,16 @@ def map_size(path: Path, channels: int = 1) -> tuple[int, int]:
     return width, height
 
 
+def depth_on_disk(path: Path) -> NDArray[np.float32]:
+    """A depth map as (H, W) values of which only what is looked at is read; `InputError` where it is damaged."""
+    start, size = _start_of(path)
+    shape, header = _parse_header(path, start, size, 1)
+    return np.memmap(path, "<f4", "r", header, shape)
+
+
 def has_depth(path: Path) -> bool:
     """Whether a depth map has a depth anywhere; it is read as far as the first one."""
-    start, size = _start_of(path)
-    (height, width), header = _parse_header(path, start, size, 1)
-    values = np.memmap(path, "<f4", "r", header, (height * width,))
+    values = depth_on_disk(path).reshape(-1)
     return any((values[first : first + _BAND_VALUES] > 0).any() for first in range(0, len(values), _BAND_VALUES))
 
 

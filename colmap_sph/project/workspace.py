@@ -88,6 +88,10 @@ class Workspace:
         """The log of all runs."""
         return self.state_dir / "log.txt"
 
+    def part_log_path(self, name: str) -> Path:
+        """The log of one of the jobs that share the workspace."""
+        return self.state_dir / "logs" / f"{name}.txt"
+
     @property
     def report_path(self) -> Path:
         """What the last run did."""
@@ -107,6 +111,11 @@ class Workspace:
     def within_path(self) -> Path:
         """What was chosen for a time."""
         return self.state_dir / "within.json"
+
+    @property
+    def georeference_path(self) -> Path:
+        """Where the model lies on the map, where that is known."""
+        return self.state_dir / "georeference.json"
 
     @property
     def given_model_dir(self) -> Path:

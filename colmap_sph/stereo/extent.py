@@ -4,6 +4,7 @@ On the sphere rows and columns are angles λ and θ, on the plane they are tange
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,8 @@ _ROW_MARGIN = 0.02
 _MARGIN_STEPS = 2
 # Rays at the sine of this to a plane, about 1°, or nearer meet it nowhere useful.
 _LEAST_STEEPNESS = 0.02
+# Views whose rays are kept: pairs are laid out in an order of place.
+_KEPT_VIEWS = 256
 
 # Centre and half width, radians.
 _Arc = tuple[float, float]
@@ -90,14 +93,18 @@ def extent_on_sphere(
         No plane through the baseline is in both images.
     """
     outlines = (outline_of(left), outline_of(right)) if outlines is None else outlines
-    centre, half = _common_arc(_row_arc(left, rotation, outlines[0]), _row_arc(right, rotation, outlines[1]))
+    views = (left, right)
+    # Rolled about the baseline they stay what they are.
+    signs = [_epipole_sign(view, rotation, outline) for view, outline in zip(views, outlines, strict=True)]
+    arcs = (_row_arc(*each, rotation) for each in zip(views, outlines, signs, strict=True))
+    centre, half = _common_arc(*arcs)
     if half <= 0:
         raise RectificationError("the two images share no epipolar plane")
     rotation = _rolled(rotation, centre)
     limit = float(np.arccos(min_cosine))
     columns: list[Range] = []
-    for view, outline in zip((left, right), outlines, strict=True):
-        low, high = _column_extent(view, rotation, outline, -half, half)
+    for each in zip(views, outlines, signs, strict=True):
+        low, high = _column_extent(*each, rotation, -half, half)
         columns.append((max(low, -limit), min(high, limit)))
     parallaxes = parallax_angles(left, right, rotation, points)
     seam = _SEAM_ROWS if half >= np.pi else 0
@@ -161,15 +168,34 @@ def _rolled(rotation: Float, angle: float) -> Float:
 
 def _border_rays(view: View, rotation: Float, outline: Float) -> Float:
     """(k n, 3) rays along an outline in the image, in the rectified frame, in order around it."""
+    return np.asarray(_world_rays(view, tuple(map(tuple, outline.tolist())))[0] @ rotation.T)
+
+
+@lru_cache(_KEPT_VIEWS)
+def _world_rays(view: View, corners: tuple[tuple[float, ...], ...]) -> tuple[Float, Float]:
+    """(k n, 3) and (m, 3) rays along an outline in the image and over what it surrounds, in the world frame.
+
+    Many pairs of a view ask for them, one soon after the other.
+    """
+    outline = np.array(corners)
     t = np.linspace(0, 1, _SIDE_SAMPLES)[:, None]
-    pixels = outline[:, None] + t * (np.roll(outline, -1, axis=0) - outline)[:, None]
-    return _rays(view, rotation, pixels.reshape(-1, 2))
+    border = outline[:, None] + t * (np.roll(outline, -1, axis=0) - outline)[:, None]
+    columns, rows = (np.linspace(*ends, _SIDE_SAMPLES) for ends in zip(*_box_of(outline), strict=True))
+    x, y = np.meshgrid(columns, rows)
+    grid = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
+    inner = grid[_is_within(outline, grid), :2]
+    return _rays(view, border.reshape(-1, 2)), _rays(view, inner)
 
 
-def _rays(view: View, rotation: Float, pixels: Float) -> Float:
-    """(n, 3) rays of pixels in the rectified frame."""
+def _box_of(outline: Float) -> tuple[Float, Float]:
+    """Least and largest x and y."""
+    return outline.min(axis=0), outline.max(axis=0)
+
+
+def _rays(view: View, pixels: Float) -> Float:
+    """(n, 3) rays of pixels in the world frame."""
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(view.K).T
-    return np.asarray(rays @ view.R @ rotation.T)
+    return np.asarray(rays @ view.R)
 
 
 def _is_within(outline: Float, pixels: Float) -> NDArray[np.bool_]:
@@ -181,16 +207,14 @@ def _is_within(outline: Float, pixels: Float) -> NDArray[np.bool_]:
 
 def _epipole_sign(view: View, rotation: Float, outline: Float) -> int:
     """+1 or -1 when the baseline's positive or negative direction lies inside the outline, else 0."""
-    for sign in (1, -1):
-        pixel = view.K @ view.R @ (sign * rotation[0])
-        if _is_within(outline, pixel[None])[0]:
-            return sign
-    return 0
+    epipole = view.K @ view.R @ rotation[0]
+    within = _is_within(outline, np.stack([epipole, -epipole]))
+    return int(within[0]) - int(within[1])
 
 
-def _row_arc(view: View, rotation: Float, outline: Float) -> _Arc:
-    """Centre and half width of the image's row angles; the half width is π when it holds an epipole."""
-    if _epipole_sign(view, rotation, outline):
+def _row_arc(view: View, outline: Float, sign: int, rotation: Float) -> _Arc:
+    """Centre and half width of the image's row angles; the half width is π when it holds an epipole, of `sign`."""
+    if sign:
         return 0.0, np.pi
     row_angles, _ = ray_angles(_border_rays(view, rotation, outline))
     # Without an epipole the image is a convex cone beside the axis: its arc is shorter than π.
@@ -210,20 +234,15 @@ def _common_arc(left: _Arc, right: _Arc) -> _Arc:
     return (low + high) / 2, (high - low) / 2
 
 
-def _column_extent(view: View, rotation: Float, outline: Float, low: float, high: float) -> Range:
+def _column_extent(view: View, outline: Float, sign: int, rotation: Float, low: float, high: float) -> Range:
     """Range of θ of the part inside an outline whose row angles lie in [low, high]."""
-    n = _SIDE_SAMPLES
-    first = outline.min(axis=0)
-    last = outline.max(axis=0)
-    x, y = np.meshgrid(np.linspace(first[0], last[0], n), np.linspace(first[1], last[1], n))
-    pixels = np.stack([x.ravel(), y.ravel(), np.ones(n * n)], axis=1)
-    inner_rays = _rays(view, rotation, pixels[_is_within(outline, pixels), :2])
-    row_angles, column_angles = ray_angles(np.concatenate([inner_rays, _border_rays(view, rotation, outline)]))
-    step_pixels = _MARGIN_STEPS * np.hypot(*(last - first)) / n
+    first, last = _box_of(outline)
+    border, inner = _world_rays(view, tuple(map(tuple, outline.tolist())))
+    row_angles, column_angles = ray_angles(np.concatenate([inner @ rotation.T, border @ rotation.T]))
+    step_pixels = _MARGIN_STEPS * np.hypot(*(last - first)) / _SIDE_SAMPLES
     margin = (high - low) * _ROW_MARGIN + step_pixels / view.K[0, 0]
     kept = column_angles[(row_angles > low - margin) & (row_angles < high + margin)]
     if not len(kept):
         return 0.0, 0.0
-    sign = _epipole_sign(view, rotation, outline)
     least, most = float(kept.min()), float(kept.max())
     return (-np.pi / 2 if sign < 0 else least), (np.pi / 2 if sign > 0 else most)

@@ -7,7 +7,7 @@ number of threads, with the maps of few images in memory, and the cloud is the s
 """
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +24,8 @@ from colmap_sph.stereo.partners.stations import OWN_STATION
 MAX_PARTNERS = 64
 # Points are made from so many pixels at a time: one that 50 images see takes 231 bytes.
 _BAND_PIXELS = 1 << 16
+# Code of a normal that is no unit vector.
+_NOT_PACKED = 3
 
 
 @dataclass(frozen=True)
@@ -125,6 +127,41 @@ class ViewMaps:
     def nbytes(self) -> int:
         """Bytes of the arrays."""
         return self.depth.nbytes + self.normals.nbytes + self.image.nbytes
+
+
+@dataclass(frozen=True, eq=False)
+class PackedMaps:
+    """The maps of a view in five sixths of the memory, from which they follow to the bit.
+
+    Attributes
+    ----------
+    maps : ViewMaps
+        With two planes of normals only, without the largest component of each.
+    codes : (H, W) uint8 ndarray
+        From which that follows.
+    """
+
+    maps: ViewMaps
+    codes: NDArray[np.uint8]
+
+    @staticmethod
+    def of(maps: ViewMaps) -> "PackedMaps | None":
+        """Pack maps; None where a normal is not as long as unit vectors are, but for rounding."""
+        pair = np.empty((2, *maps.depth.shape), np.float32)
+        codes = np.empty(maps.depth.shape, np.uint8)
+        _native.pack_normals(maps.normals, pair, codes)
+        return None if (codes == _NOT_PACKED).any() else PackedMaps(replace(maps, normals=pair), codes)
+
+    def unpacked(self) -> ViewMaps:
+        """The maps as they were."""
+        normals = np.empty((3, *self.codes.shape), np.float32)
+        _native.unpack_normals(self.maps.normals, self.codes, normals)
+        return replace(self.maps, normals=normals)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return self.maps.nbytes + self.codes.nbytes
 
 
 def fuse_view(

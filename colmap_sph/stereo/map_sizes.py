@@ -1,4 +1,4 @@
-"""Depth and normal maps → smaller ones, as if the image had fewer pixels."""
+"""Depth and normal maps → smaller ones, as if the image had fewer pixels; depth at pixels' centres."""
 
 from typing import Any
 
@@ -35,15 +35,47 @@ def reduced_maps(
     rows, row_of = _nearest(target.height, view.height)
     columns, column_of = _nearest(target.width, view.width)
     nearest = normals[:, row_of[:, None], column_of]
-    inverse = np.linalg.inv(view.K)
-    # On the plane n · z r = n · z' r', r and r' the rays of depth 1.
-    there = _along(nearest, inverse, row_of, column_of)
-    here = _along(nearest, inverse, rows, columns)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        factor = there / here
-    factor[~((factor > 1 / _MOST_CHANGE) & (factor < _MOST_CHANGE))] = 1.0
+    factor = _carried(nearest, view, (row_of, column_of), (rows, columns))
     reduced = depth[row_of[:, None], column_of] * factor
     return reduced.astype(np.float32), np.ascontiguousarray(nearest)
+
+
+def at_pixel_centres(depth: NDArray[np.float32], normals: NDArray[np.float32], view: View) -> NDArray[np.float32]:
+    """Take depth from where COLMAP's maps have it to the centres of the pixels, where other programs look for it.
+
+    COLMAP's maps hold at (col, row) the depth along the ray of the image point (col, row), half a pixel to the
+    upper left of the pixel's centre. Each depth is carried along its plane; without a normal it stays as it
+    is.
+
+    Parameters
+    ----------
+    depth, normals, view
+        As of `reduced_maps`.
+
+    Returns
+    -------
+    (H, W) float32 ndarray
+        z-depth along the ray K⁻¹ (col + 0.5, row + 0.5, 1).
+    """
+    rows = np.arange(view.height)
+    columns = np.arange(view.width)
+    factor = _carried(normals, view, (rows, columns), (rows + 0.5, columns + 0.5))
+    return np.asarray(depth * factor, np.float32)
+
+
+def _carried(
+    normals: NDArray[np.float32],
+    view: View,
+    there: tuple[NDArray[Any], NDArray[Any]],
+    here: tuple[NDArray[Any], NDArray[Any]],
+) -> NDArray[np.float64]:
+    """By what depth changes along its plane from rows and columns there to those here; 1 where it cannot tell."""
+    inverse = np.linalg.inv(view.K)
+    # On the plane n · z r = n · z' r', r and r' the rays of depth 1.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        factor = _along(normals, inverse, *there) / _along(normals, inverse, *here)
+    factor[~((factor > 1 / _MOST_CHANGE) & (factor < _MOST_CHANGE))] = 1.0
+    return factor
 
 
 def _nearest(count: int, of: int) -> tuple[NDArray[Any], NDArray[Any]]:

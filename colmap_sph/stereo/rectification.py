@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from colmap_sph.errors import OptionError, RectificationError
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Scene, View, observed_by
 from colmap_sph.stereo.disparity_range import (
     Range,
     bounded_range,
@@ -193,8 +193,7 @@ def _rectifying_rotation(left: View, right: View) -> Float:
 
 def _points_in_both(scene: Scene, left: View, right: View) -> Float:
     """Sparse points that one of the views observes and both have in view."""
-    indices = np.union1d(left.point_indices, right.point_indices)
-    points = scene.points[indices]
+    points = scene.points[observed_by(left, right)[0]]
     for view in (left, right):
         points = points[sees(view, points)]
     return points

@@ -7,9 +7,10 @@ from colmap_sph.scene import Scene
 from colmap_sph.stereo.partners.pairing import partners_of
 from colmap_sph.stereo.partners.pairs import Overlap, PairOptions, select_pairs
 from colmap_sph.stereo.partners.places import Places
+from colmap_sph.stereo.partners.reads import best_order
 
-# Bytes per pixel in memory: of the maps of a view with its image, and of an estimate with the grey image.
-_FUSED_BYTES = 19
+# Bytes per pixel in memory: of the packed maps of a view with its image, and of an estimate with the grey image.
+_FUSED_BYTES = 16
 _CHECKED_BYTES = 10
 _PARTNERS = 50
 
@@ -31,7 +32,10 @@ def _in_both_orders(
     scene: Scene, partners: Mapping[str, Sequence[str]], size: float, memory: float, *, knows_future: bool
 ) -> tuple[float, float]:
     names = list(scene.index_of)
-    in_place = Places(scene).sorted(names)
+    places = Places(scene)
+    in_place: Sequence[str] = places.sorted(names)
+    if knows_future:
+        in_place = best_order((in_place, *places.in_strips(names)), partners, dict.fromkeys(names, size), memory)
     return (
         _reads(in_place, partners, size, memory, knows_future=knows_future) / len(names),
         _reads(names, partners, size, memory, knows_future=False) / len(names),

@@ -98,6 +98,37 @@ FUNCTION(
     "What keeps a partner from agreeing with pixels: 0 unseen, 1 depth, 2 normal, 3 nothing; and the distance of\n"
     "their projections from the centre of the partner's pixel.");
 
+/* ---- less memory ------------------------------------------------------------------------------------------- */
+
+#define PACK_NORMALS(X) \
+    X(IN, float32, normals, 3, H, W) \
+    X(OUT, float32, pair, 2, H, W) \
+    X(OUT, uint8, codes, H, W)
+#define UNPACK_NORMALS(X) \
+    X(IN, float32, pair, 2, H, W) \
+    X(IN, uint8, codes, H, W) \
+    X(OUT, float32, normals, 3, H, W)
+ARGUMENTS(pack_normals, PACK_NORMALS);
+ARGUMENTS(unpack_normals, UNPACK_NORMALS);
+
+static int run_pack_normals(void *arguments) {
+    const pack_normals_arguments *a = arguments;
+    pack_normals(a->normals, a->size.H * a->size.W, a->pair, a->codes);
+    return 0;
+}
+
+static int run_unpack_normals(void *arguments) {
+    const unpack_normals_arguments *a = arguments;
+    unpack_normals(a->pair, a->codes, a->size.H * a->size.W, a->normals);
+    return 0;
+}
+
+FUNCTION(
+    pack_normals, PACK_NORMALS, any,
+    "Two components of each unit vector, and a code from which the largest follows to the bit; code 3: it does\n"
+    "not.");
+FUNCTION(unpack_normals, UNPACK_NORMALS, any, "What was packed.");
+
 /* ---- points ------------------------------------------------------------------------------------------------ */
 
 #define FUSED_ROWS(X) \
@@ -179,5 +210,10 @@ FUNCTION(write_points, WRITE_POINTS, check_write_points,
          "Points as in a PLY file: position and normal as float32, red, green, blue; and for each the number of\n"
          "views that see it, and their indices. POINTS and WORDS are what count_points returns.");
 
-native_function *const fusion_functions[] = {&fuse_partner_function, &find_gates_function, &count_points_function,
-                                             &write_points_function, NULL};
+native_function *const fusion_functions[] = {&fuse_partner_function,
+                                             &find_gates_function,
+                                             &pack_normals_function,
+                                             &unpack_normals_function,
+                                             &count_points_function,
+                                             &write_points_function,
+                                             NULL};

@@ -49,6 +49,11 @@ void find_gates(const view_maps *reference, const view_maps *partner, const fusi
 void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
                   const fusion_transfer *transfer, fusion_gates gates, int bit, const fusion_verdict *verdict);
 
+/* Unit vectors (three planes) as two of their components (two planes) and a code, and back to the same bits. Of
+ * each pixel the largest component is left out; (0, 0, 0) is none. Code 3: it cannot be packed. */
+void pack_normals(const float *normals, ptrdiff_t pixels, float *pair, uint8_t *codes);
+void unpack_normals(const float *pair, const uint8_t *codes, ptrdiff_t pixels, float *normals);
+
 /* Rows of a view's pixels that are to become points: not covered, and seen from this many stations, its own among
  * them. Partners of one station have bits beside each other. */
 typedef struct {

@@ -70,20 +70,21 @@ def estimated_fusion(context: Context) -> StageEstimate:
     return StageEstimate(FuseStage.name, parts, parts * each, each)
 
 
-def estimate(stage: Stage[Any, Any], asked: int = _ASKED) -> StageEstimate:
-    """Estimate what a stage will take from so many of its items."""
-    jobs = list(_some_jobs(stage, asked))
+def estimate(stage: Stage[Any, Any], asked: int = _ASKED, *, items: Sequence[Any] | None = None) -> StageEstimate:
+    """Estimate what a stage, or some items of it, will take from so many of these."""
+    items = stage.items if items is None else items
+    jobs = list(_some_jobs(stage, asked, items))
     to_make = [job.cost.seconds for job in jobs if job.done is None]
     each = sum(to_make) / max(len(to_make), 1)
     share = len(to_make) / max(len(jobs), 1)
-    return StageEstimate(stage.name, len(stage.items), share * each * len(stage.items), each)
+    return StageEstimate(stage.name, len(items), share * each * len(items), each)
 
 
-def _some_jobs(stage: Stage[Any, Any], asked: int) -> Iterator[Job[Any]]:
-    number = len(stage.items)
+def _some_jobs(stage: Stage[Any, Any], asked: int, items: Sequence[Any]) -> Iterator[Job[Any]]:
+    number = len(items)
     asked = min(number, asked)
     for index in range(asked):
         try:
-            yield stage.job(stage.items[index * number // asked])
+            yield stage.job(items[index * number // asked])
         except ColmapSphError:  # the stage itself will tell
             continue

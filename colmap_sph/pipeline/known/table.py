@@ -16,7 +16,7 @@ import msgspec
 import xxhash
 
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.files import atomic_file, folder_locked, make_dir
 from colmap_sph.project.state.records import read_json
 
 _MAX_BYTES = 1 << 31
@@ -73,17 +73,20 @@ class ResultTable:
         kept = {item: known for item, known in results.items() if known.stamp}
         if all(self._known.get(item) == known for item, known in kept.items()):
             return
-        content = msgspec.Raw(msgspec.json.encode(self._known | kept))
         make_dir(self._path.parent)
-        with atomic_file(self._path, sync=False) as file:  # it can be found out again
-            file.write(msgspec.json.encode(_TableFile(self._key, _check(self._key, content), content)))
+        with folder_locked(self._path.parent):
+            # Jobs that share the workspace add theirs. What is lost where there are no locks is found out again.
+            there = ResultTable(self._path, self._key)._known
+            content = msgspec.Raw(msgspec.json.encode(there | kept))
+            with atomic_file(self._path, sync=False) as file:  # it can be found out again
+                file.write(msgspec.json.encode(_TableFile(self._key, _check(self._key, content), content)))
 
 
 def stamp_of_files(paths: Iterable[str]) -> str:
     """What changes whenever the content of one of some files may have; empty where one is no regular file.
 
     That is their sizes, their places on the disk, and the times of the last changes of content, and of size or
-    times.
+    times. Not the number of the disk, which each machine that shares it gives it.
     """
     words = []
     for path in paths:
@@ -93,7 +96,7 @@ def stamp_of_files(paths: Iterable[str]) -> str:
             return ""
         if not stat.S_ISREG(status.st_mode):
             return ""
-        words += [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_dev, status.st_ino]
+        words += [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
     return xxhash.xxh3_64_hexdigest(repr(words).encode())
 
 

@@ -176,6 +176,11 @@ class CheckStage(Stage[str, ImageFile]):
         self._known = {} if context.keys.fresh or verify else read_known(self._file, self._key)
         self._seen: dict[str, Known] = {}
 
+    @property
+    def is_new(self) -> bool:
+        """Whether nothing is known of any image yet."""
+        return not self._known
+
     def job(self, item: str) -> Job[ImageFile]:
         """See `Stage.job`."""
         image = ImageFile(self._places.path(item), self._sizes[item], self._detail_sizes.get(item))
@@ -244,6 +249,9 @@ def details_of(results: Mapping[str, Result]) -> dict[str, float]:
 
 
 def _stamp_of(path: Path) -> tuple[int, ...]:
-    """What changes whenever a file's content may have: also the time of the last change of its size or times."""
+    """What changes whenever a file's content may have: also the time of the last change of its size or times.
+
+    Not the number of its disk, which each machine that shares it gives it.
+    """
     status = path.stat()
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_dev, status.st_ino
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino

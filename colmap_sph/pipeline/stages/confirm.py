@@ -55,12 +55,13 @@ _loaded: LoadCache[NDArray[np.uint8] | DepthEstimate] = LoadCache(
 
 @dataclass(frozen=True, eq=False)
 class EstimateFile:
-    """A view without its sparse points, its image, and its photometric depth; and what of it is worked on."""
+    """A view without its sparse points, its image, its photometric depth and the key of that, and its window."""
 
     whole: View
     window: Window
     image: Path
     estimate: Path
+    key: str
 
     @property
     def view(self) -> View:
@@ -124,8 +125,8 @@ def _usual(residuals: Sequence[float]) -> float:
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
-    key = f"estimate {file_stamp(file.estimate)}"
-    estimate = _loaded.get(key, lambda: read_estimate(file.estimate, file.view))
+    key = f"estimate {file_stamp(file.estimate)} {file.key}"
+    estimate = _loaded.get(key, lambda: read_estimate(file.estimate, file.view, file.key))
     assert isinstance(estimate, DepthEstimate)
     return estimate
 
@@ -215,7 +216,11 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         context = self.context
         view = context.scene.view(name).without_points()
         return EstimateFile(
-            view, context.window(name), context.workspace.image_path(name), context.estimate_path(name)
+            view,
+            context.window(name),
+            context.workspace.image_path(name),
+            context.estimate_path(name),
+            self._vote_keys[name],
         )
 
     def _cost(self, name: str) -> Cost:

@@ -5,7 +5,6 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +21,8 @@ from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.images.reading import bytes_to_reduce
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.scene import Region
-from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
+from colmap_sph.stereo.fusion import FusionOptions, PackedMaps, ViewMaps, fuse_view
+from colmap_sph.stereo.partners.reads import best_order
 from colmap_sph.stereo.region.inside import pixels_inside
 
 if TYPE_CHECKING:
@@ -41,8 +41,11 @@ _PARTNER_SECONDS = 0.011
 # Bytes per pixel: of the maps of a view with its image; largest in use while a view is fused.
 _MAPS_BYTES = 19.0
 _FUSE_BYTES = 60.0
+# Of maps that are packed; and what unpacking those of a view and of a partner takes.
+_PACKED_BYTES = 16.0
+_UNPACKING_BYTES = 24.0
 
-_maps: LoadCache[ViewMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
+_maps: LoadCache[ViewMaps | PackedMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +53,7 @@ class FuseTask:
     """A view to fuse, those that overlap it, what to add to its points, and the path of its part less suffixes.
 
     Of a `region`, in the scene's frame, only the points inside are made. `needed` says when the maps of the view
-    and of each partner are needed next, see `LoadCache.get`.
+    and of each partner are needed next, see `LoadCache.get`. `is_packed` says that they are kept in less memory.
     """
 
     reference: MapSources
@@ -62,37 +65,42 @@ class FuseTask:
     region: Region | None = None
     needed: tuple[float, ...] = ()
     with_visibility: bool = True
+    is_packed: bool = False
 
 
 def make_cloud_part(task: FuseTask) -> Facts:
     """Fuse a view; writes the points of the cloud which it sees better than any other."""
     needed = task.needed or (0.0,) * (1 + len(task.partners))
-    reference = _view_maps(task.reference, needed[0])
+    reference = _view_maps(task.reference, needed[0], task.is_packed)
     if task.region is not None:
         inside = pixels_inside(reference.view, reference.depth, task.region)
         reference = replace(reference, depth=np.where(inside, reference.depth, np.float32(0)))
     unread: dict[str, str] = {}
-    partners = _partner_maps(task.partners, needed[1:], unread)
+    partners = _partner_maps(task, needed[1:], unread)
     bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
     points = write_part(task.stem, bands, with_visibility=task.with_visibility)
     return Facts(points=points, unread=unread)
 
 
-def _view_maps(sources: MapSources, needed: float) -> ViewMaps:
+def _view_maps(sources: MapSources, needed: float, is_packed: bool) -> ViewMaps:
     files = (sources.depth, sources.normals, sources.image, sources.mask)
     stamps = [file_stamp(file) for file in files if file is not None]
     size = (sources.view.width, sources.view.height)
-    return _maps.get(f"{sources.index} {size} {stamps}", lambda: read_view_maps(sources), needed)
+
+    def load() -> ViewMaps | PackedMaps:
+        maps = read_view_maps(sources)
+        return (PackedMaps.of(maps) or maps) if is_packed else maps
+
+    maps = _maps.get(f"{sources.index} {size} {stamps}", load, needed)
+    return maps.unpacked() if isinstance(maps, PackedMaps) else maps
 
 
-def _partner_maps(
-    partners: Sequence[MapSources], needed: Sequence[float], unread: dict[str, str]
-) -> Iterator[ViewMaps | None]:
+def _partner_maps(task: FuseTask, needed: Sequence[float], unread: dict[str, str]) -> Iterator[ViewMaps | None]:
     """Maps of the partners; None for one whose maps cannot be read, and the reason in `unread`."""
-    for sources, when in zip(partners, needed, strict=True):
+    for sources, when in zip(task.partners, needed, strict=True):
         maps: ViewMaps | None
         try:
-            maps = _view_maps(sources, when)
+            maps = _view_maps(sources, when, task.is_packed)
         except InputError as error:
             unread[sources.view.name] = str(error)
             maps = None
@@ -127,6 +135,8 @@ class PartsStage(Stage[str, FuseTask]):
         super().__init__(context, context.order.sorted(names))
         self._names = names
         self._is_open = False
+        self._is_packed = False
+        self._needed: dict[str, tuple[float, ...]] = {}
         self._scratch = context.workspace.fusion_scratch_dir
         self._key = ""
 
@@ -134,17 +144,6 @@ class PartsStage(Stage[str, FuseTask]):
     @abstractmethod
     def partners(self) -> Partners:
         """Of each image."""
-
-    @cached_property
-    def needed(self) -> dict[str, tuple[float, ...]]:
-        """When the maps of each image and of its partners are needed next, as numbers of items."""
-        needed = {}
-        next_of: dict[str, float] = {}
-        for number, item in reversed(list(enumerate(self.items))):
-            names = [item, *self.partners[item][0]]
-            needed[item] = tuple(next_of.get(name, math.inf) for name in names)
-            next_of |= dict.fromkeys(names, float(number))
-        return needed
 
     @property
     @abstractmethod
@@ -157,7 +156,7 @@ class PartsStage(Stage[str, FuseTask]):
         pixels = scene.view(item).num_pixels
         partners, stations = self.partners[item]
         seconds = seconds_per_megapixel(len(partners))
-        memory = _FUSE_BYTES * pixels + bytes_to_reduce(*map(scene.view, [item, *partners]))
+        memory = self._item_bytes * pixels + bytes_to_reduce(*map(scene.view, [item, *partners]))
         cost = Cost(seconds * pixels / 1e6, memory, CLOUD_BYTES * pixels)
         task = FuseTask(
             self.sources[item],
@@ -167,8 +166,9 @@ class PartsStage(Stage[str, FuseTask]):
             scene.anchor,
             self._stem(item),
             self.region,
-            self.needed[item] if self._is_open else (),
+            self._needed.get(item, ()),
             self.with_visibility,
+            self._is_packed,
         )
         return Job(self._key, None, cost, task)
 
@@ -185,16 +185,34 @@ class PartsStage(Stage[str, FuseTask]):
     @contextmanager
     def in_scratch(self) -> Iterator[None]:
         """Parts are made in a folder that is there until this ends."""
-        self._is_open = bool(self.needed)  # found once, and not by every worker at a time
+        self._is_open = True
         with scratch_folder(self._scratch):
             yield
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
-        """See `Stage.kept_memory`."""
-        pixels = [view.num_pixels for view in map(self.context.scene.view, self.items)]
-        filled = _MAPS_BYTES * sum(pixels)
-        spare = gate.spare(2 * _FUSE_BYTES * max(pixels, default=0)) / 2
-        return Kept(cache=int(min(filled, spare)), caches=1, filled=filled)
+        """See `Stage.kept_memory`; where maps are to be made, the order of the work is chosen for it."""
+        pixels = {name: self.context.scene.view(name).num_pixels for name in self.items}
+        filled = _MAPS_BYTES * sum(pixels.values())
+        largest = max(pixels.values(), default=0)
+        whole, packed = (
+            gate.spare(2 * each * largest) / 2 for each in (_FUSE_BYTES, _FUSE_BYTES + _UNPACKING_BYTES)
+        )
+        self._is_packed = whole < filled and packed / _PACKED_BYTES > whole / _MAPS_BYTES
+        cache = int(min(filled, packed if self._is_packed else whole))
+        if self._is_open:  # once, and not by every worker at a time
+            partners = {name: self.partners[name][0] for name in self.items}
+            if cache < filled:
+                orders = (self.items, *self.context.order.in_strips(self.items))
+                each = _PACKED_BYTES if self._is_packed else _MAPS_BYTES
+                sizes = {name: each * number for name, number in pixels.items()}
+                self.items = best_order(orders, partners, sizes, cache)
+            self._needed = _next_uses(self.items, partners)
+        return Kept(cache=cache, caches=1, filled=filled)
+
+    @property
+    def _item_bytes(self) -> float:
+        """Largest in use while a view is fused, per pixel."""
+        return _FUSE_BYTES + (_UNPACKING_BYTES if self._is_packed else 0.0)
 
     def _report_unread(self, results: Mapping[str, Result]) -> bool:
         """Report images whose maps could not be read while others were fused; whether there are any."""
@@ -204,6 +222,17 @@ class PartsStage(Stage[str, FuseTask]):
                 continue
             self.context.leave_incomplete(name, f"the cloud lacks its agreement with other images: {reason}")
         return bool(unread)
+
+
+def _next_uses(items: Sequence[str], partners: Mapping[str, Sequence[str]]) -> dict[str, tuple[float, ...]]:
+    """When the maps of each image and of its partners are needed next, as numbers of items."""
+    needed = {}
+    next_of: dict[str, float] = {}
+    for number, item in reversed(list(enumerate(items))):
+        names = [item, *partners[item]]
+        needed[item] = tuple(next_of.get(name, math.inf) for name in names)
+        next_of |= dict.fromkeys(names, float(number))
+    return needed
 
 
 def index_in_model(context: "Context") -> dict[str, int]:

@@ -173,6 +173,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         super().__init__(context, pairs)
         self._scratch_bytes = _SCRATCH_BYTES
         self._unfit: set[Pair] = set()
+        self._photos: dict[str, PhotoFile] = {}
         self._usual_detail = float(np.median([*context.details.values()] or [1.0]))
 
     def input_key(self) -> str:
@@ -246,8 +247,12 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         return min(_TRIAL_SAMPLING * pixels_per_radian / geometry.columns_per_radian, 1.0)
 
     def _photo(self, view: View) -> PhotoFile:
-        workspace = self.context.workspace
-        return PhotoFile(view.without_points(), workspace.image_path(view.name), workspace.mask_path(view.name))
+        if view.name not in self._photos:
+            workspace = self.context.workspace
+            self._photos[view.name] = PhotoFile(
+                view.without_points(), workspace.image_path(view.name), workspace.mask_path(view.name)
+            )
+        return self._photos[view.name]
 
     def label(self, item: Pair) -> str:
         """See `Stage.label`."""

@@ -12,6 +12,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.errors import InputError
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.state.array_file import ArrayType, Head, read_arrays, read_head, write_arrays
@@ -70,14 +71,15 @@ def write_pair(
     return _facts(residual, pair.geometry)
 
 
-def read_pair(path: Path) -> PairDisparity:
-    """Read a pair's disparity map; `InputError` where the file is missing or damaged."""
-    return read_pair_with_ties(path)[0]
+def read_pair(path: Path, key: str | None = None) -> PairDisparity:
+    """Read a pair's disparity map; `InputError` where the file is missing, damaged, or not of the key, if any."""
+    return read_pair_with_ties(path, key)[0]
 
 
-def read_pair_with_ties(path: Path) -> tuple[PairDisparity, Ties]:
-    """Read a pair's disparity map and its ties; `InputError` where the file is missing or damaged."""
+def read_pair_with_ties(path: Path, key: str | None = None) -> tuple[PairDisparity, Ties]:
+    """Read a pair's disparity map and its ties; raises as `read_pair`."""
     head, (codes, *tables) = read_arrays(path, _PAIR, lambda head: _array_types(head, _geometry_of(head)))
+    _check_key(path, head, key)
     least, step = head.numbers[:2]
     disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
     disparity[codes == 0] = np.nan
@@ -144,10 +146,19 @@ def write_estimate(path: Path, estimate: DepthEstimate, key: str) -> None:
     write_arrays(path, _ESTIMATE, key, [estimate.depth, estimate.sigma, estimate.support])
 
 
-def read_estimate(path: Path, view: View) -> DepthEstimate:
-    """Read what was voted for a view; `InputError` where it is missing, damaged or of another size."""
-    _, arrays = read_arrays(path, _ESTIMATE, lambda _: _estimate_types(view))
+def read_estimate(path: Path, view: View, key: str | None = None) -> DepthEstimate:
+    """Read what was voted for a view; `InputError` where it is missing, damaged, or of another size or key."""
+    head, arrays = read_arrays(path, _ESTIMATE, lambda _: _estimate_types(view))
+    _check_key(path, head, key)
     return DepthEstimate(*arrays)
+
+
+def _check_key(path: Path, head: Head, key: str | None) -> None:
+    """Raise `InputError` for what was not made under the key that it must have."""
+    if key is not None and head.key != key:
+        raise InputError(
+            f"{path} was made anew with other options meanwhile; end other runs there, and run again."
+        )
 
 
 def is_estimate_there(path: Path, key: str, view: View) -> bool:

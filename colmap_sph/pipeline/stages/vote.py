@@ -55,6 +55,7 @@ class VoteTask:
 
     view: View
     pairs: tuple[Path, ...]
+    pair_keys: tuple[str, ...]
     mask: Path
     estimate: Path
     is_voted: bool
@@ -76,7 +77,7 @@ def make_photometric_maps(task: VoteTask) -> Facts:
     view = task.window.view(task.view)
     # A worker that was lost may have come so far.
     is_voted = task.is_voted or is_estimate_there(task.estimate, task.vote_key, view)
-    estimate = read_estimate(task.estimate, view) if is_voted else _vote(task, view)
+    estimate = read_estimate(task.estimate, view, task.vote_key) if is_voted else _vote(task, view)
     normals, depth = fit_normals(view, estimate, task.normal_options)
     drop_other_depths(depth, task.depths)
     drop_outside(view, depth, region_of(task.focus))
@@ -86,7 +87,7 @@ def make_photometric_maps(task: VoteTask) -> Facts:
 
 
 def _vote(task: VoteTask, view: View) -> DepthEstimate:
-    pairs = (read_pair(file) for file in task.pairs)
+    pairs = (read_pair(file, key) for file, key in zip(task.pairs, task.pair_keys, strict=True))
     estimate = vote_depth(view, pairs, task.vote_options, task.stations, task.residuals)
     mask = read_view_mask(task.mask, task.view)
     if mask is not None:
@@ -192,6 +193,7 @@ class VoteStage(RememberingStage[str, VoteTask]):
         task = VoteTask(
             view.without_points(),
             files,
+            tuple(keys),
             context.workspace.mask_path(item),
             estimate,
             is_voted,

@@ -4,7 +4,7 @@ What is read for one view, images and maps of its partners, then serves many tha
 work is done, and has no part in what comes out.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import cv2
 import numpy as np
@@ -15,6 +15,8 @@ from colmap_sph.stereo.partners.pairing import Pair
 
 # Cells of the curve along each axis: 2 to this power.
 _BITS = 16
+# Rows of views, were they on a grid, to a strip.
+_PER_STRIP = (1, 2, 3, 4, 6)
 # Points of a view that tell where it looks.
 _MOST_POINTS = 64
 
@@ -35,6 +37,25 @@ class Places:
         """Names of views, in the order of their places."""
         names = sorted(names)
         return [names[k] for k in self._order([self._cells[name] for name in names])]
+
+    def in_strips(self, names: Iterable[str]) -> Iterator[list[str]]:
+        """Names of views in other orders: there and back along strips, which are of several widths and both ways.
+
+        Where a cache holds hardly more than what one view looks at, strips of the right width load less than a
+        curve that keeps to no direction.
+        """
+        names = sorted(names)
+        cells = np.array([self._cells[name] for name in names], np.int64).reshape(-1, 2)
+        cells = cells - cells.min(axis=0, initial=1 << _BITS)
+        extents = cells.max(axis=0, initial=0) + 1
+        for across in (0, 1):
+            extent, beside = extents[[across, 1 - across]]
+            rows = max((len(names) * extent / beside) ** 0.5, 1.0)  # of a grid of so many views
+            for per_strip in _PER_STRIP:
+                strips = max(round(rows / per_strip), 1)
+                strip = cells[:, across] * strips // extent
+                along = np.where(strip % 2, -1, 1) * cells[:, 1 - across]
+                yield [names[k] for k in np.lexsort((along, strip))]
 
     def sorted_pairs(self, pairs: Iterable[Pair]) -> list[Pair]:
         """Pairs, in the order of the places between their views."""

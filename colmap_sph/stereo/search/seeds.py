@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Scene, View, observed_by
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordinates_of_rays
 
 Seeds = NDArray[np.floating]
@@ -32,7 +32,7 @@ _EQUALLY_FINE = 1.02
 
 def shared_points(scene: Scene, left: View, right: View) -> Float:
     """(n, 3) sparse points that both views observe, world frame."""
-    return scene.points[np.intersect1d(left.point_indices, right.point_indices)]
+    return scene.points[observed_by(left, right)[1]]
 
 
 def finer_first(points: Float, first: View, second: View) -> tuple[View, View]:

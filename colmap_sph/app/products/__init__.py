@@ -1,0 +1,1 @@
+"""The commands that make products of a finished workspace."""

@@ -1,0 +1,118 @@
+"""A dense workspace with its images → the scene to reconstruct and the pairs to match: how every run begins."""
+
+import logging
+from collections.abc import Collection
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from colmap_sph.errors import InputError
+from colmap_sph.pipeline.context import Context, Until, timed_stage
+from colmap_sph.pipeline.forecast.foresight import foreseen_stages
+from colmap_sph.pipeline.input.good_images import with_good_images
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
+from colmap_sph.pipeline.report import Progress, RunReport
+from colmap_sph.pipeline.stages.polish import GivenModel
+from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
+from colmap_sph.project.files import make_dir
+from colmap_sph.project.polishing.polished import starting_model
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.ownership import damaged_files, named, results_of, take_places
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.partners.pairs import PairSelection
+
+if TYPE_CHECKING:
+    from colmap_sph.pipeline.execute import Executor
+
+logger = logging.getLogger(__name__)
+
+
+def start(
+    workspace: Workspace,
+    options: RunOptions,
+    executor: "Executor",
+    *,
+    progress: Progress,
+    report: RunReport,
+    database: Path | None = None,
+    expected: Collection[str] = (),
+    given: GivenModel | None = None,
+    overwrite: bool = False,
+    verify: bool = False,
+    until: Until = "cloud",
+    pair_list: Path | None = None,
+    needs_all: bool = False,
+) -> tuple[Context, PairSelection]:
+    """Check the images, choose the pairs, and polish the poses where that is asked for.
+
+    Parameters
+    ----------
+    workspace, options, executor, progress, report, database, expected, given, overwrite, verify, until, pair_list
+        See `reconstruct`.
+    needs_all
+        See `reconstruct`.
+
+    Returns
+    -------
+    context : Context
+        Of the images that are to be matched.
+    selection : PairSelection
+    """
+    make_dir(workspace.state_dir)
+    is_polishing = given is not None and options.polish.is_wanted
+    scene = read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir)
+    # Images that this program undistorted are no larger.
+    scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
+    context = Context(workspace, scene, options, Keys(workspace, options), progress, report).in_region()
+    _report_missing(context, expected)
+    context = with_good_images(context, executor, verify=verify)
+    if needs_all and report.skipped_images:
+        reason = next(iter(sorted(report.skipped_images.items())))[1]
+        raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
+    workspace.create_stereo_dirs(context.scene.index_of)
+    selection = _selection(context, database, pair_list)
+    context = replace(context, scene=wanted_scene(context.scene, selection))
+    take_places(context.places_until(until), overwrite=overwrite)
+    if verify:
+        _verify(context)
+    if given is not None and is_polishing:
+        pairs = selection.unique_pairs()
+        progress.foresee(foreseen_stages(context, pairs, (MatchToPolishStage(context, pairs),)))
+        context = with_polished_poses(context, pairs, executor, given)
+    return context, selection
+
+
+def _report_missing(context: Context, expected: Collection[str]) -> None:
+    """Report images that the workspace's model does not have, though it was made of them."""
+    skipped = context.report.skipped_images
+    for name in sorted({*expected} - context.scene.index_of.keys() - skipped.keys()):
+        skipped[name] = "the model has no possible pose or calibration of it"
+        context.progress.leave_out("image", name, skipped[name])
+
+
+def _selection(context: Context, database: Path | None, pair_list: Path | None) -> PairSelection:
+    with timed_stage("select pairs", 1, context.progress, context.report):
+        key = context.keys.stage("selection", context.scene_key)
+        selection = choose_pairs(
+            context.workspace, context.scene, context.options, database, pair_list, scene_key=key, keep=True
+        )
+        context.report.pair_source = selection.source
+        context.progress.advance()
+    return selection
+
+
+def _verify(context: Context) -> None:
+    """Look at every byte of earlier results; what is damaged is not there for the stages that follow."""
+    results = list(results_of(context.workspace))
+    damaged = []
+    with timed_stage("verify", len(results), context.progress, context.report):
+        for result in results:
+            damaged += damaged_files(result)
+            context.progress.advance()
+    if damaged:
+        logger.warning("Damaged, and made again: %s", named(damaged))
+    else:
+        logger.info("No earlier result is damaged")

@@ -1,0 +1,94 @@
+"""The geometric maps of a workspace → depth at the centres of pixels, with the camera that has these."""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.map_files import has_depth, map_size, read_depth_map, read_normal_planes
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.map_sizes import at_pixel_centres
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, eq=False)
+class DepthAtCentres:
+    """Depth of a view where its pixels' centres are.
+
+    Attributes
+    ----------
+    view : View
+        With as many pixels as the maps have.
+    depth : (H, W) float32 ndarray
+        z-depth along K⁻¹ (col + 0.5, row + 0.5, 1), model units; 0 = none.
+    normals : (H, W, 3) float32 ndarray
+        Unit vectors in the camera's frame, towards the camera; 0 = none.
+    """
+
+    view: View
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class MappedScene:
+    """The scene of a workspace, of views that have geometric maps, each with as many pixels as these."""
+
+    workspace: Workspace
+    scene: Scene
+
+    def maps(self) -> Iterator[DepthAtCentres]:
+        """The maps of one view after the other."""
+        for view in self.scene.views:
+            yield self.maps_of(view)
+
+    def maps_of(self, view: View) -> DepthAtCentres:
+        """The maps of a view; `InputError` where they are damaged."""
+        depth = read_depth_map(self.workspace.depth_map_path(view.name, "geometric"))
+        path = self.workspace.normal_map_path(view.name, "geometric")
+        if path.is_file() and map_size(path, 3) == (view.width, view.height):
+            normals = read_normal_planes(path)
+        else:
+            normals = np.zeros((3, *depth.shape), np.float32)
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        centred = at_pixel_centres(depth, normals, view)
+        return DepthAtCentres(view, centred, np.ascontiguousarray(normals.transpose(1, 2, 0)))
+
+
+def mapped_scene(workspace: Workspace) -> MappedScene:
+    """Read the scene of a workspace, without views that have no geometric depth.
+
+    Raises
+    ------
+    InputError
+        None has, or the model cannot be read.
+    """
+    scene = read_scene(workspace.sparse_dir)
+    views = []
+    for view in scene.views:
+        path = workspace.depth_map_path(view.name, "geometric")
+        if path.is_file() and has_depth(path):
+            views.append(at_map_size(view, path))
+    if not views:
+        raise InputError(
+            f"{workspace.root} has no geometric depth map; run `colmap_sph run --workspace {workspace.root}` "
+            "first."
+        )
+    if len(views) < len(scene.views):
+        logger.warning("%d of %d images have no depth; left out", len(scene.views) - len(views), len(scene.views))
+    return MappedScene(workspace, replace(scene, views=tuple(views)))
+
+
+def at_map_size(view: View, path: Path) -> View:
+    """A view with as many pixels as its depth map has; `InputError` where that has another shape."""
+    width, height = map_size(path)
+    if not view.may_be_reduced_to(width, height):
+        raise InputError(f"{path} has another shape than its image; delete it and compute it again.")
+    return view.resized(width, height)

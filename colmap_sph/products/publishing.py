@@ -1,0 +1,91 @@
+"""Files and folders that other libraries write: in their places only when all is complete, and marked as ours."""
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+
+from colmap_sph.errors import OutputError, reason_of
+from colmap_sph.project.files import make_dir, sync_file, sync_folder
+
+MARK = "made_by_colmap_sph.txt"
+"""A file in each folder that an export made, and may replace."""
+
+
+@contextmanager
+def published(path: Path) -> Iterator[Path]:
+    """A temporary path for a file, which becomes `path` when all went well, and is removed when not.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written: a full disk, permissions, a folder in the way.
+    """
+    make_dir(path.parent)
+    temporary = path.parent / f".{path.name}.part"
+    try:
+        temporary.unlink(missing_ok=True)  # of a process that was killed
+        if path.is_dir():
+            raise OutputError(f"{path} is a folder, and a file goes there; remove it or choose another --output.")
+        yield temporary
+        sync_file(temporary)
+        temporary.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written ({reason_of(error)}); check space and permissions, or choose another "
+            "--output."
+        ) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def scratch_beside(path: Path) -> Iterator[Path]:
+    """An empty folder beside a temporary path, which is removed with all that is in it."""
+    folder = path.with_name(f"{path.name}.parts")
+    shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def published_folder(path: Path) -> Iterator[Path]:
+    """An empty folder under a temporary name, which becomes `path` when all went well.
+
+    A folder of an earlier export in its place is removed.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written, or something else is in its place.
+    """
+    check_replaceable(path)
+    make_dir(path.parent)
+    with scratch_beside(path.parent / f".{path.name}") as scratch:
+        made = scratch / "made"
+        try:
+            made.mkdir()
+            yield made
+            (made / MARK).write_text(f"Made by colmap_sph {version('colmap_sph')}, which replaces this folder.\n")
+            if path.exists():
+                shutil.rmtree(path)
+            made.replace(path)
+            sync_folder(path.parent)
+        except OSError as error:
+            raise OutputError(
+                f"{path} cannot be written ({reason_of(error)}); check space and permissions, or choose another "
+                "--output."
+            ) from error
+
+
+def check_replaceable(path: Path) -> None:
+    """Raise `OutputError` where something is in the way that no export has made."""
+    if os.path.lexists(path) and not (path / MARK).is_file():
+        raise OutputError(f"{path} is there already, and no export made it; choose another --output.")
