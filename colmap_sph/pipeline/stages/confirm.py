@@ -187,7 +187,8 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
         sights = self.context.sparse_tracks.sights(item).between(options.rectification.depths)
-        residuals = [self._residuals[as_pair(item, name)] for name in partners]
+        lead_of = self.context.lead
+        residuals = [self._residuals[as_pair(lead_of(item), lead_of(name))] for name in partners]
         cut = self.context.cut(item)
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights, cut)
         maps = self.context.map_files(item, "geometric")
@@ -203,14 +204,18 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
             options.refinement,
             options.rectification.depths,
             self.context.focus,
-            tuple(self._all_partners.get(item, [])),
+            tuple(self._matched(item)),
             maps,
             key,
         )
         return Job(key, self.found(task), self._cost(item), task)
 
     def _partners(self, name: str) -> list[str]:
-        return [other for other in self._all_partners.get(name, []) if other in self._vote_keys]
+        facing = self.context.facing.views(name, self._matched(name))
+        return [other for views in facing for other in views if other in self._vote_keys]
+
+    def _matched(self, name: str) -> list[str]:
+        return self._all_partners.get(self.context.lead(name), [])
 
     def _estimate_file(self, name: str) -> EstimateFile:
         context = self.context
@@ -298,7 +303,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
 
     def _why_empty(self, name: str) -> str:
         """Why an image has no depth, as far as it is known."""
-        if name not in self._all_partners:
+        if not self._matched(name):
             return "no pair of it could be matched"
         if self._voted.get(name, 0.0) > 0:
             return "no depth of it is confirmed by another image"
