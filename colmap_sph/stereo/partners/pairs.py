@@ -38,7 +38,7 @@ class PairOptions:
     """Which pairs of images are matched."""
 
     num_pairs: int = 10
-    """Partners of each image, at most; the views that were cut from one photograph are one partner."""
+    """Partners of each image, at most."""
 
     min_triangulation_angle: float = 1.0
     """Least parallax of a pair in degrees: its 75th percentile over the points that both images see."""
