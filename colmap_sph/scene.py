@@ -101,6 +101,11 @@ class View:
         return self.original or self.name
 
     @property
+    def views(self) -> tuple["View", ...]:
+        """Itself: a photograph that was not cut up is its only view."""
+        return (self,)
+
+    @property
     def num_pixels(self) -> int:
         """Pixels of the image."""
         return self.width * self.height
@@ -206,6 +211,57 @@ class View:
             return homogeneous[:, :2] / homogeneous[:, 2:], camera[:, 2]
 
 
+@dataclass(frozen=True, eq=False)
+class Photograph:
+    """One photograph: a view, or several that were cut from it and have one centre.
+
+    Attributes
+    ----------
+    name : str
+        See `View.photograph`.
+    views : tuple of View
+        In the order of the scene.
+    """
+
+    name: str
+    views: tuple[View, ...]
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) projection centre in the world frame."""
+        return self.views[0].center
+
+    @property
+    def viewing_direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector, world frame: the mean of its views' axes; zero where it looks all around."""
+        if len(self.views) == 1:
+            return self.views[0].viewing_direction
+        mean = np.mean([view.viewing_direction for view in self.views], axis=0)
+        length = float(np.linalg.norm(mean))
+        return np.asarray(mean / length if length > _LEAST_MEAN_AXIS else np.zeros(3))
+
+    @cached_property
+    def point_indices(self) -> NDArray[np.int64]:
+        """(n,) rows of `Scene.points` which any of its views observes, ascending, each once."""
+        if len(self.views) == 1:
+            return self.views[0].point_indices
+        return np.unique(np.concatenate([view.point_indices for view in self.views]))
+
+    @property
+    def num_pixels(self) -> int:
+        """Pixels of all its images together."""
+        return sum(view.num_pixels for view in self.views)
+
+    @property
+    def lead(self) -> View:
+        """The first of its views: by its name pairs of photographs are called."""
+        return self.views[0]
+
+
+# Axes whose mean is shorter than this look all around.
+_LEAST_MEAN_AXIS = 0.2
+
+
 def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:
     """Return the (3, 4) matrix [A | a] from pixels of one view to those of another.
 
@@ -221,7 +277,9 @@ def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:
     )
 
 
-def observed_by(first: View, second: View) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def observed_by(
+    first: View | Photograph, second: View | Photograph
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Sparse points that one of two views observes, and those that both do: rows of `Scene.points`, ascending.
 
     Examples
@@ -265,6 +323,22 @@ class Scene:
     def index_of(self) -> dict[str, int]:
         """Position in `views` of each image name."""
         return {view.name: index for index, view in enumerate(self.views)}
+
+    @cached_property
+    def photographs(self) -> tuple[Photograph, ...]:
+        """All photographs, in the order of their first views; where none was cut up, these are the views."""
+        views: dict[str, list[View]] = {}
+        for view in self.views:
+            views.setdefault(view.photograph, []).append(view)
+        return tuple(Photograph(name, tuple(cut)) for name, cut in views.items())
+
+    @cached_property
+    def _photograph_of(self) -> dict[str, Photograph]:
+        return {view.name: photograph for photograph in self.photographs for view in photograph.views}
+
+    def photograph(self, name: str) -> Photograph:
+        """Return the photograph that shows in the view of image `name`, which there must be."""
+        return self._photograph_of[name]
 
     @property
     def has_tracks(self) -> bool:

@@ -205,16 +205,16 @@ def test_cameras_of_different_size_and_focal_length(block: DemoBlock, tmp_path: 
     assert_true_depths(block, done.dense, {name: name for name in NADIR}, coverage=0.3)
 
 
-def test_panorama(block: DemoBlock, tmp_path: Path, command) -> None:
+def test_fisheye_whose_polynomial_turns_back(block: DemoBlock, tmp_path: Path, command) -> None:
     model = make_block_project(tmp_path, block, {name: block_camera(block, name) for name in NADIR})
     reconstruction = pycolmap.Reconstruction(model)
     camera = reconstruction.camera(1)
-    camera.model = pycolmap.CameraModelId.EQUIRECTANGULAR
-    camera.params = [WIDTH, HEIGHT]
+    camera.model = pycolmap.CameraModelId.SIMPLE_RADIAL_FISHEYE
+    camera.params = [60.0, WIDTH / 2, HEIGHT / 2, -0.3]
     reconstruction.write_binary(model)
     done = command(model)
     assert done.code == 2
-    assert "is a panorama" in done.output
+    assert "calibrate it again" in done.output
     assert not done.dense.exists()
 
 

@@ -233,7 +233,7 @@ def test_rectified_images_are_cut_to_what_shows_the_region(block: DemoBlock, sur
             continue
         tried += 1
         whole = rectify_pair(scene, scene.view(first.name), scene.view(second.name), options)
-        outlines = (focus.outline(first), focus.outline(second))
+        outlines = ([focus.outline(first)], [focus.outline(second)])
         pair = rectify_pair(part, first, second, options, outlines=outlines)
         assert pair.height * pair.left_width < 0.8 * whole.height * whole.left_width
         sides: list[tuple[Side, View]] = [("left", first), ("right", second)]

@@ -275,7 +275,7 @@ def test_a_pair_that_cannot_be_made(prepared: Project, monkeypatch: pytest.Monke
     make_pair = MatchStage.make
 
     def fails(task: MatchTask) -> Facts:
-        if {task.left.view.name, task.right.view.name} == {"N_0_0.jpg", "N_0_1.jpg"}:
+        if {task.left[0].view.name, task.right[0].view.name} == {"N_0_0.jpg", "N_0_1.jpg"}:
             raise InputError("the disk has a hole.")
         return make_pair(task)
 

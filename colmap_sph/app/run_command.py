@@ -259,6 +259,9 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     terminal.table("Depth maps", ["image", "coverage", "agreement"], rows, caption)
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
     facts = [("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")]
+    if report.originals:
+        mean = sum(report.originals.values()) / len(report.originals)
+        facts.append(("originals", f"{len(report.originals)} of which these are views, mean coverage {mean:.1%}"))
     if report.region is not None:
         left = f"; {len(report.out_of_region)} left out that see too little of it" if report.out_of_region else ""
         facts.append(("region", f"in {len(report.coverage)} images, of whose pixels in it coverage is{left}"))

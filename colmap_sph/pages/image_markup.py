@@ -31,9 +31,11 @@ _COLUMNS = [
 def image_values(content: Content, run: RunFacts) -> dict[str, Any]:
     """Values of the template for the images, and for the cameras and footprints on the map."""
     partners: list[list[PairFacts]] = [[] for _ in content.images]
+    scene = content.scene
     for pair in content.pairs:
-        partners[pair.left].append(pair)
-        partners[pair.right].append(pair)
+        for place in (pair.left, pair.right):
+            for view in scene.photograph(scene.views[place].name).views:
+                partners[scene.index_of[view.name]].append(pair)
     left_out = [
         *run.skipped_images.items(),
         *((name, f"incomplete: {why}") for name, why in run.incomplete.items()),

@@ -28,6 +28,7 @@ from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.partners.facing import Facing
 from colmap_sph.stereo.partners.pairs import overlapping_views
 
 # Points of an image's surface, to stand for it where there is no cloud; of the cloud, to frame the map.
@@ -174,11 +175,13 @@ class _Block:
         """The images that each was matched with, or else those that share most points with it."""
         if not self.pairs:
             return overlapping_views(self.scene, _GUESSED_PARTNERS)
-        views = self.scene.views
-        partners: dict[str, list[str]] = {view.name: [] for view in views}
+        facing = Facing(self.scene)
+        partners: dict[str, list[str]] = {view.name: [] for view in self.scene.views}
         for pair in self.pairs:
-            partners[views[pair.left].name].append(views[pair.right].name)
-            partners[views[pair.right].name].append(views[pair.left].name)
+            names = [self.scene.views[place].name for place in (pair.left, pair.right)]
+            for own, other in (names, reversed(names)):
+                for view in self.scene.photograph(own).views:
+                    partners[view.name] += facing.views(view.name, [other])[0]
         return partners
 
     def _choose_shown(self) -> set[str]:

@@ -25,7 +25,7 @@ class PairFacts:
     Attributes
     ----------
     left, right : int
-        Places of its views in the scene.
+        Places of its views in the scene; of a photograph that was cut into several, that of the first.
     angle : float or None
         Parallax at the points that both see, degrees; None where they share none.
     rows : float or None
@@ -70,7 +70,7 @@ def pairs_of(
 
 def _angle(scene: Scene, left: str, right: str, surface: NDArray[np.float64] | None) -> float | None:
     """Parallax of a pair, degrees."""
-    views = scene.view(left), scene.view(right)
+    views = scene.photograph(left), scene.photograph(right)
     rows = np.intersect1d(views[0].point_indices, views[1].point_indices, assume_unique=True)
     points = scene.points[rows[:: -(-len(rows) // _MOST_POINTS) or 1]]
     if not len(points) and surface is not None:

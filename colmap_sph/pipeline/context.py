@@ -24,6 +24,7 @@ from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Region, Scene
 from colmap_sph.stereo.agreement import SparseTracks
 from colmap_sph.stereo.extent import outline_of
+from colmap_sph.stereo.partners.facing import Facing
 from colmap_sph.stereo.partners.places import Places
 from colmap_sph.stereo.partners.stations import Stations
 from colmap_sph.stereo.region.core import core_of
@@ -73,7 +74,7 @@ class Context:
         """Digest of all that stages look at in the scene and in the region, and of what is known of the images."""
         views = self.scene.views
         return digest(
-            [(view.name, view.image_id, view.width, view.height, view.full_size) for view in views],
+            [(view.name, view.image_id, view.width, view.height, view.full_size, view.original) for view in views],
             [np.array([getattr(view, name) for view in views]) for name in ("K", "R", "t", "reprojection_error")],
             [view.point_indices for view in views],
             self.scene.points,
@@ -86,6 +87,15 @@ class Context:
     def stations(self) -> Stations:
         """Which images stand side by side: what is too near to be matched."""
         return Stations(self.scene, self.options.pairs.min_triangulation_angle)
+
+    def lead(self, name: str) -> str:
+        """What pairs call an image by: itself, or the first of those that were cut from the same photograph."""
+        return self.scene.photograph(name).lead.name
+
+    @cached_property
+    def facing(self) -> Facing:
+        """Which views of a photograph that was cut up see what others see."""
+        return Facing(self.scene)
 
     @cached_property
     def order(self) -> Places:
@@ -156,6 +166,13 @@ class Context:
     def sparse_tracks(self) -> SparseTracks:
         """Which images observe each sparse point."""
         return SparseTracks(self.scene, self.region)
+
+    def pair_paths(self, a: str, b: str) -> list[Path]:
+        """Disparity maps of a pair: two where one of its images was cut up, so that each sees half of it finer."""
+        path = self.pair_path(a, b)
+        if all(len(self.scene.photograph(name).views) == 1 for name in (a, b)):
+            return [path]
+        return [path, path.with_name("-".join(reversed(path.stem.split("-"))) + SUFFIX)]
 
     def pair_path(self, a: str, b: str) -> Path:
         """Disparity map of a pair: named by COLMAP's image ids, since names may hold anything.

@@ -57,7 +57,7 @@ def check_fusion(context: Context) -> None:
     COLMAP's fusion counts several pixels of one image, too.
     """
     options = context.options.fusion
-    images = len(context.scene.views)
+    images = len(context.scene.photographs)
     if options.method == "colmap":
         return
     if options.min_num_pixels > images:

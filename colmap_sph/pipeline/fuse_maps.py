@@ -17,7 +17,7 @@ from colmap_sph.pipeline.stages.fuse_to import FuseToStage
 from colmap_sph.pipeline.stages.fusion_partners import PartnersInFusion
 from colmap_sph.pipeline.stages.fusion_parts import index_in_model
 from colmap_sph.pipeline.stages.selection import choose_pairs
-from colmap_sph.pipeline.stages.view_maps import MapSources
+from colmap_sph.pipeline.stages.view_maps import MapSources, views_beside
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.cloud_output import CloudOutput
@@ -180,5 +180,6 @@ def _sources(context: Context, mapped: dict[str, View]) -> dict[str, MapSources]
             whole_digests(place.record, 2) if is_ours else None,
             place.record if is_ours else None,
             None if (map_view.width, map_view.height) == (view.width, view.height) else map_view.without_points(),
+            views_beside(context.scene, view.name),
         )
     return sources

@@ -8,7 +8,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import program_digest
 from colmap_sph.project.sparse_model import model_files
 from colmap_sph.project.workspace import Workspace, mask_path
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Photograph, Scene, View
 from colmap_sph.stereo.agreement import SparseSights
 from colmap_sph.stereo.rectified_pair import RectifiedPair
 from colmap_sph.stereo.search.seeds import Seeds
@@ -24,6 +24,7 @@ _MAKERS = {
         "polish": "polish",
         "vote": "vote",
         "geometric": "confirm",
+        "range": "wide.range_maps",
         "cloud": "fuse",
     }.items()
 }
@@ -122,14 +123,17 @@ class Keys:
             Of the original, where there is one.
         """
         mask_digest = None if mask is None or self.fresh else file_digest(mask)
-        return self._key("undistorted", image, camera, values, mask_digest, self._options.undistortion)
+        size = self._options.undistortion.max_image_size
+        return self._key("undistorted", image, camera, values, mask_digest, size)
 
-    def pair(self, left: View, right: View, geometry: RectifiedPair, seeds: Seeds, trial: float) -> str:
+    def pair(
+        self, left: Photograph, right: Photograph, geometry: RectifiedPair, seeds: Seeds, trial: float
+    ) -> str:
         """Of a disparity map.
 
         Parameters
         ----------
-        left, right : View
+        left, right : Photograph
         geometry : RectifiedPair
             In which the options of rectification are, too.
         seeds : (n, 3) float32 ndarray
@@ -137,10 +141,15 @@ class Keys:
         trial : float
             Share of its rows and columns that the pair is matched at first, see `MatchTask`; 1 without.
         """
-        images = [self._image(view.name) for view in (left, right)]
-        masks = [self._mask(view.name) for view in (left, right)]
-        cameras = [self._camera(view) for view in (left, right)]
+        views = [list(photograph.views) for photograph in (left, right)]
+        images = [[self._image(view.name) for view in cut] for cut in views]
+        masks = [[self._mask(view.name) for view in cut] for cut in views]
+        cameras = [[self._camera(view) for view in cut] for cut in views]
         return self._key("pair", images, masks, cameras, geometry, seeds, trial, self._matching)
+
+    def both_ways(self, keys: Sequence[str]) -> str:
+        """Of the disparity maps of a pair that is matched both ways, from the keys of each."""
+        return self._key("pair", "both ways", keys)
 
     def polish(self, pairs: Sequence[tuple[str, str]], model_dir: Path) -> str:
         """Of the polished model, from the pairs to match and the folder of the given model."""
@@ -193,6 +202,10 @@ class Keys:
         options += tuple(cut)
         return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)
 
+    def range_map(self, maps: Sequence[str], cuts: Sequence[object]) -> str:
+        """Of the range map of a wide image, from the keys of its views' geometric maps and how they were cut."""
+        return self._key("range", maps, cuts)
+
     def cloud(self, maps: Mapping[str, str], pairs: object, scene: Scene) -> str:
         """Of the cloud, from the keys of the geometric maps of the images to fuse.
 
@@ -213,7 +226,7 @@ class Keys:
             maps,
             [self._image(name) for name in maps],
             pairs,
-            (scene.origin, scene.anchor, scene.image_ids, [view.name for view in scene.views]),
+            (scene.origin, scene.anchor, scene.image_ids, [(view.name, view.original) for view in scene.views]),
             [] if self.fresh else [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
             self._options.fusion,
             [_digest_if_there(mask_path(folder, name)) for name in maps] if folder else [],

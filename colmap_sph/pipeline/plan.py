@@ -17,6 +17,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import with_polished_poses
 from colmap_sph.pipeline.reconstruct import check_input, go_through_stages
 from colmap_sph.pipeline.report import RunReport
+from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.project.files import free_space
 from colmap_sph.project.project import Project
 from colmap_sph.project.state.ownership import foreign_files, named
@@ -109,7 +110,7 @@ def make_plan(
         choice = f"{choice} {chosen.words}".lstrip()
     go_through_stages(context, pairs_to_match, survey)
     stages = survey.stages
-    pairs, _, maps, cloud = stages[-4:]
+    pairs, _, maps, cloud = [stage for stage in stages if stage.name != RangeStage.name][-4:]
     return Plan(
         undistort=bool(foreseen.to_make),
         pair_source=selection.source,

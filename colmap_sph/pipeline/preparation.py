@@ -6,8 +6,7 @@ says of itself that it is not finished, and that the next run goes on with.
 
 import logging
 import os
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,8 +87,8 @@ class Preparation:
     options : RunOptions
         As given, but for a region that was to be drawn: they have what was.
     names : tuple of str
-        Sorted names of the registered images of the original model, where a region is asked for of those that show
-        it.
+        Sorted names of the registered images of the original model, and of the views that are cut from wide ones;
+        where a region is asked for of those that show it.
 
     Raises
     ------
@@ -110,13 +109,13 @@ class Preparation:
         report: RunReport | None = None,
     ) -> None:
         self.workspace = Workspace(project.root)
-        self._originals = read_originals(project)
+        self._originals = read_originals(project, options.undistortion)
         self._originals.check_outside(self.workspace)
         self.options = options
         self._report = report or RunReport()
         self._overwrite = overwrite
         self._verify = verify
-        self._marker = Marker(self._originals.model_digest(), asdict(options.undistortion))
+        self._marker = Marker(self._originals.model_digest(), options.undistortion.of_marker(self._originals.cuts))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
         self.names = self._names()
         originals = self._originals
@@ -132,7 +131,7 @@ class Preparation:
         )
 
     def _names(self) -> tuple[str, ...]:
-        names = tuple(image_names(self._originals.model))
+        names = tuple(self._originals.cuts.names(image_names(self._originals.model)))
         if not self.options.region:
             return names
         scene = anchored(foreseen_scene(self._originals, names, self.options.undistortion))
@@ -141,6 +140,12 @@ class Preparation:
         part = whole.in_region()
         self.options = part.options
         return tuple(view.name for view in part.scene.views)
+
+    def expected(self) -> tuple[str, ...]:
+        """Of `names`, those whose original images were not left out."""
+        left_out = self._report.skipped_images
+        original = self._originals.cuts.original
+        return tuple(name for name in self.names if name == original(name) or original(name) not in left_out)
 
     def run(self, executor: "Executor") -> None:
         """Make the workspace.
@@ -158,13 +163,15 @@ class Preparation:
         """Go through the first stage: check the original images; return the results of the good ones."""
         originals = self._originals
         cameras = cameras_of_images(originals.model)
-        sizes = {name: (cameras[name].width, cameras[name].height) for name in self.names if name in cameras}
+        names = sorted(set(map(originals.cuts.original, self.names)))
+        sizes = {name: (cameras[name].width, cameras[name].height) for name in names if name in cameras}
         places = ImagePlaces("originals", originals.model_dir, originals.image_dir)
         return executor(CheckStage(self._context, sizes, places, verify=self._verify or self._overwrite))
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""
         found = self._found
+        images = self._wanted(images)
         missing = [name for name in images if self._overwrite or not self.workspace.image_path(name).exists()]
         if missing:  # a workspace that is there needs no more space
             check_space(self._originals, missing, self.workspace.root, self.options.undistortion)
@@ -179,6 +186,11 @@ class Preparation:
         if found is None or not found.is_finished:
             write_marker(self.workspace, self._marker)
         self._found = found
+
+    def _wanted(self, originals: Iterable[str]) -> list[str]:
+        """What is wanted of what comes in place of original images."""
+        wanted = set(self.names)
+        return [name for name in self._originals.cuts.names(originals) if name in wanted]
 
     def undistort(self, executor: "Executor", images: Mapping[str, Result]) -> dict[str, Result]:
         """Go through the second stage: undistort the images that `check` found good; return their results."""
@@ -218,6 +230,8 @@ class Preparation:
         return GivenModel(originals.model_dir, originals.image_dir, self._reason_to_keep_poses())
 
     def _reason_to_keep_poses(self) -> str:
+        if self._originals.cuts.views:
+            return "views that are cut from one image have its pose"
         is_replaced = self._found is None or self._overwrite
         if not is_replaced and is_users_model(self.workspace):
             return f"{self.workspace.sparse_dir} was changed since this program made it"

@@ -29,6 +29,7 @@ from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
+from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.pipeline.workers import one_opencv_thread
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.project import Project, open_workspace
@@ -151,7 +152,7 @@ def check_input(project: Project, options: RunOptions, limit: TimeLimit | None =
             raise OptionError("--within knows this machine alone; leave out it or --scheduler.")
     project.check()
     check_links(Workspace(project.root), is_given=project.workspace is not None)
-    if project.model is None and options.undistortion != UndistortionOptions():
+    if project.model is None and options.undistortion.max_image_size != UndistortionOptions().max_image_size:
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
     if project.model is None and options.polish.is_wanted:
         raise OptionError(
@@ -270,6 +271,7 @@ def go_through_stages(
         report_photometric(context, votes)
         return
     maps = by_name(executor(ConfirmStage(context, matched, votes)))
+    _join_views(context, maps, executor)
     if until == "cloud":
         executor(fuse_stage(context, keys_of(matched), maps))
 
@@ -280,8 +282,16 @@ def go_through_stages_within(within: Within, executor: Executor) -> Context:
     _judge_rows(context, matched)
     context = within.refined(context, matched, votes)
     maps = by_name(executor(ConfirmStage(context, matched, by_name(votes))))
+    _join_views(context, maps, executor)
     executor(fuse_stage(context, keys_of(matched), maps))
     return context
+
+
+def _join_views(context: Context, maps: Mapping[str, Result], executor: Executor) -> None:
+    """Make the range maps of wide images, where there are any."""
+    stage = RangeStage(context, maps)
+    if stage.items:
+        executor(stage)
 
 
 def _judge_rows(context: Context, matched: Mapping[Pair, Result]) -> None:

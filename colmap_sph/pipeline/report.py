@@ -123,6 +123,8 @@ class RunReport:
     coverage : dict
         Image name → share of its pixels with a geometric depth (photometric, where these are the last results): of
         those that show the region, where one is asked for.
+    originals : dict
+        Fisheye image or panorama → share of what its lens shows that has a range; empty without any.
     agreement : dict
         Image name → share of the sparse points it observes that agree with its geometric depth map; None where
         fewer than ten tell.
@@ -174,6 +176,7 @@ class RunReport:
     in_region: dict[str, float] = field(default_factory=dict)
     out_of_region: dict[str, str] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)
+    originals: dict[str, float] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None
     sparse_points: Agreement = field(default_factory=Agreement)

@@ -1,17 +1,15 @@
 """Cameras: all that this package knows of COLMAP's camera models.
 
 The method sees pinholes only. Every other model reaches it undistorted, by COLMAP, and here is what must be known
-of a model for that: whether it maps as a pinhole does, what to refuse, and where COLMAP needs help. A camera model
-that is new in COLMAP's library works where the answers here, which come from the library, are right for it; one
-that needs more (a panorama, say) enters here.
+of a model for that: whether it maps as a pinhole does, and where COLMAP needs help. A camera model that is new in
+COLMAP's library works where the answers here, which come from the library, are right for it. Fisheyes and
+panoramas, which no single pinhole can show, are the business of `project/wide`.
 """
 
 import copy
 
 import numpy as np
 import pycolmap
-
-from colmap_sph.errors import InputError
 
 
 def is_pinhole(camera: pycolmap.Camera) -> bool:
@@ -34,16 +32,6 @@ def make_pinhole(camera: pycolmap.Camera) -> None:
     K = camera.calibration_matrix()
     camera.model = pycolmap.CameraModelId.PINHOLE
     camera.params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-
-
-def refuse_panoramas(model: pycolmap.Reconstruction) -> None:
-    """Raise `InputError` where a camera of a model has no pinhole equivalent."""
-    for camera in model.cameras.values():
-        if camera.is_spherical():
-            raise InputError(
-                f"Camera {camera.camera_id} is a panorama ({camera.model_name}); "
-                "render perspective images from it and register those."
-            )
 
 
 def plain_camera(camera: pycolmap.Camera) -> pycolmap.Camera:

@@ -133,6 +133,7 @@ def pairs_on_disk(workspace: Workspace, scene: Scene) -> list[tuple[str, str]]:
     for path in sorted(workspace.pairs_dir.rglob(f"*{SUFFIX}"), key=lambda path: path.name):
         found = _PAIR_FILE.fullmatch(path.name)
         ids = [int(digits[:18]) for digits in found.groups()] if found else []
-        if ids and all(each in name_of for each in ids):
+        # The largest first: a second map of the pair, the other way round.
+        if ids and ids[0] < ids[1] and all(each in name_of for each in ids):
             pairs.append((name_of[ids[0]], name_of[ids[1]]))
     return pairs

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -15,6 +15,8 @@ from colmap_sph.project.cameras import is_pinhole
 from colmap_sph.project.given.binary_arrays import Observations, read_observations, read_points
 from colmap_sph.project.map_coordinates import is_plausible, local_origin
 from colmap_sph.project.sparse_model import is_text, load_model, model_files
+from colmap_sph.project.wide.cuts import Cut
+from colmap_sph.project.wide.table import read_cuts
 from colmap_sph.scene import Scene, View
 
 logger = logging.getLogger(__name__)
@@ -42,16 +44,22 @@ def read_scene(sparse_dir: Path) -> Scene:
     Raises
     ------
     InputError
-        No readable model in the folder, no registered image, or a distorted camera.
+        No readable model in the folder, no registered image, a distorted camera, or damaged `wide_images.json`.
     """
     files = model_files(sparse_dir)
     model = load_model(sparse_dir)
-    return _scene(model, sparse_dir, _of_library(model) if is_text(files) else _of_files(files))
+    sparse = _of_library(model) if is_text(files) else _of_files(files)
+    return _scene(model, sparse_dir, sparse, read_cuts(sparse_dir))
 
 
-def scene_of_model(model: pycolmap.Reconstruction, sparse_dir: Path) -> Scene:
-    """Return the scene of a model read from `sparse_dir`, and maybe changed since; see `read_scene`."""
-    return _scene(model, sparse_dir, _of_library(model))
+def scene_of_model(
+    model: pycolmap.Reconstruction, sparse_dir: Path, cuts: Mapping[str, Cut] | None = None
+) -> Scene:
+    """Return the scene of a model read from `sparse_dir`, and maybe changed since; see `read_scene`.
+
+    `cuts` says from which image views were cut, by their names.
+    """
+    return _scene(model, sparse_dir, _of_library(model), cuts or {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +91,7 @@ def _observations(image: pycolmap.Image) -> Observations:
     return Observations(xy, np.array([point.point3D_id for point in points2D], np.int64))
 
 
-def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse) -> Scene:
+def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse, cuts: Mapping[str, Cut]) -> Scene:
     origin = local_origin(model)
     if origin.any():
         logger.info("%s is in map coordinates; worked on relative to %s", sparse_dir, tuple(origin.tolist()))
@@ -98,6 +106,8 @@ def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse) ->
     for image_id, observations in sparse.observations:
         if image_id in registered:
             view = _read_view(model, image_id, sparse_dir, origin)
+            if view.name in cuts:
+                view = replace(view, original=cuts[view.name].original)
             views[image_id] = _with_observations(view, observations, rows_of, points)
     usable = [views[image_id] for image_id in model.reg_image_ids() if _is_possible(views[image_id])]
     for view in views.values():

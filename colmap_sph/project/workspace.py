@@ -226,6 +226,10 @@ class Workspace:
         """Normal map of image `name`."""
         return self.stereo_dir / "normal_maps" / f"{checked_name(name)}.{kind}.bin"
 
+    def range_map_path(self, original: str) -> Path:
+        """Map of the range of wide image `original`, of which views were cut."""
+        return self.stereo_dir / "range_maps" / f"{checked_name(original)}.exr"
+
     def create_stereo_dirs(self, names: Iterable[str]) -> None:
         """Create the folders that the maps of images `names` and our own state go to.
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 
 from colmap_sph.errors import RectificationError
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.rectified_pair import Float, ray_angles
 
 Range = tuple[float, float]
@@ -29,12 +29,12 @@ _MOST_TIMES = 4
 _DIGITS = 11
 
 
-def parallax_angles(left: View, right: View, rotation: Float, points: Float) -> Float:
+def parallax_angles(left: View | Photograph, right: View | Photograph, rotation: Float, points: Float) -> Float:
     """Parallaxes of points on the sphere.
 
     Parameters
     ----------
-    left, right : View
+    left, right : View or Photograph
     rotation : (3, 3) float64 ndarray
         World to rectified frame.
     points : (n, 3) float64 ndarray

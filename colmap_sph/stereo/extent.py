@@ -15,7 +15,7 @@ from colmap_sph.stereo.disparity_range import Range, parallax_angles, parallax_t
 from colmap_sph.stereo.rectified_pair import Float, ray_angles
 
 # Rows repeated on both sides of the seam where a whole circle of epipolar planes is in view.
-_SEAM_ROWS = 32
+SEAM_ROWS = 32
 # Rays along an image's border, and of a grid over it, per side.
 _SIDE_SAMPLES = 33
 # Samples up to so far outside of the common rows count for their columns: a share of these rows, and so many steps
@@ -95,19 +95,19 @@ def extent_on_sphere(
     outlines = (outline_of(left), outline_of(right)) if outlines is None else outlines
     views = (left, right)
     # Rolled about the baseline they stay what they are.
-    signs = [_epipole_sign(view, rotation, outline) for view, outline in zip(views, outlines, strict=True)]
-    arcs = (_row_arc(*each, rotation) for each in zip(views, outlines, signs, strict=True))
+    signs = [epipole_sign(view, rotation, outline) for view, outline in zip(views, outlines, strict=True)]
+    arcs = (row_arc(*each, rotation) for each in zip(views, outlines, signs, strict=True))
     centre, half = _common_arc(*arcs)
     if half <= 0:
         raise RectificationError("the two images share no epipolar plane")
-    rotation = _rolled(rotation, centre)
+    rotation = rolled(rotation, centre)
     limit = float(np.arccos(min_cosine))
     columns: list[Range] = []
     for each in zip(views, outlines, signs, strict=True):
-        low, high = _column_extent(*each, rotation, -half, half)
+        low, high = column_extent(*each, rotation, -half, half)
         columns.append((max(low, -limit), min(high, limit)))
     parallaxes = parallax_angles(left, right, rotation, points)
-    seam = _SEAM_ROWS if half >= np.pi else 0
+    seam = SEAM_ROWS if half >= np.pi else 0
     return Extent(rotation, (-half, half), (columns[0], columns[1]), parallaxes, seam)
 
 
@@ -160,7 +160,7 @@ def extent_on_plane(
     return Extent(rotation, (low, high), (left_columns, right_columns), parallaxes, seam=0)
 
 
-def _rolled(rotation: Float, angle: float) -> Float:
+def rolled(rotation: Float, angle: float) -> Float:
     """The frame rolled about its x axis, so that row angle `angle` becomes 0."""
     c, s = np.cos(angle), np.sin(angle)
     return np.asarray(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ rotation)
@@ -205,14 +205,14 @@ def _is_within(outline: Float, pixels: Float) -> NDArray[np.bool_]:
     return np.asarray((pixels[:, 2] > 0) & (edges[:, 0] * y - edges[:, 1] * x >= 0).all(axis=1))
 
 
-def _epipole_sign(view: View, rotation: Float, outline: Float) -> int:
+def epipole_sign(view: View, rotation: Float, outline: Float) -> int:
     """+1 or -1 when the baseline's positive or negative direction lies inside the outline, else 0."""
     epipole = view.K @ view.R @ rotation[0]
     within = _is_within(outline, np.stack([epipole, -epipole]))
     return int(within[0]) - int(within[1])
 
 
-def _row_arc(view: View, outline: Float, sign: int, rotation: Float) -> _Arc:
+def row_arc(view: View, outline: Float, sign: int, rotation: Float) -> _Arc:
     """Centre and half width of the image's row angles; the half width is π when it holds an epipole, of `sign`."""
     if sign:
         return 0.0, np.pi
@@ -234,7 +234,7 @@ def _common_arc(left: _Arc, right: _Arc) -> _Arc:
     return (low + high) / 2, (high - low) / 2
 
 
-def _column_extent(view: View, outline: Float, sign: int, rotation: Float, low: float, high: float) -> Range:
+def column_extent(view: View, outline: Float, sign: int, rotation: Float, low: float, high: float) -> Range:
     """Range of θ of the part inside an outline whose row angles lie in [low, high]."""
     first, last = _box_of(outline)
     border, inner = _world_rays(view, tuple(map(tuple, outline.tolist())))

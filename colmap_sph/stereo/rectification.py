@@ -4,12 +4,13 @@ The frame and the layout are those of `rectified_pair` (Elhashash & Qin, §3.1, 
 baseline and the viewing directions, the rows from what both images see, the columns from the disparity range.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from colmap_sph.errors import OptionError, RectificationError
-from colmap_sph.scene import Scene, View, observed_by
+from colmap_sph.scene import Photograph, Scene, View, observed_by
 from colmap_sph.stereo.disparity_range import (
     Range,
     bounded_range,
@@ -20,8 +21,9 @@ from colmap_sph.stereo.disparity_range import (
     parallax_range,
     parallax_tangents,
 )
-from colmap_sph.stereo.extent import Extent, extent_on_plane, extent_on_sphere
-from colmap_sph.stereo.partners.frusta import sees
+from colmap_sph.stereo.extent import Extent, extent_on_plane, extent_on_sphere, outline_of
+from colmap_sph.stereo.partners.frusta import any_sees
+from colmap_sph.stereo.photographs.extent import extent_of_photographs, nearer_half
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Surface
 
 # In units of the depth: a parallax of some hundredths of a pixel, and more than centres on a grid are off.
@@ -106,11 +108,11 @@ def sampling_of(detail: float) -> float:
 
 def rectify_pair(
     scene: Scene,
-    left: View,
-    right: View,
+    left: View | Photograph,
+    right: View | Photograph,
     options: RectificationOptions,
     details: tuple[float, float] | None = None,
-    outlines: tuple[Float, Float] | None = None,
+    outlines: tuple[Sequence[Float], Sequence[Float]] | None = None,
 ) -> RectifiedPair:
     """Lay out the rectified images of a pair.
 
@@ -118,14 +120,15 @@ def rectify_pair(
     ----------
     scene : Scene
         For the sparse points, which give the range of parallaxes.
-    left, right : View
-        The pair; which one is called left is free.
+    left, right : View or Photograph
+        The pair; which one is called left is free. Where one was cut into several views, the pair has only what
+        the left one may see finer.
     options : RectificationOptions
     details : (float, float), optional
         What `image_detail` finds in the left and in the right image. Without it there is a rectified pixel, times
         `sampling`, to a pixel.
-    outlines : pair of (n, 2) float64 ndarray, optional
-        Of what is wanted of the left and the right image, see `extent_on_sphere`.
+    outlines : pair of sequence of (n, 2) float64 ndarray, optional
+        Of what is wanted of each view of the left and of the right image, see `extent_on_sphere`.
 
     Returns
     -------
@@ -153,16 +156,12 @@ def rectify_pair(
     [5.0, 30.0]
     """
     baseline = float(np.linalg.norm(right.center - left.center))
-    depths = (scene.points[left.point_indices] - left.center) @ left.viewing_direction
-    distance = float(np.median(depths)) if len(depths) else 0.0
+    distance = _median_depth(scene, left)
     if not baseline > max(_LEAST_BASELINE * distance, _ROUNDED_BASELINE * float(np.abs(left.center).max())):
         raise RectificationError("the two images have the same projection centre")
     rotation = _rectifying_rotation(left, right)
     points = _points_in_both(scene, left, right)
-    if options.surface == "spherical":
-        extent = extent_on_sphere(rotation, left, right, points, options.min_cosine, outlines)
-    else:
-        extent = extent_on_plane(rotation, left, right, points, baseline, outlines)
+    extent = _extent(rotation, left, right, points, baseline, options, outlines)
     samplings = (1.0, 1.0) if details is None else (sampling_of(details[0]), sampling_of(details[1]))
     scales = _scale(left, points), _scale(right, points)
     scale = options.sampling * max(samplings[0] * scales[0], samplings[1] * scales[1])
@@ -171,12 +170,49 @@ def rectify_pair(
     if options.depths is not None:
         given = _range_of_depths(left, right, extent.rotation, options.depths, options.surface, baseline)
         searched = limited_range(given, searched)
+    if _is_cut(left, right):
+        extent = replace(extent, columns=(nearer_half(extent.columns[0], searched[1]), extent.columns[1]))
     pair = _laid_out(options.surface, extent, baseline, scale, searched)
     _check_size(pair, left, right, options.max_pixels_ratio * max(1.0, scale / max(scales)) ** 2)
     return pair
 
 
-def _rectifying_rotation(left: View, right: View) -> Float:
+def _is_cut(left: View | Photograph, right: View | Photograph) -> bool:
+    """Whether one of them was cut into several views, so that they may see all around their baseline."""
+    return len(left.views) > 1 or len(right.views) > 1
+
+
+def _median_depth(scene: Scene, photograph: View | Photograph) -> float:
+    """Median depth of the points that it observes; their distance, where it was cut up. 0 without any."""
+    rays = scene.points[photograph.point_indices] - photograph.center
+    is_whole = len(photograph.views) == 1
+    depths = rays @ photograph.viewing_direction if is_whole else np.linalg.norm(rays, axis=1)
+    return float(np.median(depths)) if len(depths) else 0.0
+
+
+def _extent(
+    rotation: Float,
+    left: View | Photograph,
+    right: View | Photograph,
+    points: Float,
+    baseline: float,
+    options: RectificationOptions,
+    outlines: tuple[Sequence[Float], Sequence[Float]] | None,
+) -> Extent:
+    """What the images cover of the surface."""
+    if outlines is None:
+        outlines = ([outline_of(view) for view in left.views], [outline_of(view) for view in right.views])
+    if _is_cut(left, right) and options.surface == "spherical":
+        return extent_of_photographs(rotation, left, right, points, options.min_cosine, outlines)
+    if _is_cut(left, right):
+        raise RectificationError("a plane cannot hold an image that was cut into several views")
+    views = (left.views[0], right.views[0])
+    if options.surface == "spherical":
+        return extent_on_sphere(rotation, *views, points, options.min_cosine, (outlines[0][0], outlines[1][0]))
+    return extent_on_plane(rotation, *views, points, baseline, (outlines[0][0], outlines[1][0]))
+
+
+def _rectifying_rotation(left: View | Photograph, right: View | Photograph) -> Float:
     """Rotation to the rectified frame (Elhashash & Qin, §3.1, in photogrammetric axes)."""
     r1 = right.center - left.center
     r1 /= np.linalg.norm(r1)
@@ -184,35 +220,46 @@ def _rectifying_rotation(left: View, right: View) -> Float:
     across = reference - r1 * (r1 @ reference)
     if np.linalg.norm(across) < _LEAST_ACROSS:
         # Forward motion, or opposite views: the roll about the baseline is free, so take any camera axis.
-        across = left.R[1] - r1 * (r1 @ left.R[1])
+        axes = left.views[0].R
+        across = axes[1] - r1 * (r1 @ axes[1])
         if np.linalg.norm(across) < _LEAST_ACROSS:
-            across = left.R[0] - r1 * (r1 @ left.R[0])
+            across = axes[0] - r1 * (r1 @ axes[0])
     r3 = across / np.linalg.norm(across)
     return np.stack([r1, np.cross(r3, r1), r3])
 
 
-def _points_in_both(scene: Scene, left: View, right: View) -> Float:
+def _points_in_both(scene: Scene, left: View | Photograph, right: View | Photograph) -> Float:
     """Sparse points that one of the views observes and both have in view."""
     points = scene.points[observed_by(left, right)[0]]
-    for view in (left, right):
-        points = points[sees(view, points)]
+    for photograph in (left, right):
+        points = points[any_sees(photograph, points)]
     return points
 
 
-def _scale(view: View, points: Float) -> float:
+def _scale(photograph: View | Photograph, points: Float) -> float:
     """Pixels per radian of an image, averaged over the overlap.
 
-    A pixel at the angle α off axis has the solid angle cos³ α / f², so its mean side is cos^1.5 α / f.
+    A pixel at the angle α off axis has the solid angle cos³ α / f², so its mean side is cos^1.5 α / f. Of several
+    views a point belongs to the one whose axis is nearest.
     """
     cosine = np.ones(1)
     if len(points):
-        rays = points @ view.R.T + view.t
-        cosine = rays[:, 2] / np.linalg.norm(rays, axis=1)
-    return float(np.sqrt(view.K[0, 0] * view.K[1, 1]) * np.mean(cosine**-1.5))
+        cosines = []
+        for view in photograph.views:
+            rays = points @ view.R.T + view.t
+            cosines.append(rays[:, 2] / np.linalg.norm(rays, axis=1))
+        cosine = np.max(cosines, axis=0)
+    K = photograph.views[0].K
+    return float(np.sqrt(K[0, 0] * K[1, 1]) * np.mean(cosine**-1.5))
 
 
 def _range_of_depths(
-    left: View, right: View, rotation: Float, depths: tuple[float, float], surface: Surface, baseline: float
+    left: View | Photograph,
+    right: View | Photograph,
+    rotation: Float,
+    depths: tuple[float, float],
+    surface: Surface,
+    baseline: float,
 ) -> Range:
     """Parallaxes of what either view sees between two depths in it, and the other has in view."""
     grid = np.linspace(0, 1, _DEPTH_SAMPLES)
@@ -220,16 +267,17 @@ def _range_of_depths(
     number = int(np.clip(np.ceil(steps) + 1, _DEPTH_SAMPLES, _MOST_DEPTHS))
     x, y, depth = np.meshgrid(grid, grid, np.geomspace(*depths, number))
     seen = []
-    for view, other in ((left, right), (right, left)):
+    sights = [(view, other) for own, other in ((left, right), (right, left)) for view in own.views]
+    for view, other in sights:
         pixels = np.stack([x.ravel() * view.width, y.ravel() * view.height, np.ones(x.size)], axis=1)
         camera = depth.reshape(-1, 1) * (pixels @ np.linalg.inv(view.K).T)
         points = (camera - view.t) @ view.R
-        seen.append(points[sees(other, points)])
+        seen.append(points[any_sees(other, points)])
     points = np.concatenate(seen)
     if surface == "spherical":
         parallaxes = parallax_angles(left, right, rotation, points)
     else:
-        parallaxes = parallax_tangents(left, rotation, points, baseline)
+        parallaxes = parallax_tangents(left.views[0], rotation, points, baseline)
     if not len(parallaxes):
         raise RectificationError("the two images do not overlap at the depths that are asked for")
     return bounded_range(parallaxes)
@@ -266,11 +314,11 @@ def _off_zero(values: Range) -> float:
     return max(0.0, values[0], -values[1])
 
 
-def _check_size(pair: RectifiedPair, left: View, right: View, max_ratio: float) -> None:
+def _check_size(pair: RectifiedPair, left: View | Photograph, right: View | Photograph, max_ratio: float) -> None:
     """Raise `RectificationError` where the rectified images are too large or too small."""
     sides = (pair.height, pair.left_width, pair.right_width)
     pixels = pair.height * (pair.left_width + pair.right_width)
-    originals = left.width * left.height + right.width * right.height
+    originals = left.num_pixels + right.num_pixels
     if max(sides) > _MAX_SIDE:
         raise RectificationError(f"its rectified images would have more than {_MAX_SIDE} rows or columns")
     if pixels > max_ratio * originals:

@@ -128,15 +128,18 @@ def rectified_coordinates(view: View, pair: RectifiedPair, side: Side, pixels: F
     return coordinates_of_rays(pair, side, rays)
 
 
-def image_coordinates(view: View, pair: RectifiedPair, side: Side, places: NDArray[np.floating]) -> Float:
-    """(n, 2) image coordinates of (n, 2) columns and rows, rectified array coordinates."""
+def rays_of_coordinates(pair: RectifiedPair, side: Side, places: NDArray[np.floating]) -> Float:
+    """(3, n) rays in the rectified frame of (n, 2) columns and rows, rectified array coordinates."""
     along = (places[:, 0].astype(float) + pair.column_origin(side)) / pair.columns_per_radian
     across = (places[:, 1].astype(float) + pair.row_origin) / pair.rows_per_radian
     if pair.surface == "spherical":
-        rays = np.stack([np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)])
-    else:
-        rays = np.stack([along, across, np.ones_like(along)])
-    pixels = pixel_from_rectified_ray(view, pair) @ rays
+        return np.stack([np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)])
+    return np.stack([along, across, np.ones_like(along)])
+
+
+def image_coordinates(view: View, pair: RectifiedPair, side: Side, places: NDArray[np.floating]) -> Float:
+    """(n, 2) image coordinates of (n, 2) columns and rows, rectified array coordinates."""
+    pixels = pixel_from_rectified_ray(view, pair) @ rays_of_coordinates(pair, side, places)
     return np.asarray((pixels[:2] / pixels[2]).T)
 
 
@@ -147,7 +150,7 @@ class PairDisparity:
     Attributes
     ----------
     left, right : str
-        Image names.
+        Image names; of a photograph that was cut into several views the name of the first of them.
     geometry : RectifiedPair
     disparity : (H, W_left) float32 ndarray
         Disparity of the left image's pixels; NaN = none.

@@ -47,10 +47,10 @@ def resample(
     image = image.astype(np.float32, copy=False)
     rectified = np.empty(shape, dtype=np.float32)
     valid = np.empty(shape, dtype=np.uint8)
-    tables = _ray_tables(view, pair, side)
+    tables = ray_tables(view, pair, side)
     for first in range(0, pair.height, _BAND_ROWS):
         band = slice(first, first + _BAND_ROWS)
-        columns, rows, inside = _pixel_maps(view, tables, band)
+        columns, rows, inside = pixel_maps(view, *tables.rays(band))
         if mask is not None:
             inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
         valid[band] = inside
@@ -68,7 +68,7 @@ def half_size(image: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 @dataclass(frozen=True, eq=False)
-class _RayTables:
+class RayTables:
     """Homogeneous source pixel of a rectified one: ``rows[:, row] * weights[column] + columns[:, column]``.
 
     No trigonometry per pixel.
@@ -78,8 +78,16 @@ class _RayTables:
     columns: NDArray[np.float32]
     weights: NDArray[np.float32]
 
+    def rays(self, rows: slice, columns: slice = slice(None)) -> tuple[NDArray[np.float32], ...]:
+        """Homogeneous source pixels x, y and z of some rectified ones; on the sphere their rays have length 1."""
+        return tuple(
+            np.multiply.outer(row[rows], self.weights[columns]) + column[columns]
+            for row, column in zip(self.rows, self.columns, strict=True)
+        )
 
-def _ray_tables(view: View, pair: RectifiedPair, side: Side) -> _RayTables:
+
+def ray_tables(view: View, pair: RectifiedPair, side: Side) -> RayTables:
+    """Tables of the source pixels of a rectified image."""
     A = pixel_from_rectified_ray(view, pair)
     along = (np.arange(pair.width(side)) + pair.column_origin(side)) / pair.columns_per_radian
     across = (np.arange(pair.height) + pair.row_origin) / pair.rows_per_radian
@@ -92,17 +100,13 @@ def _ray_tables(view: View, pair: RectifiedPair, side: Side) -> _RayTables:
         column_weight = np.ones_like(along)
         row_table = np.outer(A[:, 1], across) + A[:, 2:3]
     tables = row_table, np.outer(A[:, 0], column_table), column_weight
-    return _RayTables(*(table.astype(np.float32) for table in tables))
+    return RayTables(*(table.astype(np.float32) for table in tables))
 
 
-def _pixel_maps(
-    view: View, tables: _RayTables, band: slice
+def pixel_maps(
+    view: View, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Source columns and rows (pixel centres at whole numbers) of a band of rectified rows, and the valid mask."""
-    x, y, z = (
-        np.multiply.outer(row[band], tables.weights) + column
-        for row, column in zip(tables.rows, tables.columns, strict=True)
-    )
+    """Source columns and rows (pixel centres at whole numbers) of rectified pixels, in place; the valid mask."""
     in_front = z > _LEAST_DEPTH
     np.divide(1, z, out=z, where=in_front)
     x *= z

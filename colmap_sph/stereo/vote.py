@@ -130,6 +130,7 @@ def vote_depth(
     options: VoteOptions,
     stations: Sequence[int] | None = None,
     residuals: Sequence[float] | None = None,
+    lead: str = "",
 ) -> DepthEstimate:
     """Photometric depth of a view: the vote of all its pairs.
 
@@ -144,6 +145,8 @@ def vote_depth(
         vote. Without it each is a station of its own.
     residuals : sequence of float, optional
         Row residual of each pair, radians. Without it poses and lenses are perfect.
+    lead : str
+        What pairs call the view by, where it was cut from a photograph: the name of the first of its views.
 
     Returns
     -------
@@ -167,7 +170,7 @@ def vote_depth(
     """
     sources: list[tuple[NDArray[np.float32], RectifiedPair, Side]] = []
     for pair in pairs:
-        if pair.left == view.name:
+        if pair.left == (lead or view.name):
             sources.append((pair.disparity, pair.geometry, "left"))
         else:
             sources.append((right_disparity(pair, options.max_disparity_step), pair.geometry, "right"))

@@ -1,7 +1,7 @@
 """Analytic scenes with exact depth and normals, stereo pairs for tests, and the demo block.
 
 Each module imports only those before it: texture, primitives, terrain, rays, light, photographs' sky and optics,
-render, pairs, ground, village, model, photographs, capture, block, street, canyon, town.
+render, pairs, ground, village, model, photographs, capture, block, street, canyon, town, wide.
 """
 
 from colmap_sph.synthetic.block import BlockOptions, DemoBlock, demo_cameras, make_demo_block

@@ -160,13 +160,13 @@ def sample_sparse_points(
 
 def _same_camera(first: Camera, second: Camera) -> bool:
     same_size = (first.width, first.height) == (second.width, second.height)
-    return same_size and np.array_equal(first.K, second.K)
+    return same_size and first.colmap == second.colmap
 
 
-def _pinhole(camera: Camera, camera_id: int) -> pycolmap.Camera:
-    parameters = [camera.K[0, 0], camera.K[1, 1], camera.K[0, 2], camera.K[1, 2]]
+def _colmap_camera(camera: Camera, camera_id: int) -> pycolmap.Camera:
+    name, parameters = camera.colmap
     return pycolmap.Camera(
-        camera_id=camera_id, model="PINHOLE", width=camera.width, height=camera.height, params=parameters
+        camera_id=camera_id, model=name, width=camera.width, height=camera.height, params=parameters
     )
 
 
@@ -179,7 +179,7 @@ def build_reconstruction(
     keypoint_noise: float = 0.0,
     rng: np.random.Generator | None = None,
 ) -> pycolmap.Reconstruction:
-    """Build a COLMAP model: shared PINHOLE cameras, posed images, points with tracks.
+    """Build a COLMAP model: shared cameras, posed images, points with tracks.
 
     Parameters
     ----------
@@ -208,7 +208,7 @@ def build_reconstruction(
         if camera_id == 0:
             kinds.append(camera)
             camera_id = len(kinds)
-            model.add_camera_with_trivial_rig(_pinhole(camera, camera_id))
+            model.add_camera_with_trivial_rig(_colmap_camera(camera, camera_id))
         exact = sparse.observations[number]
         keypoints = exact + keypoint_noise * rng.standard_normal(exact.shape)
         image = pycolmap.Image(name=name, keypoints=keypoints, camera_id=camera_id, image_id=number + 1)

@@ -48,6 +48,15 @@ class Camera:
         """Rays through the grid of image coordinates x (W,) and y (H,), pixels."""
         return PinholeRays(self, x, y, grid=True)
 
+    def rays_at(self, image: FloatArray) -> Rays:
+        """Rays through image coordinates (N, 2), pixels, of the camera that a written model knows."""
+        return PinholeRays(self, image[:, 0], image[:, 1], grid=False)
+
+    @property
+    def colmap(self) -> tuple[str, list[float]]:
+        """Name of its COLMAP camera model, and the parameters."""
+        return "PINHOLE", [self.K[0, 0], self.K[1, 1], self.K[0, 2], self.K[1, 2]]
+
     def project(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Image coordinates (N, 2) and z-depth (N,) of world points (N, 3)."""
         in_camera = points @ self.R.T + self.t
@@ -243,6 +252,6 @@ def trace_points(surfaces: Sequence[Surface], camera: Camera, image: FloatArray)
     Returns
     -------
     Hits
-        Their distance is the z-depth.
+        Their distance is the z-depth, of a wide camera the range.
     """
-    return trace(surfaces, PinholeRays(camera, image[:, 0], image[:, 1], grid=False))
+    return trace(surfaces, camera.rays_at(image))

@@ -36,7 +36,7 @@ def _flat(shape: tuple[int, int]) -> tuple[NDArray[np.float32], NDArray[np.float
 
 def _pair(task: match.MatchTask) -> Facts:
     disparity = np.full((task.geometry.height, task.geometry.left_width), np.nan, np.float32)
-    pair = PairDisparity(task.left.view.name, task.right.view.name, task.geometry, disparity)
+    pair = PairDisparity(task.left[0].view.name, task.right[0].view.name, task.geometry, disparity)
     return write_pair(task.target, pair, task.key)
 
 

@@ -147,7 +147,8 @@ class Within:
             known = estimated_fusion(self._context).seconds
             for name, others in partners.items():
                 seconds = vote_seconds(len(others), normals) + confirm_seconds(len(others), normals, refinement)
-                known += seconds * self._context.window(name).num_pixels / 1e6
+                views = self._context.scene.photograph(name).views
+                known += seconds * sum(self._context.window(view.name).num_pixels for view in views) / 1e6
             self._later_works[case] = known
         return known
 

@@ -71,7 +71,7 @@ def prepare(
     given = preparation.given_model()
     if given.reason_to_keep or not options.polish.is_wanted:
         restore_given(workspace)
-    return Prepared(preparation.options, preparation.names, given)
+    return Prepared(preparation.options, preparation.expected(), given)
 
 
 def find_prepared(
@@ -85,4 +85,4 @@ def find_prepared(
     is_polished = starting_model(workspace) != workspace.sparse_dir
     if not preparation.is_finished or is_polished > (options.polish.is_wanted and not given.reason_to_keep):
         return None
-    return Prepared(preparation.options, preparation.names, given)
+    return Prepared(preparation.options, preparation.expected(), given)

@@ -187,7 +187,8 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
         sights = self.context.sparse_tracks.sights(item).between(options.rectification.depths)
-        residuals = [self._residuals[as_pair(item, name)] for name in partners]
+        lead_of = self.context.lead
+        residuals = [self._residuals[as_pair(lead_of(item), lead_of(name))] for name in partners]
         cut = self.context.cut(item)
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights, cut)
         maps = self.context.map_files(item, "geometric")
@@ -203,14 +204,18 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
             options.refinement,
             options.rectification.depths,
             self.context.focus,
-            tuple(self._all_partners.get(item, [])),
+            tuple(self._matched(item)),
             maps,
             key,
         )
         return Job(key, self.found(task), self._cost(item), task)
 
     def _partners(self, name: str) -> list[str]:
-        return [other for other in self._all_partners.get(name, []) if other in self._vote_keys]
+        facing = self.context.facing.views(name, self._matched(name))
+        return [other for views in facing for other in views if other in self._vote_keys]
+
+    def _matched(self, name: str) -> list[str]:
+        return self._all_partners.get(self.context.lead(name), [])
 
     def _estimate_file(self, name: str) -> EstimateFile:
         context = self.context
@@ -262,7 +267,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         if failures and not report.images:
             raise NoResultError(f"No image has a depth map ({failures[0]})")
         for name in (name for name, share in report.coverage.items() if share == 0):
-            if name in report.skipped_images:
+            if name in report.skipped_images or self._is_one_of_many(name):
                 continue
             if self._shows_enough(name):
                 report.skipped_images[name] = self._why_empty(name)
@@ -273,6 +278,13 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
                 )
         if not report.images:
             raise NoResultError(self._why_nothing())
+
+    def _is_one_of_many(self, name: str) -> bool:
+        """Whether a view is cut from an image of which others have a depth: it may show the sky alone."""
+        original = self.context.scene.view(name).original
+        coverage = self.context.report.coverage
+        views = self.context.scene.views
+        return bool(original) and any(view.original == original and coverage[view.name] > 0 for view in views)
 
     def _shows_enough(self, name: str) -> bool:
         """Whether an image shows so much of the region, where there is one, that it ought to have some depth."""
@@ -291,7 +303,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
 
     def _why_empty(self, name: str) -> str:
         """Why an image has no depth, as far as it is known."""
-        if name not in self._all_partners:
+        if not self._matched(name):
             return "no pair of it could be matched"
         if self._voted.get(name, 0.0) > 0:
             return "no depth of it is confirmed by another image"

@@ -4,10 +4,11 @@ Every image is fused into a part of the cloud, and the parts are joined; or COLM
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,7 @@ from colmap_sph.pipeline.stages.fusion_parts import (
     warn_of_masks,
 )
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
-from colmap_sph.pipeline.stages.view_maps import MapSources, read_sound_maps
+from colmap_sph.pipeline.stages.view_maps import MapSources, read_sound_maps, views_beside
 from colmap_sph.project.cloud_files import (
     check_places,
     join_parts,
@@ -136,7 +137,11 @@ class FuseStage(PartsStage):
         """See `PartsStage`."""
         indices = index_in_model(self.context)
         # All at once: where maps turn out to be damaged, their records say other things meanwhile.
-        return {name: _sources_of(self.context, name, indices[name]) for name in self.items}
+        among = self.context.scene.only(set(self.items))
+        return {
+            name: replace(_sources_of(self.context, name, indices[name]), beside=views_beside(among, name))
+            for name in self.items
+        }
 
     def is_missing(self, item: str) -> bool:
         """See `Stage.is_missing`."""
@@ -223,6 +228,13 @@ class FuseStage(PartsStage):
         return int(not self._is_there), int(self._is_there)
 
 
+def _views_of_partners(context: "Context", pairs: Iterable[Pair]) -> dict[str, list[str]]:
+    """The views of each view's partners."""
+    leads = partners_of(pairs)
+    names = (view.name for lead in leads for view in context.scene.photograph(lead).views)
+    return {name: [*chain(*context.facing.views(name, leads[context.lead(name)]))] for name in names}
+
+
 def _key_of_cloud(context: "Context", pair_keys: Mapping[Pair, str], maps: Mapping[str, Result]) -> str:
     """The pairs and the model tell who looks where, and who stands beside whom."""
     pairs = (sorted(pair_keys), context.options.pairs.min_triangulation_angle)
@@ -260,7 +272,7 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
         self._sound = self._names
         self._views = [context.scene.view(name) for name in self._names]
         # Without tracks COLMAP would find no images that overlap.
-        self._partners = None if context.scene.has_tracks else partners_of(pair_keys)
+        self._partners = None if context.scene.has_tracks else _views_of_partners(context, pair_keys)
         self._key = _key_of_cloud(context, pair_keys, maps)
         self._known = known_cloud(context, self._key)
 

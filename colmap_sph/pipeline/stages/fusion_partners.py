@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from colmap_sph.stereo.fusion import MAX_PARTNERS
-from colmap_sph.stereo.partners.pairing import Pair, partners_of
+from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.partners.pairs import Overlap
 from colmap_sph.stereo.partners.stations import OWN_STATION, Stations, by_station
 
@@ -33,17 +33,29 @@ class PartnersInFusion(Mapping[str, tuple[list[str], list[int]]]):
     def __init__(self, context: "Context", pairs: Iterable[Pair], names: Sequence[str]) -> None:
         self._most = min(context.options.fusion.check_num_images, MAX_PARTNERS)
         self._stations = context.stations
+        self._facing = context.facing
         self._overlap = Overlap(context.scene)
-        self._matched = partners_of(pairs)
+        leads = dict.fromkeys((context.lead(first), context.lead(second)) for first, second in pairs)
+        self._matched = partners_of(dict.fromkeys(as_pair(*lead) for lead in leads))
+        self._lead = context.lead
         self._names = dict.fromkeys(names)
         self._found: dict[str, tuple[list[str], list[int]]] = {}
 
     def __getitem__(self, name: str) -> tuple[list[str], list[int]]:
         if name not in self._found:
-            overlapping = self._overlap.of(name, _CANDIDATES * self._most)
-            others = [o for o in dict.fromkeys([*overlapping, *self._matched.get(name, [])]) if o in self._names]
-            self._found[name] = _some_of_each_station(self._stations, name, others, self._most)
+            self._found[name] = self._find(name)
         return self._found[name]
+
+    def _find(self, name: str) -> tuple[list[str], list[int]]:
+        overlapping = self._overlap.of(name, _CANDIDATES * self._most)
+        matched = self._matched.get(self._lead(name), [])
+        firsts = list(dict.fromkeys([*overlapping, *matched]))
+        facing = zip(firsts, self._facing.views(name, firsts), strict=True)
+        views = {first: [view for view in shown if view in self._names] for first, shown in facing}
+        others = [first for first, fused in views.items() if fused]
+        chosen = zip(*_some_of_each_station(self._stations, name, others, self._most), strict=True)
+        names = [(view, number) for first, number in chosen for view in views[first]][:MAX_PARTNERS]
+        return [view for view, _ in names], [number for _, number in names]
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._names)

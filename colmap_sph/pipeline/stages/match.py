@@ -2,9 +2,9 @@
 
 import logging
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
@@ -24,11 +24,13 @@ from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
 from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs
 from colmap_sph.project.workspace import Known
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.matching import MatchingOptions, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair, as_pair
+from colmap_sph.stereo.photographs.resampling import resample_photograph
+from colmap_sph.stereo.photographs.ties import find_ties_of_photographs
 from colmap_sph.stereo.poses.ties import Ties, find_ties, row_residual, tolerable_sampling
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
@@ -80,12 +82,13 @@ class PhotoFile:
 class MatchTask:
     """A pair to match, with the bytes of scratch memory a thread may keep, and where its disparity map goes.
 
-    `seeds` are those of its sparse points, see `seeds_of_points`. Where poses may be imprecise, the pair is
-    matched at the share `trial` of its rows and columns first.
+    Each side is one view, or all that were cut from one photograph. `seeds` are those of its sparse points, see
+    `seeds_of_points`. Where poses may be imprecise, the pair is matched at the share `trial` of its rows and
+    columns first. `back` is the same pair the other way round, where it is matched both ways, with the same key.
     """
 
-    left: PhotoFile
-    right: PhotoFile
+    left: tuple[PhotoFile, ...]
+    right: tuple[PhotoFile, ...]
     geometry: RectifiedPair
     seeds: Seeds
     trial: float
@@ -93,10 +96,30 @@ class MatchTask:
     scratch_bytes: int
     target: Path
     key: str
+    back: "MatchTask | None" = None
+
+    @property
+    def ways(self) -> list["MatchTask"]:
+        """Itself, and the other way round."""
+        return [self] if self.back is None else [self, self.back]
+
+
+def make_disparity_maps(task: MatchTask) -> Facts:
+    """Rectify and match a pair; writes its disparity map and ties, both where it is matched both ways."""
+    return _facts_of(make_disparity_map(way) for way in task.ways)
+
+
+def _facts_of(ways: Iterable[Facts]) -> Facts:
+    """What is known of a pair that is matched one way or both."""
+    facts, *others = ways
+    if not others:
+        return facts
+    known = [each.row_residual for each in (facts, *others) if each.row_residual is not None]
+    return Facts(row_residual=float(np.mean(known)) if known else None)
 
 
 def make_disparity_map(task: MatchTask) -> Facts:
-    """Rectify and match a pair; writes its disparity map and ties."""
+    """Rectify and match a pair one way."""
     if getattr(_thread, "scratch", None) is None or _thread.scratch.max_bytes != task.scratch_bytes:
         _thread.scratch = Scratch(task.scratch_bytes)
     share = 1.0
@@ -105,7 +128,7 @@ def make_disparity_map(task: MatchTask) -> Facts:
         share = tolerable_sampling(residual or 0.0, task.trial)
     geometry = task.geometry.resampled(share)
     disparity, ties = _match(task, geometry)
-    pair = PairDisparity(task.left.view.name, task.right.view.name, geometry, disparity)
+    pair = PairDisparity(task.left[0].view.name, task.right[0].view.name, geometry, disparity)
     return write_pair(task.target, pair, task.key, ties, share)
 
 
@@ -120,9 +143,18 @@ def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32
         infinity=-geometry.disparity_origin,
         seeds=task.seeds * (geometry.columns_per_radian / task.geometry.columns_per_radian),
     )
-    left, right = _photo(task.left), _photo(task.right)
-    photos = (task.left.view, left.image), (task.right.view, right.image)
-    return disparity, find_ties(*photos, geometry, disparity, left.corners)
+    return disparity, _ties(task, geometry, disparity)
+
+
+def _ties(task: MatchTask, geometry: RectifiedPair, disparity: NDArray[np.float32]) -> Ties:
+    left, right = ([(file.view, _photo(file)) for file in side] for side in (task.left, task.right))
+    if len(left) == len(right) == 1:
+        ((view, photo),) = left
+        ((other_view, other_photo),) = right
+        photos = ((view, photo.image), (other_view, other_photo.image))
+        return find_ties(*photos, geometry, disparity, photo.corners)
+    lefts, rights = ([(view, photo.image, photo.corners) for view, photo in side] for side in (left, right))
+    return find_ties_of_photographs(lefts, rights, geometry, disparity)
 
 
 def _photo(file: PhotoFile) -> Photo:
@@ -131,13 +163,19 @@ def _photo(file: PhotoFile) -> Photo:
 
 
 def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> RectifiedImage:
-    photo = task.left if side == "left" else task.right
+    files = task.left if side == "left" else task.right
+    views = [file.view for file in files]
+    images = [_photo(file).image for file in files]
+    masks = [_kept_mask(file, image, task.options.keep_blank) for file, image in zip(files, images, strict=True)]
+    if len(views) == 1:
+        return RectifiedImage(*resample(images[0], views[0], geometry, side, mask=masks[0]))
+    return RectifiedImage(*resample_photograph(images, views, geometry, side, masks))
+
+
+def _kept_mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
     view = photo.view
-    image = _photo(photo).image
-    keep_blank = task.options.keep_blank
     key = f"{file_stamp(photo.mask)} {view.width} {view.height} {file_stamp(photo.image)} {keep_blank}"
-    mask = _masks.get(key, lambda: _mask(photo, image, keep_blank))
-    return RectifiedImage(*resample(image, view, geometry, side, mask=mask))
+    return _masks.get(key, lambda: _mask(photo, image, keep_blank))
 
 
 def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
@@ -160,14 +198,20 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
 
     name = "match pairs"
     remembered_as: ClassVar[Known | None] = "pairs"
-    make = staticmethod(make_disparity_map)
+    make = staticmethod(make_disparity_maps)
     caches = (_photos, _masks)
 
     @staticmethod
     def found(task: MatchTask) -> Facts | None:
         """See `Stage.found`."""
-        names = (task.left.view.name, task.right.view.name)
-        return facts_of_pair(task.target, task.key, *names, task.geometry)
+        found = []
+        for way in task.ways:
+            names = (way.left[0].view.name, way.right[0].view.name)
+            facts = facts_of_pair(way.target, way.key, *names, way.geometry)
+            if facts is None:
+                return None
+            found.append(facts)
+        return _facts_of(found)
 
     def __init__(self, context: "Context", pairs: Sequence[Pair]) -> None:
         super().__init__(context, pairs)
@@ -184,27 +228,43 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
 
     def files(self, item: Pair) -> list[str]:
         """See `RememberingStage`."""
-        return [str(self.context.pair_path(*item))]
+        return [str(path) for path in self.context.pair_paths(*item)]
 
     def is_there(self, item: Pair, key: str) -> bool:
         """See `RememberingStage`."""
-        head = read_head(self.context.pair_path(*item))
-        return head is not None and head.key == key
+        heads = map(read_head, self.context.pair_paths(*item))
+        return all(head is not None and head.key == key for head in heads)
 
     def ask(self, item: Pair) -> Job[MatchTask]:
         """See `RememberingStage`; `RectificationError` for a pair that cannot be rectified."""
         context = self.context
-        first, second = (context.scene.view(name) for name in item)
+        first, second = (context.scene.photograph(name) for name in item)
         points = shared_points(context.scene, first, second)
-        left, right = finer_first(points, first, second)
+        leads = finer_first(points, first.lead, second.lead)
+        left, right = (context.scene.photograph(lead.name) for lead in leads)
+        ways = [(left, right), (right, left)]
+        asked = [
+            self._ask(*way, points, target) for way, target in zip(ways, context.pair_paths(*item), strict=False)
+        ]
+        (task, cost), *backs = asked
+        for back, other_cost in backs:
+            key = context.keys.both_ways([task.key, back.key])
+            task = replace(task, key=key, back=replace(back, key=key))
+            cost = cost.beside(other_cost)
+        return Job(task.key, self.found(task), cost, task)
+
+    def _ask(
+        self, left: Photograph, right: Photograph, points: NDArray[np.float64], target: Path
+    ) -> tuple[MatchTask, Cost]:
+        """What is to be done one way, and what it costs."""
+        context = self.context
         geometry = self._geometry(left, right)
-        seeds = seeds_of_points(left, right, geometry, points)
+        seeds = seeds_of_points(left.lead, right.lead, geometry, points)
         trial = self._trial(left, right, geometry)
         key = context.keys.pair(left, right, geometry, seeds, trial)
-        target = context.pair_path(*item)
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)
-        reading = max(_READ_BYTES * pixels, bytes_to_reduce(left, right))
+        reading = max(_READ_BYTES * pixels, bytes_to_reduce(*left.views, *right.views))
         both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
             seconds=match_seconds(both_pixels) + (match_seconds(trial**2 * both_pixels) if trial < 1 else 0.0),
@@ -213,8 +273,8 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
             scratch=scratch_bytes(left_pixels, context.options.matching),
         )
         task = MatchTask(
-            self._photo(left),
-            self._photo(right),
+            tuple(map(self._photo, left.views)),
+            tuple(map(self._photo, right.views)),
             geometry,
             seeds,
             trial,
@@ -223,27 +283,34 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
             target,
             key,
         )
-        return Job(key, self.found(task), cost, task)
+        return task, cost
 
-    def _geometry(self, left: View, right: View) -> RectifiedPair:
+    def _geometry(self, left: Photograph, right: Photograph) -> RectifiedPair:
         try:
-            details = (self._detail(left), self._detail(right))
-            outlines = (self.context.outline(left.name), self.context.outline(right.name))
+            details = (self._detail_of(left), self._detail_of(right))
+            outlines = (self._outlines(left), self._outlines(right))
             options = self.context.options.rectification
             return rectify_pair(self.context.scene, left, right, options, details, outlines)
         except RectificationError:
-            self._unfit.add(as_pair(left.name, right.name))
+            self._unfit.add(as_pair(left.lead.name, right.lead.name))
             raise
+
+    def _outlines(self, photograph: Photograph) -> list[NDArray[np.float64]]:
+        return [self.context.outline(view.name) for view in photograph.views]
+
+    def _detail_of(self, photograph: Photograph) -> float:
+        """Detail of a photograph: the median of its views'."""
+        return float(np.median([self._detail(view) for view in photograph.views]))
 
     def _detail(self, view: View) -> float:
         """Detail of an image; of one that is not there yet, that of those that are, or what a sharp one has."""
         return self.context.details.get(view.name, self._usual_detail)
 
-    def _trial(self, left: View, right: View, geometry: RectifiedPair) -> float:
+    def _trial(self, left: Photograph, right: Photograph, geometry: RectifiedPair) -> float:
         """Share of the rows and columns at which to find out how precise the poses are; 1 where that is known."""
-        if all(view.reprojection_error <= _PRECISE_POSES for view in (left, right)):
+        if all(view.reprojection_error <= _PRECISE_POSES for view in (*left.views, *right.views)):
             return 1.0
-        pixels_per_radian = max(float(view.K[0, 0]) for view in (left, right))
+        pixels_per_radian = max(float(view.K[0, 0]) for view in (left.lead, right.lead))
         return min(_TRIAL_SAMPLING * pixels_per_radian / geometry.columns_per_radian, 1.0)
 
     def _photo(self, view: View) -> PhotoFile:
@@ -270,7 +337,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """Scratch memory and caches take of what the largest pair leaves, but never starve."""
         views = self.context.scene.views
-        largest = max(view.num_pixels for view in views)
+        largest = max(photograph.num_pixels for photograph in self.context.scene.photographs)
         finest = max(sampling_of(self._detail(view)) for view in views)
         share = _RECTIFIED_SHARE * (finest * self.context.options.rectification.sampling) ** 2
         spare = int(max(gate.spare(share * _MATCH_BYTES * largest), gate.free / 8))

@@ -66,4 +66,5 @@ def _users_list(workspace: Workspace | None) -> Path | None:
 
 def wanted_scene(scene: Scene, selection: PairSelection) -> Scene:
     """Return the scene without the views that are not asked for."""
-    return scene.only({*selection.partners, *itertools.chain(*selection.unique_pairs())})
+    names = {*selection.partners, *itertools.chain(*selection.unique_pairs())}
+    return scene.only({view.name for name in names for view in scene.photograph(name).views})

@@ -44,6 +44,15 @@ class Cost:
     disk: float
     scratch: float = 0.0
 
+    def beside(self, other: "Cost") -> "Cost":
+        """Of making both, one after the other."""
+        return Cost(
+            self.seconds + other.seconds,
+            max(self.memory, other.memory),
+            self.disk + other.disk,
+            max(self.scratch, other.scratch),
+        )
+
 
 @dataclass(frozen=True)
 class Job(Generic[Task]):

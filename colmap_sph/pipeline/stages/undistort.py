@@ -50,6 +50,8 @@ _FILE_BYTES = 1.0
 _BYTES = 14.0
 _DEEP_BYTES = 25.0
 _PROCESS_BYTES = 120e6
+# The same per pixel of a view that is cut, beside the wide image: its places there are kept.
+_VIEW_BYTES = 80.0
 
 _thread = threading.local()
 _children: list[ChildProcess] = []
@@ -80,7 +82,7 @@ class UndistortTask:
     @property
     def files(self) -> list[Path]:
         """What will be there."""
-        return [self.target] if self.image.mask is None else [self.target, self.mask_target]
+        return [self.target, self.mask_target] if self.image.has_mask else [self.target]
 
 
 def make_undistorted_image(task: UndistortTask) -> Facts:
@@ -109,7 +111,7 @@ def make_undistorted_image(task: UndistortTask) -> Facts:
 def _publish(task: UndistortTask) -> None:
     """Move what was made into its place."""
     moves = {task.target: task.image.image_path}
-    if task.image.mask is not None:
+    if task.image.has_mask:
         moves[task.mask_target] = task.image.mask_path
     else:
         _withdraw_mask(task)
@@ -185,13 +187,12 @@ class UndistortStage(Stage[str, UndistortTask]):
         *,
         verify: bool = False,
     ) -> None:
-        super().__init__(context, sorted(digests))
+        super().__init__(context, originals.cuts.names(digests))
         self._originals = originals
         self._digests = digests
         self._values = values
         self._verify = verify
         self._cameras = cameras_of_images(originals.model)
-        self._fields = {name: originals.fields.get(camera.camera_id) for name, camera in self._cameras.items()}
         self._numbers = {name: number for number, name in enumerate(self.items)}
 
     def job(self, item: str) -> Job[UndistortTask]:
@@ -199,18 +200,27 @@ class UndistortStage(Stage[str, UndistortTask]):
         context = self.context
         workspace = context.workspace
         options = context.options.undistortion
-        camera = plain_camera(self._cameras[item])
-        field = self._fields[item]
-        values = self._values.get(item)
-        mask = self._originals.mask_of(item)
+        original, cut = self._originals.cuts.original(item), self._originals.cuts.views.get(item)
+        camera = self._cameras[original] if cut is not None else plain_camera(self._cameras[original])
+        field = None if cut is not None else self._originals.fields.get(camera.camera_id)
+        values = self._values.get(original)
+        mask = self._originals.mask_of(original)
         # Of its own for each image, as its name may be another's without the folders; and for each run, as the
         # process of one that was killed may still be at work.
         scratch = workspace.undistortion_scratch_dir / f"{os.getpid()}-{self._numbers[item]}"
         image = ImageToUndistort(
-            self._originals.image_path(item), values, mask, camera, options, scratch, scratch / "masks", field
+            self._originals.image_path(original),
+            values,
+            mask,
+            camera,
+            options,
+            scratch,
+            scratch / "masks",
+            field,
+            cut,
         )
-        camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params), field)
-        key = context.keys.undistorted(self._digests[item], camera_parts, values, mask)
+        camera_parts = (camera.model_name, camera.width, camera.height, list(camera.params), field, cut)
+        key = context.keys.undistorted(self._digests[original], camera_parts[: 5 + bool(cut)], values, mask)
         target = workspace.image_path(item)
         record = undistorted_place(workspace, item).record
         task = UndistortTask(
@@ -224,6 +234,9 @@ class UndistortStage(Stage[str, UndistortTask]):
         known = self._is_as_made(task) or self._is_changed_by_user(task)
         pixels = camera.width * camera.height
         memory = (_BYTES if values is None and field is None else _DEEP_BYTES) * pixels
+        if cut is not None:
+            pixels = cut.face.width * cut.face.height
+            memory += _VIEW_BYTES * pixels
         if image.is_colmaps:
             memory += _PROCESS_BYTES
         cost = Cost(_SECONDS * pixels, memory, _FILE_BYTES * pixels)
@@ -247,8 +260,7 @@ class UndistortStage(Stage[str, UndistortTask]):
         is_made = record is not None and (record.key, record.state) == (task.key, "done")
         if not is_made or not all(path.is_file() for path in task.files):
             return False
-        camera = task.image.undistorted_camera
-        if image_problem(task.target, camera.width, camera.height) is not None:
+        if image_problem(task.target, *task.image.undistorted_size) is not None:
             return False
         logger.warning("%s or its mask was changed since this program made it; used as it is", task.target)
         return True

@@ -11,9 +11,10 @@ from colmap_sph.project.images.reading import fitted, read_colours
 from colmap_sph.project.map_files import check_map, find_flaw, read_depth_map, read_normal_planes
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.records import invalidate
-from colmap_sph.scene import View
+from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.fusion import ViewMaps
 from colmap_sph.stereo.map_sizes import reduced_maps
+from colmap_sph.stereo.photographs.owners import owned_pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,8 @@ class MapSources:
         What vouches for the maps, and shall not any more where they are found to be damaged.
     map_view : View, optional
         With as many pixels as the maps have, where these are more.
+    beside : tuple of View
+        The other views of its photograph that are fused, see `owned_pixels`.
     """
 
     view: View
@@ -47,6 +50,12 @@ class MapSources:
     digests: tuple[str, ...] | None = None
     record: Path | None = None
     map_view: View | None = None
+    beside: tuple[View, ...] = ()
+
+
+def views_beside(scene: Scene, name: str) -> tuple[View, ...]:
+    """The other views of a scene that were cut from the same photograph as one of it."""
+    return tuple(view.without_points() for view in scene.photograph(name).views if view.name != name)
 
 
 def read_view_maps(sources: MapSources) -> ViewMaps:
@@ -68,6 +77,8 @@ def read_view_maps(sources: MapSources) -> ViewMaps:
     mask = None if sources.mask is None else read_view_mask(sources.mask, view)
     if mask is not None:
         depth[mask == 0] = 0
+    if sources.beside:
+        depth[~owned_pixels(view, sources.beside)] = 0
     return ViewMaps(view, sources.index, depth, normals, fitted(image, (view.width, view.height)))
 
 

@@ -1,5 +1,6 @@
 """Second stage: the disparity maps of every image's pairs vote on its photometric depth."""
 
+import itertools
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -54,6 +55,7 @@ class VoteTask:
     """A view's pairs, or its estimate where only the maps are to be made from it, and where the results go."""
 
     view: View
+    lead: str
     pairs: tuple[Path, ...]
     pair_keys: tuple[str, ...]
     mask: Path
@@ -88,7 +90,7 @@ def make_photometric_maps(task: VoteTask) -> Facts:
 
 def _vote(task: VoteTask, view: View) -> DepthEstimate:
     pairs = (read_pair(file, key) for file, key in zip(task.pairs, task.pair_keys, strict=True))
-    estimate = vote_depth(view, pairs, task.vote_options, task.stations, task.residuals)
+    estimate = vote_depth(view, pairs, task.vote_options, task.stations, task.residuals, task.lead)
     mask = read_view_mask(task.mask, task.view)
     if mask is not None:
         # A pixel next to the rim can see a neighbour's disparity. Fusion leaves out what has no depth.
@@ -179,9 +181,14 @@ class VoteStage(RememberingStage[str, VoteTask]):
         """See `RememberingStage`."""
         context = self.context
         view = context.scene.view(item)
-        partners, stations = context.stations.elsewhere(item, self._partners.get(item, []))
-        files = tuple(context.pair_path(item, partner) for partner in partners)
-        pairs = [as_pair(item, partner) for partner in partners]
+        lead = context.lead(item)
+        matched = self._partners.get(lead, [])
+        partners, stations = context.stations.elsewhere(item, matched)
+        paths = [context.pair_paths(lead, partner) for partner in partners]
+        files = tuple(itertools.chain(*paths))
+        # One that is matched both ways has two maps.
+        pairs = [as_pair(lead, partner) for partner, maps in zip(partners, paths, strict=True) for _ in maps]
+        stations = [number for number, maps in zip(stations, paths, strict=True) for _ in maps]
         residuals = [self._residuals[pair] for pair in pairs]
         keys = [self._pair_keys[pair] for pair in pairs]
         key = context.keys.vote(view, keys, stations, residuals, context.cut(item))
@@ -192,6 +199,7 @@ class VoteStage(RememberingStage[str, VoteTask]):
         is_voted = is_estimate_there(estimate, key, window.view(view))
         task = VoteTask(
             view.without_points(),
+            lead,
             files,
             tuple(keys),
             context.workspace.mask_path(item),
@@ -204,7 +212,7 @@ class VoteStage(RememberingStage[str, VoteTask]):
             context.options.rectification.depths,
             window,
             context.focus,
-            tuple(self._partners.get(item, [])),
+            tuple(matched),
             maps,
             key,
             maps_key,

@@ -63,7 +63,7 @@ def undistort_deep(
     OutputError
         `target` cannot be written.
     """
-    image = _stretched(_read(source, camera, deep=True), values)
+    image = read_original(source, camera.width, camera.height, values)
     # Else COLMAP would copy it.
     if field is not None or not (camera.is_undistorted() and options.max_image_size < 0):
         image = undistorted_pixels(image, camera, options, field)
@@ -81,17 +81,30 @@ def undistort_bent(
     field: LensField,
 ) -> None:
     """Undistort an image of 8 bits whose camera has a lens field; otherwise as `undistort_deep`."""
-    image = undistorted_pixels(_read(source, camera, deep=False), camera, options, field)
+    image = undistorted_pixels(read_original(source, camera.width, camera.height, None), camera, options, field)
     write_undistorted(pycolmap.Bitmap.from_array(np.squeeze(image)), source, target)
 
 
-def _read(source: Path, camera: pycolmap.Camera, *, deep: bool) -> NDArray[Any]:
+def read_original(source: Path, width: int, height: int, values: ValueRange | None) -> NDArray[Any]:
+    """Read an image of this size: (H, W, 3 or 1), uint8, or uint16 where `values` become black and white.
+
+    Raises
+    ------
+    InputError
+        It is damaged, or not of this size.
+    """
+    if values is None:
+        return _read(source, (width, height), deep=False)
+    return _stretched(_read(source, (width, height), deep=True), values)
+
+
+def _read(source: Path, size: tuple[int, int], *, deep: bool) -> NDArray[Any]:
     try:
         image = read_pixels(source, deep=deep)
     except (OSError, DamagedError) as error:
         reason = reason_of(error) if isinstance(error, OSError) else error
         raise InputError(f"{source} cannot be read as an image ({reason}); mend or remove it.") from error
-    if image.shape[:2] != (camera.height, camera.width):
+    if image.shape[1::-1] != size:
         raise InputError(f"{source} is not of its camera's size; start again.")
     return image
 

@@ -27,6 +27,7 @@ logger = logging.getLogger(__name__)
 
 _NAMED_FILES = 3
 _UNDISTORTED = ".undistorted.json"
+_RANGE = ".range.json"
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,11 @@ def map_place(workspace: Workspace, name: str, kind: MapKind) -> Place:
     """The depth and the normal map of an image."""
     files = (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind))
     return Place(workspace.records_dir / f"{name}.{kind}.json", files)
+
+
+def range_place(workspace: Workspace, original: str) -> Place:
+    """The range map of a wide image."""
+    return Place(workspace.records_dir / f"{original}{_RANGE}", (workspace.range_map_path(original),))
 
 
 def cloud_place(workspace: Workspace, *, local: bool) -> Place:
@@ -88,6 +94,8 @@ def recorded_places(workspace: Workspace) -> Iterator[Place]:
     for kind in get_args(MapKind):
         for name in _recorded_names(workspace, f".{kind}.json"):
             yield map_place(workspace, name, kind)
+    for name in _recorded_names(workspace, _RANGE):
+        yield range_place(workspace, name)
     cloud = read_record(workspace.cloud_record_path)
     if cloud is not None:
         yield cloud_place(workspace, local=len(cloud.stamps) != len(workspace.cloud_paths))

@@ -16,6 +16,8 @@ from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.straight import straight_camera
 from colmap_sph.project.masks import undistort_mask
 from colmap_sph.project.undistortion.options import UndistortionOptions
+from colmap_sph.project.wide.cuts import Cut
+from colmap_sph.project.wide.cutting import cut_image
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,6 +41,8 @@ class ImageToUndistort:
         Where its mask is, as ``NAME.png``.
     field : LensField or None
         Of its camera.
+    cut : Cut or None
+        The view to cut from it instead, where it is wide.
     """
 
     source: Path
@@ -49,6 +53,7 @@ class ImageToUndistort:
     folder: Path
     mask_folder: Path
     field: LensField | None = None
+    cut: Cut | None = None
 
     @property
     def image_path(self) -> Path:
@@ -61,14 +66,26 @@ class ImageToUndistort:
         return self.mask_folder / f"{self.source.name}.png"
 
     @property
+    def has_mask(self) -> bool:
+        """Whether a mask is made: with every view that is cut, as these show what is beyond the lens, too."""
+        return self.mask is not None or self.cut is not None
+
+    @property
+    def undistorted_size(self) -> tuple[int, int]:
+        """Width and height of what is made."""
+        if self.cut is not None:
+            return self.cut.face.width, self.cut.face.height
+        return self.undistorted_camera.width, self.undistorted_camera.height
+
+    @property
     def undistorted_camera(self) -> pycolmap.Camera:
         """Camera of the undistorted image."""
         return straight_camera(self.camera, self.options.for_colmap(), self.field)
 
     @property
     def is_colmaps(self) -> bool:
-        """Whether COLMAP undistorts it: not where it is only copied, has more than 8 bits or a lens field."""
-        if self.values is not None or self.field is not None:
+        """Whether COLMAP undistorts it: not what is copied or cut, has more than 8 bits or a lens field."""
+        if self.values is not None or self.field is not None or self.cut is not None:
             return False
         return undistorted_camera(self.camera, self.options.for_colmap()) is not None
 
@@ -83,6 +100,9 @@ def undistort(task: ImageToUndistort) -> None:
     OutputError
         A file cannot be written.
     """
+    if task.cut is not None:
+        cut_image(task.source, task.mask, task.cut, task.values, task.image_path, task.mask_path)
+        return
     options = task.options.for_colmap()
     if task.values is not None:
         undistort_deep(task.source, task.camera, options, task.image_path, task.values, task.field)

@@ -19,6 +19,7 @@ from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
 from colmap_sph.project.state.ownership import fusion_cfg_place
 from colmap_sph.project.state.records import claim, read_json
+from colmap_sph.project.wide.table import TABLE_NAME
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -132,7 +133,7 @@ def check_made_from(workspace: Workspace, marker: Marker) -> Marker | None:
     for name in sorted({*found.options, *marker.options}):
         was, now = found.options.get(name), marker.options.get(name)
         if was != now:
-            flag = f"--{name.replace('_', '-')}"
+            flag = "--max-image-size" if name == "max_image_size" else f"--undistortion.{name.replace('_', '-')}"
             raise InputError(f"{workspace.root} was made with {flag} {was}, not {now}; give that, {again}.")
     return found
 
@@ -265,8 +266,8 @@ def has_given_model(workspace: Workspace, marker: Marker) -> bool:
 
 
 def _model_files(folder: Path) -> list[Path]:
-    paths = (folder / f"{stem}{end}" for stem in (*MODEL_FILES, *RIG_FILES) for end in (".bin", ".txt"))
-    return [path for path in paths if path.is_file()]
+    names = [f"{stem}{end}" for stem in (*MODEL_FILES, *RIG_FILES) for end in (".bin", ".txt")]
+    return [folder / name for name in (*names, TABLE_NAME) if (folder / name).is_file()]
 
 
 def model_digests(folder: Path) -> dict[str, str]:

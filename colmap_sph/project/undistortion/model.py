@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.cameras import change_camera, make_pinhole, plain_camera
@@ -25,15 +26,23 @@ from colmap_sph.project.scene_reader import scene_of_model
 from colmap_sph.project.sparse_model import cameras_of_images, load_model, model_files, submodel
 from colmap_sph.project.undistortion.options import UndistortionOptions
 from colmap_sph.project.undistortion.originals import Originals
+from colmap_sph.project.wide.cuts import Cuts
+from colmap_sph.project.wide.model import model_of_views
+from colmap_sph.project.wide.table import write_cuts
 from colmap_sph.scene import Scene
 
 _FULL_DISK_BYTES = 64 << 20
 # Space that undistortion is given, relative to the files it starts from; JPEGs come out up to 1.6 times larger.
 _SPACE_FACTOR = 2
+# Of a pixel of a view that is cut from a wide image, at most; half of it, as that factor is for all.
+_VIEW_BYTES = 1
 
 
 def foreseen_scene(originals: Originals, names: Collection[str], options: UndistortionOptions) -> Scene:
     """Return the scene of the undistorted images `names`, before they are there."""
+    if originals.cuts.views:
+        model = _model_of_views(originals.model, originals.cuts, names, originals.fields, options)
+        return scene_of_model(model, originals.model_dir, originals.cuts.views)
     model = submodel(originals.model, set(names))
     for camera_id, camera in model.cameras.items():
         change_camera(camera, straight_camera(camera, options.for_colmap(), originals.fields.get(camera_id)))
@@ -75,6 +84,14 @@ def undistort_model(task: ModelToUndistort) -> None:
         COLMAP cannot do it, or nothing more can be written.
     """
     model = load_model(task.model_dir)
+    cuts = task.options.cuts(model, task.model_dir)
+    if cuts.views:
+        made = _model_of_views(model, cuts, task.names, read_lens_fields(task.model_dir), task.options)
+        make_dir(task.final_dir)
+        made.write_binary(task.final_dir)
+        _load_written_model(task.final_dir)
+        write_cuts({name: cuts.views[name] for name in task.names if name in cuts.views}, task.final_dir)
+        return
     plain = task.folder / "plain"
     _write_plain_model(model, plain)
     # COLMAP undistorts the images that it is told of, or all: it gets one, and does not find it.
@@ -96,6 +113,28 @@ def undistort_model(task: ModelToUndistort) -> None:
     undistorted = _load_written_model(task.folder / "sparse")
     _straighten(undistorted, load_model(task.model_dir), read_lens_fields(task.model_dir), task.options)
     _write_final_model(undistorted, task.final_dir, task.names)
+
+
+def _model_of_views(
+    model: pycolmap.Reconstruction,
+    cuts: Cuts,
+    names: Collection[str],
+    fields: Mapping[int, LensField],
+    options: UndistortionOptions,
+) -> pycolmap.Reconstruction:
+    """The model of views cut from wide images, and of other images undistorted as COLMAP does it."""
+
+    def straight(camera: pycolmap.Camera) -> pycolmap.Camera:
+        made = straight_camera(camera, options.for_colmap(), fields.get(camera.camera_id))
+        make_pinhole(made)
+        return made
+
+    def moved(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        rays = np.asarray(plain_camera(camera).cam_from_img(pixels), np.float64)[:, :2]
+        field = fields.get(camera.camera_id)
+        return ray_pixels(straight(camera), rays if field is None else field.straightened(rays))
+
+    return model_of_views(model, cuts, names, straight, moved)
 
 
 def _straighten(
@@ -144,6 +183,10 @@ def check_space(originals: Originals, names: Iterable[str], output: Path, option
     cameras = cameras_of_images(originals.model)
     limit = options.max_image_size
     for name in names:
+        if name in originals.cuts.views:
+            face = originals.cuts.views[name].face
+            needed += _VIEW_BYTES * face.width * face.height
+            continue
         longest = max(cameras[name].width, cameras[name].height)
         scale = min(1.0, limit / longest) if limit > 0 else 1.0
         needed += int(scale**2 * (originals.image_dir / name).stat().st_size)

@@ -8,13 +8,14 @@ from pathlib import Path
 import pycolmap
 
 from colmap_sph.errors import InputError
-from colmap_sph.project.cameras import refuse_panoramas
 from colmap_sph.project.files import real_path
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.files import LENS_FIELDS_NAME, read_lens_fields
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import image_names, load_model, model_files
+from colmap_sph.project.undistortion.options import UndistortionOptions
+from colmap_sph.project.wide.cuts import NO_CUTS, Cuts
 from colmap_sph.project.workspace import Workspace, checked_name, mask_path
 
 
@@ -31,6 +32,8 @@ class Originals:
         What is in `model_dir`.
     fields : mapping of int to LensField
         What lenses do beyond their camera models, by camera id.
+    cuts : Cuts
+        What is cut from wide images.
     """
 
     model_dir: Path
@@ -38,6 +41,7 @@ class Originals:
     mask_dir: Path | None
     model: pycolmap.Reconstruction
     fields: Mapping[int, LensField] = field(default_factory=dict)
+    cuts: Cuts = NO_CUTS
 
     def model_digest(self) -> str:
         """Digest of the content of the model's files."""
@@ -83,13 +87,14 @@ class Originals:
                 yield mask
 
 
-def read_originals(project: Project) -> Originals:
+def read_originals(project: Project, options: UndistortionOptions) -> Originals:
     """Read a project's sparse model; where its images are is found out, if not given.
 
     Parameters
     ----------
     project : Project
         With a model.
+    options : UndistortionOptions
 
     Returns
     -------
@@ -98,11 +103,10 @@ def read_originals(project: Project) -> Originals:
     Raises
     ------
     InputError
-        No readable model, a camera without pinhole equivalent, damaged lens fields, or no images.
+        No readable model, a camera that is no lens, damaged lens fields, or no images.
     """
     assert project.model is not None
     model = load_model(project.model)
-    refuse_panoramas(model)
     images = project.images
     if images is None:
         images = find_images(project.model, image_names(model))
@@ -111,4 +115,5 @@ def read_originals(project: Project) -> Originals:
         raise InputError(
             f"The image folder {images} {'is a file' if is_file else 'does not exist'}; check --images."
         )
-    return Originals(project.model, images, project.masks, model, read_lens_fields(project.model))
+    fields = read_lens_fields(project.model)
+    return Originals(project.model, images, project.masks, model, fields, options.cuts(model, project.model))

@@ -1,25 +1,25 @@
-"""Scene → what its views have in common: shared points and their parallax, as a graph of candidates.
+"""Scene → what its photographs have in common: shared points and their parallax, as a graph of candidates.
 
 Candidates share sparse points. Without tracks the verified matches of COLMAP's database stand in for these, and
 without matches the overlap of the viewing frusta.
 """
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
-from colmap_sph.scene import Scene
+from colmap_sph.scene import Photograph, Scene
 from colmap_sph.stereo.partners.frusta import points_in_view
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles, worth_of
 
 logger = logging.getLogger(__name__)
 
 CovisibilitySource = Literal["tracks", "database", "frusta"]
-"""What tells which views see the same."""
+"""What tells which photographs see the same."""
 
 # Points that tell a pair's angle and its worth.
 _MAX_ANGLE_POINTS = 512
@@ -28,32 +28,35 @@ _ANGLE_PERCENTILE = 75
 
 
 class Covisibility:
-    """Candidates of every view with the weight of each; angles and worth are computed when asked for.
+    """Candidates of every photograph with the weight of each; angles and worth are computed when asked for.
+
+    Views that were cut from one photograph are one here. All others are photographs of their own.
 
     Parameters
     ----------
-    scene : Scene
+    photographs : sequence of Photograph
+        V of them.
     source : "tracks", "database" or "frusta"
         What the weights rest on.
     weights : (V, V) sparse array of int
-        What two views share.
+        What two photographs share.
     points : (N, 3) float64 ndarray
         World frame: the scene's, or samples of the frusta.
     observed : list of (n,) int64 ndarray
-        For every view the ascending rows of `points` that it observes or has in view.
+        For every photograph the ascending rows of `points` that it observes or has in view.
     """
 
     def __init__(
         self,
-        scene: Scene,
+        photographs: Sequence[Photograph],
         source: CovisibilitySource,
         weights: sparse.csr_array,
         points: NDArray[np.float64],
         observed: list[NDArray[np.int64]],
     ) -> None:
-        self.scene = scene
+        self.photographs = photographs
         self.source = source
-        self.centers = np.array([view.center for view in scene.views])
+        self.centers = np.array([photograph.center for photograph in photographs])
         self._weights = weights
         self._points = points
         self._observed = observed
@@ -63,11 +66,11 @@ class Covisibility:
         self._place = np.full(len(observed), -1)
 
     def weight(self, i: int, j: int) -> int:
-        """Return what views `i` and `j` share."""
+        """Return what photographs `i` and `j` share."""
         return int(self._weights[i, j])
 
     def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the views that share something with view `i`, most first, and how much it is."""
+        """Return the photographs that share something with `i`, most first, and how much it is."""
         row = slice(self._weights.indptr[i], self._weights.indptr[i + 1])
         views = self._weights.indices[row]
         weights = self._weights.data[row]
@@ -75,7 +78,7 @@ class Covisibility:
         return views[order].astype(np.int64), weights[order].astype(np.int64)
 
     def angles(self, i: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the parallax of view `i` with each of (C,) others, degrees; NaN without common points.
+        """Return the parallax of photograph `i` with each of (C,) others, degrees; NaN without common points.
 
         It is the 75th percentile of the triangulation angles over an even part of the points that both see.
         """
@@ -91,11 +94,11 @@ class Covisibility:
         return _percentiles(angles, place, len(others))
 
     def seen_by(self, i: int) -> NDArray[np.float64]:
-        """Return the (n, 3) points that view `i` observes or has in view."""
+        """Return the (n, 3) points that photograph `i` observes or has in view."""
         return self._points[self._observed[i]]
 
     def worths(self, i: int, others: NDArray[np.int64]) -> NDArray[np.float32]:
-        """Return how well each of (C,) views would serve the points of view `i`, or an even part of them."""
+        """Return how well each of (C,) photographs would serve the points of `i`, or an even part of them."""
         rows = self._observed[i]
         rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
         believed: NDArray[Any]
@@ -106,8 +109,8 @@ class Covisibility:
             entry, place = self._seen_too(rows, others)
             believed = np.zeros((len(others), len(rows)), bool)
             believed[place, entry] = True
-        views = self.scene.views
-        return worth_of(views[i], [views[j] for j in others], self._points[rows], believed)
+        candidates = [self.photographs[j] for j in others]
+        return worth_of(self.photographs[i], candidates, self._points[rows], believed)
 
     def _seen_too(
         self, rows: NDArray[np.int64], others: NDArray[np.int64]
@@ -141,13 +144,13 @@ def _percentiles(values: NDArray[np.float64], group: NDArray[np.int64], groups: 
 def find_covisibility(
     scene: Scene, min_shared_points: int, matches: Mapping[tuple[str, str], int] | None
 ) -> Covisibility:
-    """Find what views have in common: tracks, else verified matches, else samples of the frusta.
+    """Find what photographs have in common: tracks, else verified matches, else samples of the frusta.
 
     Parameters
     ----------
     scene : Scene
     min_shared_points : int
-        Least number of points, or matches, that two views must share to be candidates of each other.
+        Least number of points, or matches, that two photographs must share to be candidates of each other.
     matches : mapping or None
         Names of two images → number of their verified matches; serves where the model has no tracks.
 
@@ -155,26 +158,33 @@ def find_covisibility(
     -------
     Covisibility
     """
-    points, observed, has_tracks = points_in_view(scene)
+    points, of_views, has_tracks = points_in_view(scene)
+    photographs = scene.photographs
+    observed = [_together([of_views[scene.index_of[view.name]] for view in each.views]) for each in photographs]
     if has_tracks:
         weights = _shared_points(observed, len(points), min_shared_points)
-        return Covisibility(scene, "tracks", weights, points, observed)
+        return Covisibility(photographs, "tracks", weights, points, observed)
     if matches is not None:
-        weights = _match_counts(scene, matches, min_shared_points)
+        weights = _match_counts(photographs, matches, min_shared_points)
         if weights.nnz:
-            return Covisibility(scene, "database", weights, points, observed)
+            return Covisibility(photographs, "database", weights, points, observed)
         logger.warning("the database has no verified matches of the model's images")
-    return Covisibility(scene, "frusta", _shared_points(observed, len(points), 1), points, observed)
+    return Covisibility(photographs, "frusta", _shared_points(observed, len(points), 1), points, observed)
+
+
+def _together(observed: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """The ascending rows that any view of a photograph sees."""
+    return observed[0] if len(observed) == 1 else np.unique(np.concatenate(observed))
 
 
 def _shared_points(observed: list[NDArray[np.int64]], num_points: int, least: int) -> sparse.csr_array:
-    """Count the points that two views share, as a (V, V) matrix of counts of at least `least`."""
+    """Count the points that two photographs share, as a (V, V) matrix of counts of at least `least`."""
     seen = _incidence(observed, num_points)
     return _without_self_and_few(seen @ seen.T, least)
 
 
 def _incidence(observed: list[NDArray[np.int64]], num_points: int) -> sparse.csr_array:
-    """(V, N) matrix of ones where a view sees a point."""
+    """(V, N) matrix of ones where a photograph sees a point."""
     indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
     indices = np.concatenate([*observed, np.empty(0, np.int64)]).astype(np.int32)
     ones = np.ones(len(indices), dtype=np.int32)
@@ -188,10 +198,12 @@ def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_ar
     return sparse.csr_array(kept, shape=counts.shape)
 
 
-def _match_counts(scene: Scene, matches: Mapping[tuple[str, str], int], least: int) -> sparse.csr_array:
-    """Numbers of verified matches between views, as a (V, V) matrix of those of at least `least`."""
-    index_of = scene.index_of
+def _match_counts(
+    photographs: Sequence[Photograph], matches: Mapping[tuple[str, str], int], least: int
+) -> sparse.csr_array:
+    """Numbers of verified matches between photographs, as a (V, V) matrix of those of at least `least`."""
+    index_of = {photograph.name: index for index, photograph in enumerate(photographs)}
     known = [(index_of[a], index_of[b], n) for (a, b), n in matches.items() if a in index_of and b in index_of]
     first, second, counts = np.array(known, dtype=np.int64).reshape(-1, 3).T
     both = (np.tile(counts, 2), (np.concatenate([first, second]), np.concatenate([second, first])))
-    return _without_self_and_few(sparse.csr_array(both, shape=(len(scene.views),) * 2), least)
+    return _without_self_and_few(sparse.csr_array(both, shape=(len(photographs),) * 2), least)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Photograph, Scene, View
 
 # Depths of the samples in units of the distance to the neighbours, and samples per side of an image.
 _DEPTHS = (2.0, 4.0, 8.0)
@@ -138,6 +138,11 @@ def seen_by(views: Sequence[View], points: NDArray[np.float64]) -> NDArray[np.bo
         x, y = x / w, y / w
     widths, heights = np.array([(view.width, view.height) for view in views]).T[..., None]
     return np.asarray((camera[..., 2] > 0) & (x > 0) & (y > 0) & (x < widths) & (y < heights))
+
+
+def any_sees(photograph: View | Photograph, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of (N, 3) points lie in any view of a photograph, see `sees`."""
+    return np.asarray(np.any([sees(view, points) for view in photograph.views], axis=0))
 
 
 def sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:

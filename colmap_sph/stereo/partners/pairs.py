@@ -5,6 +5,7 @@ see all of the image. Without tracks the verified matches of COLMAP's database s
 without these the overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
 """
 
+import itertools
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.scene import Scene, SourceImages
 from colmap_sph.stereo.partners.covisibility import Covisibility, CovisibilitySource, find_covisibility
+from colmap_sph.stereo.partners.facing import Facing
 from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.partner_choice import choose
 from colmap_sph.stereo.partners.stations import StationCounter
@@ -45,7 +47,8 @@ class PairOptions:
     """Parallax in degrees above which a partner comes after all others."""
 
     min_shared_points: int = 10
-    """Least number of sparse points (or verified matches) that both images must have."""
+    """Least number of sparse points (or verified matches) that both images must have, all views of a photograph
+    together."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of its bounds."""
@@ -86,6 +89,8 @@ class Partner:
 @dataclass(frozen=True)
 class PairSelection:
     """The partners of every reference image.
+
+    Views that were cut from one photograph are one image here, which is called by the name of the first of them.
 
     Attributes
     ----------
@@ -157,10 +162,11 @@ def select_pairs(
     options.check()
     graph = find_covisibility(scene, options.min_shared_points, matches)
     if explicit is None:
-        partners = {view.name: _best_partners(graph, options, i) for i, view in enumerate(scene.views)}
+        photographs = enumerate(graph.photographs)
+        partners = {photograph.lead.name: _best_partners(graph, options, i) for i, photograph in photographs}
         selection = PairSelection(partners, graph.source)
     else:
-        selection = _explicit_selection(graph, options, explicit)
+        selection = _explicit_selection(scene, graph, options, explicit)
     report_selection(selection, options)
     return selection
 
@@ -172,23 +178,30 @@ class Overlap:
     """
 
     def __init__(self, scene: Scene) -> None:
+        self._scene = scene
         self._graph = find_covisibility(scene, 1, None)
+        self._index_of = {photograph.name: index for index, photograph in enumerate(scene.photographs)}
 
     def of(self, name: str, most: int) -> list[str]:
-        """Names of up to so many views, those which share most points with the view first."""
-        scene = self._graph.scene
-        candidates, _ = self._graph.candidates(scene.index_of[name])
-        return [scene.views[j].name for j in candidates[:most]]
+        """Names of up to so many views, those whose photographs share most points with the view's first.
+
+        Of each of these photographs there is one, its first.
+        """
+        photographs = self._scene.photographs
+        candidates, _ = self._graph.candidates(self._index_of[self._scene.photograph(name).name])
+        return [photographs[j].lead.name for j in candidates[:most]]
 
 
 def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
     """Names of up to `most` views that overlap each view, see `Overlap`."""
     overlap = Overlap(scene)
-    return {view.name: overlap.of(view.name, most) for view in scene.views}
+    facing = Facing(scene)
+    found = {view.name: facing.views(view.name, overlap.of(view.name, most)) for view in scene.views}
+    return {name: [*itertools.chain(*views)] for name, views in found.items()}
 
 
 def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[Partner, ...]:
-    """Return the best partners of view `i`.
+    """Return the best partners of photograph `i`, each by the name of its first view.
 
     These are the ones that together see most of it, then those under a wide angle, and last those that stand
     beside one of these.
@@ -198,8 +211,8 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
     beside: list[Partner] = []
     worths: list[NDArray[np.float32]] = []
     most = max(_MAX_CANDIDATES, options.num_pairs)
-    views = graph.scene.views
-    stations = StationCounter(graph.seen_by(i), views[i], options.min_triangulation_angle)
+    photographs = graph.photographs
+    stations = StationCounter(graph.seen_by(i), photographs[i], options.min_triangulation_angle)
     candidates, weights = graph.candidates(i)
     for first in range(0, len(candidates), _AT_A_TIME):
         if len(near) == most or len(near) + len(wide) == 2 * most or len(beside) == _MAX_BESIDE * most:
@@ -208,12 +221,13 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
         angles = graph.angles(i, some)
         is_apart = ~np.isnan(angles) | (graph.centers[some] != graph.centers[i]).any(axis=1)
         good = np.flatnonzero(is_apart & ~(angles < options.min_triangulation_angle))
-        is_new = stations.are_new([views[j] for j in some[good]])
+        is_new = stations.are_new([photographs[j] for j in some[good]])
         chosen = []
         for k, new in zip(good.tolist(), is_new, strict=True):
             if len(near) == most or len(near) + len(wide) == 2 * most or len(beside) == _MAX_BESIDE * most:
                 break
-            partner = Partner(views[some[k]].name, int(weights[first + k]), float(angles[k]))
+            name = photographs[some[k]].lead.name
+            partner = Partner(name, int(weights[first + k]), float(angles[k]))
             if not new:
                 beside.append(partner)
             elif angles[k] > options.max_triangulation_angle:
@@ -228,26 +242,33 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
 
 
 def _explicit_selection(
-    graph: Covisibility, options: PairOptions, explicit: Mapping[str, SourceImages]
+    scene: Scene, graph: Covisibility, options: PairOptions, explicit: Mapping[str, SourceImages]
 ) -> PairSelection:
-    index_of = graph.scene.index_of
+    index_of = scene.index_of
+    place_of = {photograph.name: place for place, photograph in enumerate(graph.photographs)}
     _warn_unknown(explicit, index_of)
     partners: dict[str, tuple[Partner, ...]] = {}
     obeyed = set(index_of) - set(explicit) != set()
     for name in sorted(explicit.keys() & index_of.keys(), key=index_of.__getitem__):
         sources = explicit[name]
-        i = index_of[name]
+        photograph = scene.photograph(name)
+        i = place_of[photograph.name]
         if isinstance(sources, int):
-            partners[name] = _best_partners(graph, options, i)
-            continue
-        obeyed = True
-        named = index_of if sources == "__all__" else sources
-        known = [index_of[other] for other in named if other in index_of and other != name]
-        angles = graph.angles(i, np.array(known, np.int64))
-        partners[name] = tuple(
-            Partner(graph.scene.views[j].name, graph.weight(i, j), float(angle))
-            for j, angle in zip(known, angles, strict=True)
-        )
+            found = _best_partners(graph, options, i)
+        else:
+            obeyed = True
+            named = index_of if sources == "__all__" else sources
+            places = [place_of[scene.photograph(other).name] for other in named if other in index_of]
+            known = [place for place in dict.fromkeys(places) if place != i]
+            angles = graph.angles(i, np.array(known, np.int64))
+            found = tuple(
+                Partner(graph.photographs[j].lead.name, graph.weight(i, j), float(angle))
+                for j, angle in zip(known, angles, strict=True)
+            )
+        # Views of one photograph have their partners in common.
+        before = partners.get(photograph.lead.name, ())
+        others = {partner.name for partner in before}
+        partners[photograph.lead.name] = before + tuple(each for each in found if each.name not in others)
     return PairSelection(partners, "patch-match.cfg" if obeyed else graph.source)
 
 

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.partners.frusta import seen_by
 
 # What a point that a view and a candidate both observe is worth; one that only lies in the candidate's view, where
@@ -48,14 +48,17 @@ def triangulation_angles(
 
 
 def worth_of(
-    view: View, candidates: Sequence[View], points: NDArray[np.float64], observed: NDArray[np.bool_] | float
+    view: View | Photograph,
+    candidates: Sequence[View | Photograph],
+    points: NDArray[np.float64],
+    observed: NDArray[np.bool_] | float,
 ) -> NDArray[np.float32]:
-    """How well candidates would serve each point of a view.
+    """How well candidates would serve each point of a view or photograph.
 
     Parameters
     ----------
-    view : View
-    candidates : sequence of View
+    view : View or Photograph
+    candidates : sequence of View or Photograph
         C of them.
     points : (N, 3) float64 ndarray
         Points that the view observes, world frame.
@@ -69,12 +72,20 @@ def worth_of(
     """
     centers = np.array([candidate.center for candidate in candidates])
     angles = triangulation_angles(points, view.center, centers[:, None])
-    in_sight = seen_by(candidates, points)
+    in_sight = _in_sight(candidates, points)
     observed = np.asarray(observed)
     if observed.dtype == bool:
         in_sight |= observed  # whatever the rounding at the image's rim
     parallax = np.interp(angles, _ANGLES, (0.0, 1.0, 1.0, 0.0))
     return np.asarray(in_sight * parallax * (1 - _OBSERVED + _OBSERVED * observed), dtype=np.float32)
+
+
+def _in_sight(candidates: Sequence[View | Photograph], points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(C, N) bool: which points each candidate has in view, a photograph in any of its views."""
+    views = [candidate.views for candidate in candidates]
+    firsts = np.cumsum([0, *map(len, views[:-1])])
+    seen = seen_by([view for cut in views for view in cut], points)
+    return np.asarray(np.logical_or.reduceat(seen, firsts, axis=0))
 
 
 def choose(worths: NDArray[np.float32], count: int) -> list[int]:

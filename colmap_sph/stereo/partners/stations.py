@@ -1,19 +1,20 @@
-"""Views that stand side by side → stations, each of which counts once.
+"""Photographs that were taken side by side → stations, each of which counts once.
 
 Two frames of a hovering drone see the same from the same place: they are matched with the same images, make the
 same mistakes, and confirm each other. To a third view they are one witness, not two. So views are of one *station*
 where their baseline subtends, at what that third view sees, less than the angle under which a pair is worth
 matching, and where they look the same way: cameras of a rig that look apart have different pictures of what they
-share.
+share. Views that were cut from one photograph are one witness wherever they look.
 """
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Scene
 from colmap_sph.stereo.partners.frusta import points_in_view
 
 # Points that tell the angles of a view; so large a share of them must see two views as one (the angle of a pair is
@@ -29,33 +30,45 @@ OWN_STATION = 0
 """Number of the station of the view that looks."""
 
 
+class Standing(Protocol):
+    """A view or a photograph: it stands somewhere, and looks somewhere; all around where its direction is zero."""
+
+    @property
+    def center(self) -> NDArray[np.float64]:
+        """(3,) projection centre, world frame."""
+
+    @property
+    def viewing_direction(self) -> NDArray[np.float64]:
+        """(3,) unit vector, world frame, or zero."""
+
+
 class StationCounter:
-    """Numbers the stations of views, one after the other, as one view sees them.
+    """Numbers the stations of views or photographs, one after the other, as one of them sees them.
 
     Parameters
     ----------
     points : (n, 3) float64 ndarray
         What the view sees, world frame.
-    view : View
-        The view itself: the first of station `OWN_STATION`.
+    view : View or Photograph
+        The one that looks: the first of station `OWN_STATION`.
     least_angle : float
         Degrees; views nearer to each other than this are of one station.
     """
 
-    def __init__(self, points: NDArray[np.float64], view: View, least_angle: float) -> None:
+    def __init__(self, points: NDArray[np.float64], view: Standing, least_angle: float) -> None:
         self._points = points[:: -(-len(points) // _MAX_POINTS) or 1]
         self._cosine = float(np.cos(np.radians(least_angle)))
         self._firsts = self._rays([view])
         self._axes = view.viewing_direction[None]
 
-    def numbers(self, views: Sequence[View]) -> list[int]:
+    def numbers(self, views: Sequence[Standing]) -> list[int]:
         """Return the station of each view: the first one whose first view is near enough, or a new one."""
         numbers: list[int] = []
         for first in range(0, len(views), _AT_A_TIME):
             numbers += self._numbers(views[first : first + _AT_A_TIME])
         return numbers
 
-    def are_new(self, views: Sequence[View]) -> list[bool]:
+    def are_new(self, views: Sequence[Standing]) -> list[bool]:
         """Whether each view stands where none stood before, the one after the other."""
         known = len(self._axes)
         is_new = []
@@ -64,7 +77,7 @@ class StationCounter:
             known = max(known, number + 1)
         return is_new
 
-    def _numbers(self, views: Sequence[View]) -> list[int]:
+    def _numbers(self, views: Sequence[Standing]) -> list[int]:
         rays = self._rays(views)
         axes = np.array([view.viewing_direction for view in views])
         stands_at = self._are_one(rays, axes, self._firsts, self._axes)
@@ -94,9 +107,11 @@ class StationCounter:
         """(V, W) bool: which of two lots of views stand side by side and look the same way."""
         cosines = np.einsum("vpi,wpi->vwp", rays, others)
         is_near = np.count_nonzero(cosines > self._cosine, axis=2) >= max(_MOST * rays.shape[1], 1)
-        return np.asarray(is_near & (axes @ other_axes.T > _SAME_WAY))
+        look_alike = axes @ other_axes.T > _SAME_WAY
+        look_alike |= np.logical_or.outer(~axes.any(axis=1), ~other_axes.any(axis=1))
+        return np.asarray(is_near & look_alike)
 
-    def _rays(self, views: Sequence[View]) -> NDArray[np.float64]:
+    def _rays(self, views: Sequence[Standing]) -> NDArray[np.float64]:
         """(V, P, 3) unit vectors from the views to the points."""
         rays = self._points - np.array([view.center for view in views])[:, None]
         with np.errstate(invalid="ignore", divide="ignore"):  # a point at the centre is near to nothing
@@ -130,19 +145,26 @@ class Stations:
         name : str
             The view that looks.
         others : sequence of str
-            Views that overlap it. The first of a station stands for it.
+            Views that overlap it. The first photograph of a station stands for it.
 
         Returns
         -------
         list of int
             For each of them its station, from 1 in the order of their first views; `OWN_STATION` for those that
-            stand where the view itself does. Where all do, each is a station of its own: there is nothing better.
+            stand where the view itself does. Where all do, each photograph is a station of its own: there is
+            nothing better. Views of one photograph always have one number, and those of the view's own are of
+            its station.
         """
-        index = self._scene.index_of[name]
+        scene = self._scene
         points, observed = self._points_in_view
-        stations = StationCounter(points[observed[index]], self._scene.views[index], self._least_angle)
-        found = stations.numbers([self._scene.view(other) for other in others])
-        return found if any(found) else list(range(1, 1 + len(found)))
+        own = scene.photograph(name)
+        shown = [scene.photograph(other) for other in others]
+        photographs = [photograph for photograph in dict.fromkeys(shown) if photograph is not own]
+        stations = StationCounter(points[observed[scene.index_of[name]]], own, self._least_angle)
+        found = stations.numbers(photographs)
+        numbers = found if any(found) else range(1, 1 + len(found))
+        number_of = dict(zip(photographs, numbers, strict=True))
+        return [number_of.get(photograph, OWN_STATION) for photograph in shown]
 
     def elsewhere(self, name: str, others: Sequence[str]) -> tuple[list[str], list[int]]:
         """Those of the others that stand elsewhere, and their stations' numbers, which ascend; see `numbers`."""

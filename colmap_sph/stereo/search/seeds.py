@@ -5,7 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_sph.scene import Scene, View, observed_by
+from colmap_sph.scene import Photograph, Scene, View, observed_by
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordinates_of_rays
 
 Seeds = NDArray[np.floating]
@@ -30,7 +30,7 @@ _MOST_PLACES = 8192
 _EQUALLY_FINE = 1.02
 
 
-def shared_points(scene: Scene, left: View, right: View) -> Float:
+def shared_points(scene: Scene, left: View | Photograph, right: View | Photograph) -> Float:
     """(n, 3) sparse points that both views observe, world frame."""
     return scene.points[observed_by(left, right)[1]]
 

@@ -1,0 +1,108 @@
+"""Which cameras of a model are wide, and how far off the axis each of them is believed."""
+
+import logging
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.project.wide.layout import WIDEST_PINHOLE, angles_shown
+from colmap_sph.project.wide.projection import MODELS, PANORAMA, Lens, camera_rays, principal_point, turning_angle
+
+logger = logging.getLogger(__name__)
+
+# Radians beyond what is observed up to which a polynomial is believed.
+_BEYOND = np.radians(2.0)
+# Share of its observations that may lie beyond a lens: mistakes; more say that it is not this lens.
+_MOST_BEYOND = 0.01
+_HALF = 0.5
+
+
+def wide_lenses(model: pycolmap.Reconstruction, name: str) -> dict[int, Lens]:
+    """Lenses of a model that a single pinhole view cannot hold, by camera id.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    name : str
+        Of the model, for messages.
+
+    Raises
+    ------
+    InputError
+        A camera's parameters describe no lens, or one that does not show what it is said to have observed.
+    """
+    lenses = {}
+    for camera_id in sorted(used_cameras(model)):
+        camera = model.camera(camera_id)
+        if camera.model_name == PANORAMA:
+            lenses[camera_id] = _panorama(camera, name)
+        elif camera.model_name in MODELS:
+            lens = _fisheye(model, camera, name)
+            if max(angles_shown(lens)) > WIDEST_PINHOLE:
+                lenses[camera_id] = lens
+    return lenses
+
+
+def used_cameras(model: pycolmap.Reconstruction) -> set[int]:
+    """Ids of the cameras of registered images."""
+    return {model.image(image_id).camera_id for image_id in model.reg_image_ids()}
+
+
+def _lens(camera: pycolmap.Camera) -> Lens:
+    return Lens(camera.model_name, tuple(map(float, camera.params)), camera.width, camera.height)
+
+
+def _panorama(camera: pycolmap.Camera, name: str) -> Lens:
+    width, height = camera.params
+    if not (np.isfinite([width, height]).all() and min(width, height) >= 1):
+        raise InputError(f"Camera {camera.camera_id} in {name} has impossible parameters; export the model again.")
+    return _lens(camera)
+
+
+def _fisheye(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str) -> Lens:
+    lens = _lens(camera)
+    is_possible = np.isfinite(lens.params).all() and camera.mean_focal_length() > 0
+    turn = turning_angle(lens) if is_possible else 0.0
+    if turn < _BEYOND:
+        raise InputError(
+            f"Camera {camera.camera_id} ({camera.model_name}) in {name} describes no lens: points do not move "
+            "outward with their angle off its axis; calibrate it again."
+        )
+    observed = _observed(model, camera.camera_id)
+    if not len(observed):
+        return replace(lens, limit=min(turn, _rim(lens)))
+    rays = camera_rays(lens, observed)
+    beyond = np.isnan(rays[:, 2])
+    if beyond.mean() > _MOST_BEYOND:
+        raise InputError(
+            f"Camera {camera.camera_id} ({camera.model_name}) in {name} shows nothing beyond "
+            f"{np.degrees(turn):.0f} degrees off its axis by its parameters, but {100 * beyond.mean():.0f} % of "
+            "what it observes lies beyond; calibrate it again, or choose another camera model."
+        )
+    reach = float(np.arccos(np.clip(rays[~beyond, 2].min(), -1, 1)))
+    return replace(lens, limit=min(turn, reach + _BEYOND))
+
+
+def _observed(model: pycolmap.Reconstruction, camera_id: int) -> NDArray[np.float64]:
+    """(n, 2) image coordinates of all points that a camera observes."""
+    places = list(_places(model, camera_id))
+    return np.concatenate(places) if places else np.empty((0, 2))
+
+
+def _places(model: pycolmap.Reconstruction, camera_id: int) -> Iterator[NDArray[np.float64]]:
+    for image_id in model.reg_image_ids():
+        image = model.image(image_id)
+        if image.camera_id == camera_id and image.num_points3D:
+            yield np.array([point.xy for point in image.get_observation_points2D()])
+
+
+def _rim(lens: Lens) -> float:
+    """Radians that the largest circle in the image shows: what lies beyond may be the inside of the lens."""
+    x, y = principal_point(lens)
+    ends = np.array([[_HALF, y], [lens.width - _HALF, y], [x, _HALF], [x, lens.height - _HALF]])
+    depth = camera_rays(lens, ends)[:, 2]
+    return float(np.arccos(np.clip(np.nan_to_num(depth, nan=-1.0), -1, 1)).max())

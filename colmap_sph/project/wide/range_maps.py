@@ -1,0 +1,164 @@
+"""Maps of the views cut from a wide image → the range and normal of each of its own pixels, and their file.
+
+The range is the distance from the camera's centre, along the ray of the pixel's centre.
+"""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio  # noqa: N813
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.wide.projection import Lens, camera_rays
+
+Pixels = NDArray[np.float32]
+
+CHANNELS = ("range", "normal.X", "normal.Y", "normal.Z")
+"""Of the file. Normals are unit vectors in the frame of the image's camera, towards it; 0 where there is none."""
+
+_BAND_PIXELS = 1 << 18
+# Cosine between ray and normal below which a pixel's plane says nothing of the rays beside it.
+_GRAZING = 0.05
+# By which a plane may change the range within a pixel, relative to it.
+_MOST_CHANGE = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMaps:
+    """Maps of a view that was cut.
+
+    Attributes
+    ----------
+    R : (3, 3) float64 ndarray
+        From the frame of the image's camera to the view's.
+    K : (3, 3) float64 ndarray
+        Calibration matrix of the view.
+    depth : (H, W) float32 ndarray
+        COLMAP's depth map.
+    normals : (H, W, 3) float32 ndarray
+        COLMAP's normal map.
+    """
+
+    R: NDArray[np.float64]
+    K: NDArray[np.float64]
+    depth: Pixels
+    normals: Pixels
+
+
+def range_and_normals(lens: Lens, views: Sequence[ViewMaps]) -> tuple[Pixels, Pixels]:
+    """What the views of an image know of its pixels: of each pixel the view with the axis nearest to its ray.
+
+    Parameters
+    ----------
+    lens : Lens
+        Of the image.
+    views : sequence of ViewMaps
+
+    Returns
+    -------
+    range : (H, W) float32 ndarray
+        0 where no view has a depth.
+    normals : (H, W, 3) float32 ndarray
+    """
+    found = np.zeros((lens.height, lens.width), np.float32)
+    normals = np.zeros((lens.height, lens.width, 3), np.float32)
+    for rows in _bands(lens):
+        rays = _rays(lens)[rows].reshape(-1, 3).astype(np.float64)
+        distance, normal = np.zeros(len(rays)), np.zeros((len(rays), 3))
+        nearest = np.full(len(rays), -np.inf)
+        for view in views:
+            local = rays @ view.R.T
+            seen = np.flatnonzero((local[:, 2] > nearest) & (local[:, 2] > 0))
+            here, normal_here = _looked_up(view, local[seen])
+            has_depth = here > 0
+            chosen = seen[has_depth]
+            distance[chosen] = here[has_depth]
+            normal[chosen] = normal_here[has_depth] @ view.R
+            nearest[chosen] = local[chosen, 2]
+        found[rows] = distance.reshape(-1, lens.width)
+        normals[rows] = normal.reshape(-1, lens.width, 3)
+    return found, normals
+
+
+def _looked_up(view: ViewMaps, rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Distances (n,) along unit rays in the view's frame with z > 0, 0 where there is none, and normals (n, 3)."""
+    height, width = view.depth.shape
+    places = (rays @ view.K.T)[:, :2] / rays[:, 2:]
+    # A value belongs to the ray through (column, row), see COLMAP's fusion.
+    column, row = np.rint(np.clip(places, -1, 1 << 24)).astype(np.int64).T
+    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
+    column, row = column * inside, row * inside
+    depth = view.depth[row, column].astype(np.float64) * inside
+    normals = view.normals[row, column].astype(np.float64)
+    own = np.column_stack([column, row, np.ones(len(rays))]) @ np.linalg.inv(view.K).T
+    towards = np.einsum("ni,ni->n", normals, rays)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        plane = depth * np.einsum("ni,ni->n", normals, own) / towards
+        distance = depth / rays[:, 2]
+        is_plane = (towards < -_GRAZING) & (np.abs(plane / distance - 1) < _MOST_CHANGE)
+    return np.where(is_plane, plane, distance), normals
+
+
+def pixels_shown(lens: Lens) -> int:
+    """Number of an image's pixels that show something: the others lie beyond the lens."""
+    return int(np.count_nonzero(~np.isnan(_rays(lens)[:, :, 0])))
+
+
+@lru_cache(maxsize=1)
+def _rays(lens: Lens) -> Pixels:
+    """(H, W, 3) rays of the centres of a lens's pixels; NaN where it shows nothing."""
+    rays = np.empty((lens.height, lens.width, 3), np.float32)
+    for rows in _bands(lens):
+        x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
+        rays[rows] = camera_rays(lens, np.column_stack([x.ravel(), y.ravel()])).reshape(-1, lens.width, 3)
+    return rays
+
+
+def _bands(lens: Lens) -> Iterator[slice]:
+    step = max(_BAND_PIXELS // lens.width, 1)
+    for top in range(0, lens.height, step):
+        yield slice(top, min(top + step, lens.height))
+
+
+def write_range_map(path: Path, distance: Pixels, normals: Pixels) -> str:
+    """Write range and normals as an OpenEXR image with `CHANNELS`; returns the `files.whole_digest` of the file.
+
+    Raises
+    ------
+    OutputError
+        The file cannot be written.
+    """
+    make_dir(path.parent)
+    height, width = distance.shape
+    spec = oiio.ImageSpec(width, height, len(CHANNELS), "float")
+    spec.channelnames = CHANNELS
+    spec["compression"] = "zip"
+    image = oiio.ImageBuf(spec)
+    image.set_pixels(image.roi, np.ascontiguousarray(np.dstack([distance, normals]), np.float32))
+    try:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".range-") as folder:
+            made = Path(folder) / "made.exr"
+            if not image.write(str(made)):
+                raise OutputError(f"{path} cannot be written ({image.geterror()}); check space and permissions.")
+            with atomic_file(path, sync=False) as file:
+                file.write(made.read_bytes())
+                return file.digest
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
+        ) from error
+
+
+def read_range_map(path: Path) -> tuple[Pixels, Pixels]:
+    """Read the range (H, W) and normals (H, W, 3) of `write_range_map`; `InputError` where it is no such file."""
+    image = oiio.ImageBuf(str(path))
+    if image.has_error or tuple(image.spec().channelnames) != CHANNELS:
+        raise InputError(f"{path} is no range map, or damaged; run again.")
+    pixels = np.asarray(image.get_pixels("float"), np.float32)
+    return pixels[:, :, 0], pixels[:, :, 1:]

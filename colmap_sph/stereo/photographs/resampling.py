@@ -1,0 +1,99 @@
+"""Photograph that was cut into views → its rectified image, each pixel read from the view that owns its ray.
+
+That is the view whose axis is nearest, of those that have the ray in their image, as in `owners`. The views are
+samples of one photograph, so what comes of their seams is as smooth as the photograph.
+"""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.scene import View
+from colmap_sph.stereo.rectified_pair import RectifiedPair, Side
+from colmap_sph.stereo.resampling import RayTables, pixel_maps, ray_tables
+
+# Rows that are read at a time, which bounds memory.
+_BAND_ROWS = 64
+# Every so many-th pixel tells where in a band a view is; it reaches no more than as many beyond.
+_COARSE = 8
+
+Image = NDArray[np.uint8] | NDArray[np.float32]
+
+
+def resample_photograph(
+    images: Sequence[Image],
+    views: Sequence[View],
+    pair: RectifiedPair,
+    side: Side,
+    masks: Sequence[NDArray[np.uint8] | None],
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Resample the views of a photograph to the sphere, as `resample` does with one.
+
+    Parameters
+    ----------
+    images : sequence of (view.height, view.width) uint8 or float32 ndarray
+        Grey, of each view.
+    views : sequence of View
+        Of one centre.
+    pair : RectifiedPair
+    side : {"left", "right"}
+        Which of the pair's images the photograph is.
+    masks : sequence of (view.height, view.width) uint8 ndarray or None
+        255 where the image counts, 0 where it is to be ignored.
+
+    Returns
+    -------
+    rectified : (H, W) float32 ndarray
+    valid : (H, W) uint8 ndarray
+        255 where a view has the ray in its image, and no ignored pixel of the view that owns it has a part in it.
+    """
+    shape = (pair.height, pair.width(side))
+    rectified = np.zeros(shape, np.float32)
+    valid = np.zeros(shape, np.uint8)
+    pixels = [image.astype(np.float32, copy=False) for image in images]
+    tables = [ray_tables(view, pair, side) for view in views]
+    for first in range(0, pair.height, _BAND_ROWS):
+        band = slice(first, min(first + _BAND_ROWS, pair.height))
+        nearness = np.zeros(rectified[band].shape, np.float32)
+        for image, view, table, mask in zip(pixels, views, tables, masks, strict=True):
+            columns = _columns_of(view, table, band)
+            if columns.start < columns.stop:
+                target = (rectified[band, columns], valid[band, columns], nearness[:, columns])
+                _read(image, view, table.rays(band, columns), mask, *target)
+    return rectified, valid
+
+
+def _columns_of(view: View, tables: RayTables, band: slice) -> slice:
+    """The columns of a band in which a view may have rays; none where it has none."""
+    rows = slice(band.start, band.stop + _COARSE - 1, _COARSE)
+    *_, inside = pixel_maps(view, *tables.rays(rows, slice(None, None, _COARSE)))
+    found = np.flatnonzero(inside.any(axis=0))
+    if not len(found):
+        return slice(0, 0)
+    return slice(max((int(found[0]) - 1) * _COARSE, 0), (int(found[-1]) + 1) * _COARSE + 1)
+
+
+def _read(
+    image: NDArray[np.float32],
+    view: View,
+    rays: tuple[NDArray[np.float32], ...],
+    mask: NDArray[np.uint8] | None,
+    rectified: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+    nearness: NDArray[np.float32],
+) -> None:
+    """Read the pixels whose rays are nearer to the view's axis than to those of the views before."""
+    x, y, z = rays
+    cosine = z.copy()
+    columns, rows, inside = pixel_maps(view, x, y, z)
+    owned = (inside > 0) & (cosine > nearness)
+    if not owned.any():
+        return
+    nearness[owned] = cosine[owned]
+    if mask is not None:
+        inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
+    values = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    rectified[owned] = values[owned]
+    valid[owned] = inside[owned]

@@ -1,0 +1,119 @@
+"""Measure a workspace of fisheyes or panoramas against exact range, counted per original image.
+
+    python scripts/measure_wide.py SCENE [--width 480] [--panoramas] [-- options of colmap_sph run]
+
+SCENE is a folder: where it does not exist, a courtyard is rendered into it. The program runs on it, and of the
+pixels of the original images that show a surface, these shares are printed: covered; within 2 % of the exact
+range; of those that are covered, off by more than 5 %. Covered is what any of the views cut from an image covers;
+the range is that of the view nearest to its axis there. The last numbers are the coverage within 2 degrees of the
+border of any of these views over that 12 degrees away from all; processor seconds of the command.
+"""
+
+import argparse
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from colmap_sph.synthetic.wide.courtyard import CourtyardOptions, make_courtyard
+
+Float = NDArray[np.float64]
+
+
+def margins(K: Float, width: int, height: int, rays: Float) -> Float:
+    """Radians by which unit rays (n, 3) in a pinhole's frame lie inside its borders."""
+    low = np.linalg.inv(K) @ [0.0, 0.0, 1.0]
+    high = np.linalg.inv(K) @ [width, height, 1.0]
+    sides = np.array([[1, 0, -low[0]], [-1, 0, high[0]], [0, 1, -low[1]], [0, -1, high[1]]])
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    return np.asarray(np.arcsin(np.clip(rays @ sides.T, -1, 1)).min(axis=1))
+
+
+def read_depth(path: Path) -> Float:
+    """A map of COLMAP's, or one without any depth."""
+    if not path.exists():
+        return np.zeros((1, 1))
+    depth = pycolmap.DepthMap()
+    depth.read(str(path))
+    return np.asarray(depth.to_array(), np.float64)
+
+
+def measure_image(
+    workspace: Path, views: pycolmap.Reconstruction, original: pycolmap.Image, truth: Path, kind: str
+) -> tuple[Float, Float, Float]:
+    """Range, exact range, and margin to the nearest border of any view, of the pixels that show a surface."""
+    with np.load(truth) as arrays:
+        exact, rays = arrays["range"].astype(np.float64), arrays["rays"].astype(np.float64)
+    seen = exact > 0
+    exact, rays = exact[seen], rays[seen]
+    world = rays @ original.cam_from_world().rotation.matrix()
+    found, best, border = np.zeros(len(rays)), np.full(len(rays), -2.0), np.full(len(rays), 9.0)
+    for image in views.images.values():
+        if np.linalg.norm(image.projection_center() - original.projection_center()) > 1e-5:
+            continue
+        camera = views.camera(image.camera_id)
+        K = camera.calibration_matrix()
+        depth = read_depth(workspace / "stereo" / "depth_maps" / f"{image.name}.{kind}.bin")
+        local = world @ image.cam_from_world().rotation.matrix().T
+        margin = margins(K, camera.width, camera.height, local)
+        border = np.minimum(border, np.where(local[:, 2] > 0, np.abs(margin), 9.0))
+        place = np.rint((local @ K.T)[:, :2] / local[:, 2:]).clip(-1, 1 << 20).astype(np.int64)
+        inside = (margin > 0) & (place >= 0).all(axis=1) & (place < depth.shape[::-1]).all(axis=1)
+        z = np.zeros(len(rays))
+        z[inside] = depth[place[inside, 1], place[inside, 0]]
+        better = (z > 0) & (local[:, 2] > best)
+        found[better] = (z / local[:, 2])[better]
+        best[better] = local[better, 2]
+    return found, exact, border
+
+
+def measure(scene: Path, workspace: Path, kind: str = "geometric") -> str:
+    """One row of numbers."""
+    originals = pycolmap.Reconstruction(scene / "sparse" / "0")
+    views = pycolmap.Reconstruction(workspace / "sparse")
+    parts = [
+        measure_image(workspace, views, image, scene / "truth" / f"{image.name}.npz", kind)
+        for image in originals.images.values()
+    ]
+    found, exact, border = (np.concatenate(column) for column in zip(*parts, strict=True))
+    covered = found > 0
+    error = np.abs(found - exact) / exact
+    near, far = border < np.radians(2), border > np.radians(12)
+    seam = covered[near].mean() / max(covered[far].mean(), 1e-9) if near.any() and far.any() else np.nan
+    bad = (error[covered] > 0.05).mean() if covered.any() else np.nan
+    return (
+        f"covered {100 * covered.mean():5.1f}  within 2 % {100 * (covered & (error < 0.02)).mean():5.1f}  "
+        f"off by > 5 % {100 * bad:5.2f}  seams {seam:.3f}"
+    )
+
+
+def main() -> None:
+    """Render what is not there, run, and print."""
+    split = sys.argv.index("--") if "--" in sys.argv else len(sys.argv)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("--output", type=Path, help="workspace; default: SCENE/dense")
+    parser.add_argument("--width", type=int, default=480, help="pixels of the images")
+    parser.add_argument("--panoramas", action="store_true")
+    parser.add_argument("--measure-only", action="store_true", help="of a workspace that is there")
+    given = parser.parse_args(sys.argv[1:split])
+    if not (given.scene / "sparse").exists():
+        make_courtyard(given.scene, CourtyardOptions(width=given.width, panoramas=given.panoramas))
+    output = given.output or given.scene / "dense"
+    seconds = ""
+    if not given.measure_only:
+        command = [sys.executable, "-m", "colmap_sph", "run", "--model", given.scene / "sparse" / "0"]
+        command += ["--output", output, *sys.argv[split + 1 :]]
+        if subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode not in (0, 5):
+            sys.exit("the run failed")
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds = f"  cpu {used.ru_utime + used.ru_stime:.1f} s"
+    print(f"{given.scene.name}: {measure(given.scene, output)}{seconds}")
+
+
+if __name__ == "__main__":
+    main()
