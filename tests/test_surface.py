@@ -49,8 +49,7 @@ def places(arrays, transform):
 
 def signed_distance(x, y):
     """To the outline of the box, negative inside of it."""
-    outside = np.maximum(np.maximum(BOX[0, 0] - x, x - BOX[1, 0]), np.maximum(BOX[0, 1] - y, y - BOX[1, 1]))
-    return outside
+    return np.maximum(np.maximum(BOX[0, 0] - x, x - BOX[1, 0]), np.maximum(BOX[0, 1] - y, y - BOX[1, 1]))
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +238,7 @@ def test_a_model_on_the_map_has_its_coordinates(workspace, tmp_path):
 def test_a_facade_is_seen_from_outside(workspace, tmp_path):
     """The southern wall: 8 m wide, 4 m high, in the plane y = -3."""
     corners = ("-4,-3,0", "4,-3,0", "-4,-3,4")
-    arrays, transform, _ = made(workspace, tmp_path, plane=corners, cell=0.25, plane_depth=0.5, min_images=1)
+    arrays, _, _ = made(workspace, tmp_path, plane=corners, cell=0.25, plane_depth=0.5, min_images=1)
     height = arrays["dsm"][0]
     assert height.shape == (16, 32)
     known = height > -9999

@@ -121,7 +121,7 @@ Box = tuple[int, int, int, int]
 """Left, top, right and bottom in pixels, the last two excluded."""
 
 
-def read_part(workspace: Workspace, view: View, box: Box) -> Part:
+def read_part(workspace: Workspace, view: View, box: Box, *, with_normals: bool = True) -> Part:
     """Read the maps of a part of a view; `InputError` where they are damaged or not of one size."""
     left, top, right, bottom = box
     rows = np.arange(top, bottom)
@@ -129,7 +129,9 @@ def read_part(workspace: Workspace, view: View, box: Box) -> Part:
     shape = (view.height, view.width)
     depth = read_some_pixels(workspace.depth_map_path(view.name, "geometric"), shape, rows, columns)
     depth[~((depth > 0) & (depth < _FARTHEST))] = 0
-    normals = read_some_pixels(workspace.normal_map_path(view.name, "geometric"), (*shape, 3), rows, columns)
+    normals = np.zeros((3, 0, 0), np.float32)
+    if with_normals:
+        normals = read_some_pixels(workspace.normal_map_path(view.name, "geometric"), (*shape, 3), rows, columns)
     return Part(view.cropped(*box), depth, normals)
 
 
