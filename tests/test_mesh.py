@@ -211,7 +211,7 @@ def test_nonsense_is_refused(options, name):
 
 def test_a_missing_open3d_is_one_sentence(workspace, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(InputError, match=r"pip install 'colmap_sph\[mesh\]'.*poisson"):
+    with pytest.raises(InputError, match=r"pip install '\.\[mesh\]', .*poisson"):
         made(workspace, tmp_path)
 
 

@@ -27,10 +27,18 @@ rasterio = pytest.importorskip("rasterio")
 PLENTY = 4 << 30
 
 
-def made(workspace: Workspace, folder: Path, memory: int = PLENTY, place: Georeference | None = None, **options):
+def made(
+    workspace: Workspace,
+    folder: Path,
+    memory: int = PLENTY,
+    place: Georeference | None = None,
+    *,
+    overwrite: bool = False,
+    **options,
+):
     """Arrays of all files by their stems, the DSM's transform, and the summary."""
     chosen = SurfaceOptions(**{"cell": GSD, **options})
-    request = SurfaceRequest(workspace, place or Georeference(), chosen, folder, memory)
+    request = SurfaceRequest(workspace, place or Georeference(), chosen, folder, memory, overwrite)
     paths, summary = make_surface(request, lambda *_: None, lambda: None)
     arrays = {}
     for path in paths:
@@ -206,7 +214,7 @@ def test_a_model_on_its_side_is_seen_from_above(tmp_path, products):
     shift = np.array([1.0, -2.0, 0.5])
     turned = surveyed_workspace(tmp_path / "dense", turn=turn, shift=shift)
     for up in ("auto", ",".join(map(str, turn[:, 2]))):
-        arrays, _, summary = made(turned, tmp_path / "out", up=up)
+        arrays, _, summary = made(turned, tmp_path / "out", up=up, overwrite=True)
         known = arrays["dsm"][0] > -9999
         to_raster = np.array(summary.model_to_raster)
         level = to_raster[:, :3] @ shift + to_raster[:, 3]
@@ -313,7 +321,7 @@ def test_a_workspace_without_maps_is_told_what_to_do(tmp_path):
 
 def test_a_missing_gdal_is_one_sentence(workspace, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(InputError, match=r"pip install 'colmap_sph\[geo\]'"):
+    with pytest.raises(InputError, match=r"pip install '\.\[geo\]'"):
         made(workspace, tmp_path / "out")
 
 
@@ -321,6 +329,8 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
     (tmp_path / "dsm.tif").write_text("earlier")
     monkeypatch.setattr("colmap_sph.products.surface.make.free_space", lambda _: 1000)
     with pytest.raises(OutputError, match=r"make room"):
+        made(workspace, tmp_path, overwrite=True)
+    with pytest.raises(OutputError, match=r"dsm\.tif is there already; give --overwrite"):
         made(workspace, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
     assert (tmp_path / "dsm.tif").read_text() == "earlier"

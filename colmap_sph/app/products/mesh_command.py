@@ -30,9 +30,11 @@ class MeshCommand:
         default_factory=GeoreferenceOptions
     )
     output: Path | None = None
-    """Folder for what is made; what is there from before is replaced. Default: mesh in the workspace."""
+    """Folder for what is made. Default: mesh in the workspace."""
     memory: str = ""
     """Memory to keep to while depth maps are averaged, such as 4GiB. Default: 70 % of what is free."""
+    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Replace what is there from before."""
 
 
 def mesh_command(command: MeshCommand, terminal: Terminal) -> int:
@@ -45,7 +47,9 @@ def mesh_command(command: MeshCommand, terminal: Terminal) -> int:
         terminal.say_lines("\n".join(report_lines(georeference)))
     folder = command.output or workspace.root / "mesh"
     with Display(terminal) as display:
-        request = MeshRequest(workspace, georeference, command.options, folder, memory, num_cores())
+        request = MeshRequest(
+            workspace, georeference, command.options, folder, memory, num_cores(), command.overwrite
+        )
         paths, faces = make_mesh(request, display.start, display.advance)
     terminal.say(f"{faces:,} triangles", label="Mesh:", style="bold")
     for path in paths:

@@ -31,9 +31,11 @@ class SurfaceCommand:
         default_factory=GeoreferenceOptions
     )
     output: Path | None = None
-    """Folder for what is made; what is there from before is replaced. Default: surface in the workspace."""
+    """Folder for what is made. Default: surface in the workspace."""
     memory: str = ""
     """Memory to keep to, such as 2GiB. Default: 70 % of what is free."""
+    overwrite: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Replace what is there from before."""
 
 
 def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
@@ -46,7 +48,7 @@ def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
         terminal.say_lines("\n".join(report_lines(georeference)))
     folder = command.output or workspace.root / "surface"
     with Display(terminal) as display:
-        request = SurfaceRequest(workspace, georeference, command.options, folder, memory)
+        request = SurfaceRequest(workspace, georeference, command.options, folder, memory, command.overwrite)
         paths, summary = make_surface(request, display.start, display.advance)
     size = f"{summary.width} x {summary.height} cells of {summary.cell:g}"
     filled = f", {summary.filled:.1%} filled" if summary.filled else ""

@@ -14,6 +14,7 @@ from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.options import MeshOptions
 from colmap_sph.products.mesh.triangles import Triangles, joined, read_ply, write_ply
 from colmap_sph.products.mesh.tsdf import Volume, open3d
+from colmap_sph.products.places import check_places
 from colmap_sph.products.surface.seen import SeenView, seen_views
 from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.meshing import poisson_mesh, simplify
@@ -32,6 +33,8 @@ class MeshRequest:
     ----------
     memory : int
         Bytes that the process may use while depth maps are averaged.
+    overwrite : bool
+        Whether files that are there already are replaced.
     """
 
     workspace: Workspace
@@ -40,6 +43,7 @@ class MeshRequest:
     folder: Path
     memory: int
     threads: int
+    overwrite: bool = False
 
 
 def make_mesh(
@@ -64,6 +68,8 @@ def make_mesh(
     options.check()
     if options.method == "tsdf":
         open3d()
+    names = [f"mesh.{each}" for each in options.formats]
+    check_places(request.workspace, request.folder, names, overwrite=request.overwrite)
     scene, seen = seen_views(request.workspace)
     gsd = float(np.median(np.concatenate([each.footprint for each in seen])))
     make_dir(request.folder)

@@ -32,8 +32,8 @@ def open3d() -> Any:
         return import_module("open3d")
     except ModuleNotFoundError as error:
         raise InputError(
-            "--method tsdf needs Open3D, which is not installed; install it by `pip install 'colmap_sph[mesh]'`, "
-            "or give --method poisson."
+            "--method tsdf needs Open3D, which is not installed; install this program with it, pip install "
+            "'.[mesh]', or give --method poisson."
         ) from error
     except (ImportError, OSError) as error:
         library = reason_of(error).split(":")[0]

@@ -18,8 +18,8 @@ NO_HEIGHT = -9999.0
 _BLOCK = 256
 _CACHE_MEGABYTES = 64
 _MISSING = (
-    "Surface models and orthophotos need GDAL, which is not installed; install it by "
-    "`pip install 'colmap_sph[geo]'`."
+    "Surface models and orthophotos need GDAL (rasterio), which is not installed; install this program with it: "
+    "pip install '.[geo]'."
 )
 
 

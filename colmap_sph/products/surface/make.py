@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError, OutputError, reason_of
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.places import check_places
 from colmap_sph.products.surface.balance import balancing_gains
 from colmap_sph.products.surface.drawing import Drawing, Drawn, Pictures, margin_of
 from colmap_sph.products.surface.geotiff import NO_HEIGHT, Layer, LayerFiles, gdal
@@ -72,6 +73,8 @@ class SurfaceRequest:
     ----------
     memory : int
         Bytes that the process may use.
+    overwrite : bool
+        Whether files that are there already are replaced.
     """
 
     workspace: Workspace
@@ -79,6 +82,7 @@ class SurfaceRequest:
     options: SurfaceOptions
     folder: Path
     memory: int
+    overwrite: bool = False
 
 
 Start = Callable[[str, int], None]
@@ -109,15 +113,17 @@ def make_surface(request: SurfaceRequest, start: Start, advance: Advance) -> tup
     """
     request.options.check()
     gdal()
+    layers = {
+        key: each for key, each in _LAYERS.items() if request.options.orthophoto or key not in _OF_ORTHOPHOTO
+    }
+    names = [*(layer.name for layer in layers.values()), _SUMMARY]
+    check_places(request.workspace, request.folder, names, overwrite=request.overwrite)
     scene, seen = seen_views(request.workspace)
     placement = place(scene, seen, request.georeference, request.options)
     drawing, tiles = _prepared(request, scene, seen, placement)
     make_dir(request.folder)
     _check_space(request.folder, placement)
     scratch = request.folder / ".surface.tmp"
-    layers = {
-        key: each for key, each in _LAYERS.items() if request.options.orthophoto or key not in _OF_ORTHOPHOTO
-    }
     with scratch_folder(scratch):
         counts = np.zeros(2, np.int64)
         with LayerFiles(scratch, layers, placement.raster, placement.crs, _tags(placement)) as files:
