@@ -33,7 +33,7 @@ def made(
     memory: int = PLENTY,
     place: Georeference | None = None,
     *,
-    overwrite: bool = False,
+    overwrite: bool = True,
     **options,
 ):
     """Arrays of all files by their stems, the DSM's transform, and the summary."""
@@ -214,7 +214,7 @@ def test_a_model_on_its_side_is_seen_from_above(tmp_path, products):
     shift = np.array([1.0, -2.0, 0.5])
     turned = surveyed_workspace(tmp_path / "dense", turn=turn, shift=shift)
     for up in ("auto", ",".join(map(str, turn[:, 2]))):
-        arrays, _, summary = made(turned, tmp_path / "out", up=up, overwrite=True)
+        arrays, _, summary = made(turned, tmp_path / "out", up=up)
         known = arrays["dsm"][0] > -9999
         to_raster = np.array(summary.model_to_raster)
         level = to_raster[:, :3] @ shift + to_raster[:, 3]
@@ -329,9 +329,9 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
     (tmp_path / "dsm.tif").write_text("earlier")
     monkeypatch.setattr("colmap_sph.products.surface.make.free_space", lambda _: 1000)
     with pytest.raises(OutputError, match=r"make room"):
-        made(workspace, tmp_path, overwrite=True)
-    with pytest.raises(OutputError, match=r"dsm\.tif is there already; give --overwrite"):
         made(workspace, tmp_path)
+    with pytest.raises(OutputError, match=r"dsm\.tif is there already; give --overwrite"):
+        made(workspace, tmp_path, overwrite=False)
     assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
     assert (tmp_path / "dsm.tif").read_text() == "earlier"
 
