@@ -634,3 +634,27 @@ def write_points(
     points : (POINTS, 27) uint8, written
     visibility : (WORDS) uint32, written
     """
+
+def draw_heights(
+    depth: NDArray[np.float32],
+    normals: NDArray[np.float32],
+    ray_from_pixel: NDArray[np.floating[Any]],
+    cells_from_camera: NDArray[np.floating[Any]],
+    shift: NDArray[np.floating[Any]],
+    half: float,
+    max_ratio: float,
+    raster: NDArray[np.float32],
+    /,
+) -> None:
+    """Draw every pixel with a depth as a patch of its plane, so many pixels to each side, into a raster, whose
+    cells keep the greatest height at their centres.
+
+    depth : (MAP_H, MAP_W) float32
+    normals : (3, MAP_H, MAP_W) float32
+    ray_from_pixel : (3, 3) float64
+    cells_from_camera : (3, 3) float64
+    shift : (3) float64
+    half : float
+    max_ratio : float
+    raster : (H, W) float32, written
+    """

@@ -267,6 +267,11 @@ def write_points(rng: Random) -> Arguments:
     return [*rows, *frame, filled(rng, (65,), np.uint32), *outputs]
 
 
+def draw_heights(rng: Random) -> Arguments:
+    frame = [filled(rng, shape, np.float64) for shape in ((3, 3), (3, 3), (3,))]
+    return [*fused_maps(rng), *frame, number(rng), number(rng), filled(rng, size(rng), np.float32)]
+
+
 def fused_maps(rng: Random) -> Arguments:
     h, w = size(rng)
     return [filled(rng, (h, w), np.float32), filled(rng, (3, h, w), np.float32)]
@@ -359,6 +364,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         unpack_normals,
         count_points,
         write_points,
+        draw_heights,
         confirm_depth,
         fit_planes,
         add_patch_equations,

@@ -580,3 +580,27 @@ def patch_equations(image, source, matrix, planes, contrast, min_score):
         upper = matrix_of[np.triu_indices(3)]
         equations[:, row, column] += w.sum() * np.array([1, 2 * (1 - score), parallax @ parallax, *right, *upper])
     return equations
+
+
+def draw_heights(depth, normals, ray_from_pixel, cells_from_camera, shift, half, max_ratio, shape):
+    """Heights of pixels' patches: for every cell, every triangle that its centre lies in."""
+    heights = np.full(shape, -np.inf)
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    for y, x in np.argwhere(depth > 0):
+        normal = normals[:, y, x].astype(np.float64)
+        facing = normal @ ray_from_pixel @ [x, y, 1]
+        corners = []
+        for right, down in ((-half, -half), (half, -half), (half, half), (-half, half)):
+            ray = ray_from_pixel @ [x + right, y + down, 1]
+            ratio = facing / (normal @ ray)
+            corners.append((ratio, cells_from_camera @ (ray * depth[y, x] * ratio) + shift))
+        if facing >= 0 or not all(1 / max_ratio < ratio < max_ratio for ratio, _ in corners):
+            continue
+        for chosen in ((0, 1, 2), (0, 2, 3)):
+            triangle = np.array([corners[k][1] for k in chosen])
+            inverse = np.linalg.inv(np.vstack([triangle[:, :2].T, np.ones(3)]))
+            shares = np.tensordot(inverse, np.stack([columns, rows, np.ones_like(rows)]), 1)
+            inside = (shares >= 0).all(axis=0)
+            value = np.tensordot(triangle[:, 2], shares, 1)
+            heights[inside] = np.maximum(heights, value)[inside]
+    return heights

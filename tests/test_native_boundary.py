@@ -230,6 +230,16 @@ def arguments(function):
             "out points": np.zeros(((H - 1) * W, 27), u8),
             "out visibility": np.zeros(2 * (H - 1) * W, np.uint32),
         },
+        "draw_heights": {
+            "depth": np.ones((5, 6), f32),
+            "normals": np.full((3, 5, 6), -0.5, f32),
+            "ray_from_pixel": np.eye(3),
+            "cells_from_camera": np.eye(3),
+            "shift": np.zeros(3),
+            "half": 0.5,
+            "max_ratio": 2.0,
+            "out raster": np.zeros((H, W), f32),
+        },
         "confirm_depth": {
             "depth": np.ones((H, W), f32),
             "sigma": np.ones((H, W), f32),
@@ -320,6 +330,7 @@ FUNCTIONS = [
     "unpack_normals",
     "count_points",
     "write_points",
+    "draw_heights",
     "confirm_depth",
     "fit_planes",
     "add_patch_equations",
@@ -348,6 +359,7 @@ FREE = {
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
     ("add_patch_equations", "image"): {0},
+    ("draw_heights", "out raster"): {0, 1},
 }
 
 

@@ -16,11 +16,11 @@ from colmap_sph.pages.pictures import COLOURS, depth_picture, normal_picture, pi
 from colmap_sph.pages.reasons import Partner, Reason, find_reasons
 from colmap_sph.pages.samples import MapSamples, grid_of
 from colmap_sph.pages.small_cloud import STEPS, thin_out
-from colmap_sph.pages.vertical import map_axes
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.images.reading import read_small_colours
 from colmap_sph.project.map_files import read_some_pixels, write_depth_map, write_normal_map
 from colmap_sph.scene import Region, View
+from colmap_sph.stereo.region.map_axes import map_axes
 from colmap_sph.stereo.region.shown import count_shown, filled
 
 WIDTH, HEIGHT, FOCAL = 200, 150, 100.0

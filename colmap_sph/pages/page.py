@@ -23,13 +23,13 @@ from colmap_sph.pages.pair_facts import PairFacts, pairs_of
 from colmap_sph.pages.reasons import Partner, Reason, find_reasons
 from colmap_sph.pages.run_facts import RunFacts, read_run_facts
 from colmap_sph.pages.samples import MapSamples, read_samples, samples_per_side
-from colmap_sph.pages.vertical import map_axes
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.partners.facing import Facing
 from colmap_sph.stereo.partners.pairs import overlapping_views
+from colmap_sph.stereo.region.map_axes import map_axes
 
 # Points of an image's surface, to stand for it where there is no cloud; of the cloud, to frame the map.
 _SURFACE_SAMPLE = 300

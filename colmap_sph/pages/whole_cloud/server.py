@@ -13,13 +13,13 @@ import numpy as np
 
 from colmap_sph.errors import InputError, OptionError, printable, reason_of
 from colmap_sph.pages.markup import from_template, style_and_script
-from colmap_sph.pages.vertical import map_axes
 from colmap_sph.pages.whole_cloud.blocks import FAN, LEAVES, CloudBlocks, CloudFrame
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import real_path
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.region.map_axes import map_axes
 
 _HERE = "127.0.0.1"
 # Points that tell where to look from.

@@ -10,7 +10,11 @@ from colmap_sph.stereo.region.vertical import upwards
 
 
 def map_axes(
-    views: Sequence[View], points: NDArray[np.float64], *, is_georeferenced: bool = False
+    views: Sequence[View],
+    points: NDArray[np.float64],
+    *,
+    is_georeferenced: bool = False,
+    up: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Axes of a map of a scene.
 
@@ -22,6 +26,8 @@ def map_axes(
         Some points of its surface.
     is_georeferenced : bool
         Whether the scene is in map coordinates, whose z is up.
+    up : (3,) float64 ndarray, optional
+        Unit vector; found from views and points where it is not given.
 
     Returns
     -------
@@ -30,7 +36,7 @@ def map_axes(
     """
     if is_georeferenced:
         return np.eye(3)
-    up = upwards(views, points)
+    up = upwards(views, points) if up is None else up
     # The long side of the scene lies across.
     level = points - points.mean(axis=0) if len(points) else np.zeros((1, 3))
     level = level - np.outer(level @ up, up)

@@ -1,0 +1,1 @@
+"""Depth maps or a cloud → a mesh, as PLY and GLB."""

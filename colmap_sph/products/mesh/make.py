@@ -1,0 +1,153 @@
+"""A workspace → its mesh as PLY and GLB, by the method that is asked for."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.mesh.glb import write_glb
+from colmap_sph.products.mesh.options import MeshOptions
+from colmap_sph.products.mesh.triangles import Triangles, joined, read_ply, write_ply
+from colmap_sph.products.mesh.tsdf import Volume, open3d
+from colmap_sph.products.places import check_places
+from colmap_sph.products.surface.seen import SeenView, seen_views
+from colmap_sph.project.files import make_dir, scratch_folder
+from colmap_sph.project.meshing import poisson_mesh, simplify
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene
+from colmap_sph.stereo.region.map_axes import map_axes
+
+_DEPTHS = (6, 13)
+
+
+@dataclass(frozen=True, eq=False)
+class MeshRequest:
+    """What is to be made of a workspace, and where.
+
+    Attributes
+    ----------
+    memory : int
+        Bytes that the process may use while depth maps are averaged.
+    overwrite : bool
+        Whether files that are there already are replaced.
+    """
+
+    workspace: Workspace
+    georeference: Georeference
+    options: MeshOptions
+    folder: Path
+    memory: int
+    threads: int
+    overwrite: bool = False
+
+
+def make_mesh(
+    request: MeshRequest, start: Callable[[str, int], None], advance: Callable[[], None]
+) -> tuple[list[Path], int]:
+    """Make the mesh and write it; returns what was made, and its number of faces.
+
+    Parameters
+    ----------
+    request : MeshRequest
+    start, advance : callable
+        Told that so many steps of something begin, and that one is done.
+
+    Raises
+    ------
+    InputError, NoResultError, OptionError
+        Open3D, maps or the cloud are missing, or there is no surface.
+    OutputError
+        The files cannot be written.
+    """
+    options = request.options
+    options.check()
+    if options.method == "tsdf":
+        open3d()
+    names = [f"mesh.{each}" for each in options.formats]
+    check_places(request.workspace, request.folder, names, overwrite=request.overwrite)
+    scene, seen = seen_views(request.workspace)
+    gsd = float(np.median(np.concatenate([each.footprint for each in seen])))
+    make_dir(request.folder)
+    scratch = request.folder / ".mesh.tmp"
+    with scratch_folder(scratch):
+        if options.method == "tsdf":
+            mesh = _of_maps(request, seen, options.voxel or gsd, start, advance)
+        else:
+            start("poisson", 1)
+            mesh = _of_cloud(request, scene, seen, options.voxel or 2 * gsd, scratch)
+            advance()
+        if options.simplify < 1:
+            mesh = _simplified(mesh, request, scratch)
+    if not len(mesh.faces):
+        raise NoResultError("There is no surface: give a larger --voxel or a smaller --min-images.")
+    return _written(request, mesh, scene, seen), len(mesh.faces)
+
+
+def _of_maps(
+    request: MeshRequest,
+    seen: list[SeenView],
+    voxel: float,
+    start: Callable[[str, int], None],
+    advance: Callable[[], None],
+) -> Triangles:
+    volume = Volume(
+        request.workspace, seen, voxel=voxel, min_views=request.options.min_images, memory=request.memory
+    )
+    start("mesh", len(volume.blocks))
+    parts = []
+    for part in volume.meshes():
+        if len(part.faces):
+            parts.append(part)
+        advance()
+    return joined(parts)
+
+
+def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: float, scratch: Path) -> Triangles:
+    """Of the cloud, near its origin where the model is in map coordinates."""
+    workspace = request.workspace
+    cloud = (workspace.local_dir / "fused.ply") if scene.origin.any() else workspace.fused_path
+    if not cloud.is_file():
+        raise InputError(f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run first.")
+    points = np.concatenate([each.points for each in seen])
+    size = float(np.max(np.percentile(points, 99.5, axis=0) - np.percentile(points, 0.5, axis=0)))
+    depth = int(np.clip(round(math.log2(max(size / cell, 1.0))), *_DEPTHS))
+    mesh = scratch / "poisson.ply"
+    poisson_mesh(cloud, mesh, depth=depth, trim=request.options.trim, threads=request.threads)
+    return read_ply(mesh)
+
+
+def _simplified(mesh: Triangles, request: MeshRequest, scratch: Path) -> Triangles:
+    full, fewer = scratch / "full.ply", scratch / "fewer.ply"
+    write_ply(full, mesh, mesh.points)
+    simplify(full, fewer, ratio=request.options.simplify, threads=request.threads)
+    return read_ply(fewer)
+
+
+def _written(request: MeshRequest, mesh: Triangles, scene: Scene, seen: list[SeenView]) -> list[Path]:
+    is_on_map = bool(request.georeference.crs) or not request.georeference.is_identity or bool(scene.origin.any())
+    paths = []
+    for each in dict.fromkeys(request.options.formats):
+        path = request.folder / f"mesh.{each}"
+        if each == "ply":
+            places: NDArray[np.floating] = mesh.points
+            if is_on_map:
+                places = request.georeference.to_map(mesh.points.astype(np.float64) + scene.origin)
+            write_ply(path, mesh, places)
+        else:
+            write_glb(path, mesh, _axes(request.georeference, scene, seen, is_on_map=is_on_map))
+        paths.append(path)
+    return paths
+
+
+def _axes(
+    georeference: Georeference, scene: Scene, seen: list[SeenView], *, is_on_map: bool
+) -> NDArray[np.float64]:
+    """East, north and up in the scene's frame, or what comes next to them."""
+    if is_on_map:
+        return georeference.rotation
+    return map_axes(scene.views, np.concatenate([each.points for each in seen]).astype(np.float64))

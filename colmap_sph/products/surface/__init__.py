@@ -1,0 +1,1 @@
+"""Depth maps → surface model, hillshade and true orthophoto."""

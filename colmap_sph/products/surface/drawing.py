@@ -1,0 +1,164 @@
+"""A tile and the maps of the views that see it → its surface and its orthophoto."""
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from colmap_sph.products.surface.options import SurfaceOptions
+from colmap_sph.products.surface.placing import Placement
+from colmap_sph.products.surface.seen import Box, Part, SeenView, read_part, read_picture
+from colmap_sph.products.surface.tiles import Sightings, Tile
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.surface.heights import Surface, highest_surface, hillshade
+from colmap_sph.stereo.surface.mosaic import SEAM_RADIUS, Mosaic
+from colmap_sph.stereo.surface.patches import draw_heights
+from colmap_sph.stereo.surface.raster import Raster
+from colmap_sph.stereo.surface.visibility import sight_of
+
+# Heights of one surface, as views see it, differ by no more than this many pixels on it.
+_TOLERANCE = 3.0
+_UNFILLED = np.float32(-1e30)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """What is written of a tile.
+
+    Attributes
+    ----------
+    surface : Surface
+        A count of 0 where the height is filled in.
+    shade : (h, w) uint8 ndarray
+        Hillshade, 0 = none.
+    colours : (h, w, 3) uint8 ndarray
+    source : (h, w) uint16 ndarray
+        Number of the image, from 1; 0 = none.
+    """
+
+    surface: Surface
+    shade: NDArray[np.uint8]
+    colours: NDArray[np.uint8]
+    source: NDArray[np.uint16]
+
+
+class Pictures:
+    """Images with their colours balanced, of which the latest are kept."""
+
+    def __init__(
+        self, workspace: Workspace, seen: Sequence[SeenView], gains: NDArray[np.float32], memory: int
+    ) -> None:
+        self._workspace = workspace
+        self._seen = seen
+        self._gains = gains
+        self._memory = memory
+        self._kept: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
+
+    def of(self, index: int) -> NDArray[np.uint8]:
+        """(H, W, 3) image of a view."""
+        if index in self._kept:
+            self._kept.move_to_end(index)
+            return self._kept[index]
+        picture = read_picture(self._workspace, self._seen[index].view)
+        for colour, gain in enumerate(self._gains[index]):
+            table = np.clip(np.rint(np.arange(256) * gain), 0, 255).astype(np.uint8)
+            picture[..., colour] = table[picture[..., colour]]
+        while self._kept and sum(each.nbytes for each in self._kept.values()) + picture.nbytes > self._memory:
+            self._kept.popitem(last=False)
+        if picture.nbytes <= self._memory:
+            self._kept[index] = picture
+        return picture
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """All that tiles are drawn from."""
+
+    workspace: Workspace
+    seen: Sequence[SeenView]
+    placement: Placement
+    sightings: Sightings
+    options: SurfaceOptions
+    pictures: Pictures | None
+
+    def draw(self, tile: Tile) -> Drawn:
+        """Draw a tile."""
+        margin = margin_of(self.options)
+        window = self.placement.raster.window(
+            tile.row - margin, tile.column - margin, tile.height + 2 * margin, tile.width + 2 * margin
+        )
+        views = list(self.sightings.in_tile(tile, margin))
+        surface = filled(self._surface(window, views), self.options.fill)
+        shade = hillshade(surface.height, self.placement.raster.cell)
+        mosaic = self._mosaic(window, views, surface)
+        inner = (slice(margin, margin + tile.height), slice(margin, margin + tile.width))
+        return Drawn(
+            Surface(surface.height[inner], surface.deviation[inner], surface.count[inner]),
+            shade[inner],
+            mosaic.colours[inner],
+            mosaic.source[inner],
+        )
+
+    @property
+    def _tolerance(self) -> float:
+        """Units of the raster."""
+        return _TOLERANCE * self.placement.gsd
+
+    def _surface(self, window: Raster, views: Sequence[tuple[int, Box]]) -> Surface:
+        heights = np.empty((len(views), *window.shape), np.float32)
+        for place, (index, box) in enumerate(views):
+            part = self._part(index, box, window)
+            heights[place] = draw_heights(part.view, part.depth, part.normals, window)
+        return highest_surface(heights, self._tolerance, self.options.min_images)
+
+    def _part(self, index: int, box: Box, window: Raster) -> Part:
+        """A part of a view, without depths that do not count."""
+        part = read_part(self.workspace, self.seen[index].view, box)
+        low, high = self.placement.slab
+        if np.isfinite(low) or np.isfinite(high):
+            height = _heights(part, window)
+            part.depth[~((height >= low) & (height <= high))] = 0
+        return part
+
+    def _mosaic(self, window: Raster, views: Sequence[tuple[int, Box]], surface: Surface) -> Mosaic:
+        is_filled = np.isfinite(surface.height) & (surface.count == 0)
+        mosaic = Mosaic(surface.height, is_filled, self._tolerance)
+        if self.pictures is None or not np.isfinite(surface.height).any():
+            return mosaic
+        tolerance = 2 * self._tolerance / self.placement.raster.scale
+        for index, box in views:
+            seen = self.seen[index]
+            part = read_part(self.workspace, seen.view, box)
+            sight = sight_of(part.view, seen.view, part.depth, surface.height, window, tolerance)
+            if (sight.is_open & (sight.is_seen | is_filled)).any():
+                mosaic.add(sight, self.pictures.of(index), box[:2], seen.index + 1)
+        return mosaic
+
+
+def margin_of(options: SurfaceOptions) -> int:
+    """Cells around a tile that its own depend on."""
+    return max(4 * SEAM_RADIUS if options.orthophoto else 1, options.fill + 1)
+
+
+def _heights(part: Part, window: Raster) -> NDArray[np.float64]:
+    """(h, w) height in the raster of each pixel with a depth."""
+    matrix, shift = window.cells_from_camera(part.view)
+    along = matrix[2] @ np.linalg.inv(part.view.K)
+    column = np.arange(part.view.width)
+    row = np.arange(part.view.height)[:, None]
+    return np.asarray((along[0] * column + along[1] * row + along[2]) * part.depth + shift[2])
+
+
+def filled(surface: Surface, reach: int) -> Surface:
+    """Fill holes from their rims, inversely to the distance, up to `reach` cells from a measured one."""
+    is_known = np.isfinite(surface.height)
+    if not reach or is_known.all() or not is_known.any():
+        return surface
+    from rasterio.fill import fillnodata  # of the extra
+
+    height = fillnodata(np.where(is_known, surface.height, _UNFILLED), mask=is_known, max_search_distance=reach)
+    is_filled = (distance_transform_edt(~is_known) <= reach) & (height > _UNFILLED)
+    return Surface(np.where(is_filled, height, np.float32(np.nan)), surface.deviation, surface.count)

@@ -1,0 +1,144 @@
+"""A workspace → its views with depth maps, and roughly where each of them sees something."""
+
+import logging
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.project.images.reading import read_colours
+from colmap_sph.project.map_files import map_size, read_some_pixels
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene, View
+
+logger = logging.getLogger(__name__)
+
+# Pixels along the longer side of a map that are looked at beforehand.
+_SAMPLES = 128
+# Depths beyond come from damage.
+_FARTHEST = 1e12
+
+
+@dataclass(frozen=True, eq=False)
+class SeenView:
+    """A view as large as its maps, and samples of what it sees.
+
+    Attributes
+    ----------
+    view : View
+    index : int
+        Its place among all views of the scene.
+    step : int
+        Pixels from sample to sample.
+    pixels : (n, 2) int32 ndarray
+        Column and row of samples with a depth.
+    points : (n, 3) float32 ndarray
+        Their points, scene frame.
+    footprint : (n,) float32 ndarray
+        What the pixel covers there, across the view: depth over focal length, units of the scene.
+    """
+
+    view: View
+    index: int
+    step: int
+    pixels: NDArray[np.int32]
+    points: NDArray[np.float32]
+    footprint: NDArray[np.float32]
+
+
+def seen_views(workspace: Workspace) -> tuple[Scene, list[SeenView]]:
+    """Look at all geometric depth maps of a workspace.
+
+    Images without maps are left out, with a warning where others have some.
+
+    Raises
+    ------
+    InputError
+        There is no model, or a map is damaged or not of its image's size.
+    NoResultError
+        There are no maps, or no depth in any.
+    """
+    scene = read_scene(workspace.sparse_dir)
+    found = []
+    missing = []
+    for index, view in enumerate(scene.views):
+        if not workspace.depth_map_path(view.name, "geometric").exists():
+            missing.append(view.name)
+        elif (seen := _seen(workspace, view, index)) is not None:
+            found.append(seen)
+    if not found:
+        lack = "no geometric depth maps" if len(missing) == len(scene.views) else "no depth in its geometric maps"
+        raise NoResultError(
+            f"{workspace.root} has {lack}, of which products are made; run colmap_sph run --workspace "
+            f"{workspace.root} first."
+        )
+    if missing:
+        logger.warning("%d of %d images have no geometric depth map; left out", len(missing), len(scene.views))
+    return scene, found
+
+
+def _seen(workspace: Workspace, view: View, index: int) -> SeenView | None:
+    path = workspace.depth_map_path(view.name, "geometric")
+    width, height = map_size(path)
+    if not view.may_be_reduced_to(width, height):
+        raise InputError(f"The map {path} is not of its image's size; compute it again.")
+    view = view.resized(width, height)
+    step = max(1, -(-max(width, height) // _SAMPLES))
+    rows = np.arange(min(step // 2, height - 1), height, step)
+    columns = np.arange(min(step // 2, width - 1), width, step)
+    depth = read_some_pixels(path, (height, width), rows, columns)
+    has_depth = (depth > 0) & (depth < _FARTHEST)
+    if not has_depth.any():
+        return None
+    row, column = np.nonzero(has_depth)
+    z = depth[row, column].astype(np.float64)
+    pixels = np.stack([columns[column], rows[row]], axis=1)
+    rays = np.column_stack([pixels, np.ones(len(z))]) @ np.linalg.inv(view.K).T
+    points = (rays * z[:, None]) @ view.R + view.center
+    footprint = z / np.sqrt(view.K[0, 0] * view.K[1, 1])
+    return SeenView(
+        view.without_points(),
+        index,
+        step,
+        pixels.astype(np.int32),
+        points.astype(np.float32),
+        footprint.astype(np.float32),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of a view: its camera cropped, and the maps there."""
+
+    view: View
+    depth: NDArray[np.float32]
+    normals: NDArray[np.float32]
+
+
+Box = tuple[int, int, int, int]
+"""Left, top, right and bottom in pixels, the last two excluded."""
+
+
+def read_part(workspace: Workspace, view: View, box: Box, *, with_normals: bool = True) -> Part:
+    """Read the maps of a part of a view; `InputError` where they are damaged or not of one size."""
+    left, top, right, bottom = box
+    rows = np.arange(top, bottom)
+    columns = np.arange(left, right)
+    shape = (view.height, view.width)
+    depth = read_some_pixels(workspace.depth_map_path(view.name, "geometric"), shape, rows, columns)
+    depth[~((depth > 0) & (depth < _FARTHEST))] = 0
+    normals = np.zeros((3, 0, 0), np.float32)
+    if with_normals:
+        normals = read_some_pixels(workspace.normal_map_path(view.name, "geometric"), (*shape, 3), rows, columns)
+    return Part(view.cropped(*box), depth, normals)
+
+
+def read_picture(workspace: Workspace, view: View) -> NDArray[np.uint8]:
+    """(H, W, 3) colours of a view's image, red, green and blue, as large as its maps."""
+    path = workspace.image_path(view.name)
+    colours = read_colours(path, (view.width, view.height) if view.full_size is not None else None)
+    if colours.shape[:2] != (view.height, view.width):
+        raise InputError(f"{path} is not of its camera's size; undistort it again.")
+    return np.ascontiguousarray(colours[..., ::-1])

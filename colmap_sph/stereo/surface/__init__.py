@@ -1,0 +1,1 @@
+"""Depth maps → surfaces seen from one side: heights, and who sees them."""

@@ -1,0 +1,137 @@
+"""Measure a surface model and an orthophoto against exact depth maps, and against LiDAR.
+
+    python scripts/measure_surface.py SURFACE MODEL DEPTH [--depth-scale 0.005] [--lidar CLOUD]
+
+SURFACE is what `colmap_sph surface` has made in the model's own frame, MODEL its sparse model, DEPTH a folder with
+exact depth at pixel centres. The truth of a cell is the highest exact point in its middle half each way, from all
+images together: it has nothing from our own maps.
+"""
+
+import argparse
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+
+from colmap_sph.evaluation import read_geometry
+from colmap_sph.evaluation.depth_files import read_exact_depth
+from colmap_sph.evaluation.geometry_io import PointCloud
+from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.scene import View
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A raster's size, and the map from places to its cells."""
+
+    shape: tuple[int, int]
+    left: float
+    top: float
+    cell: float
+
+    def of(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Flat indices of (n, 3) points' cells, and which points lie in the middle half of one."""
+        places = np.stack([points[:, 0] - self.left, self.top - points[:, 1]], axis=1) / self.cell
+        numbers = np.floor(places).astype(np.int64)
+        inside = ((numbers >= 0) & (numbers < self.shape[::-1])).all(axis=1)
+        middle = np.asarray(inside & (np.abs(places - numbers - 0.5) < 0.25).all(axis=1))
+        return np.where(inside, numbers[:, 1] * self.shape[1] + numbers[:, 0], 0), middle
+
+    def points(self, heights: Array) -> Array:
+        """(n, 3) centres of all cells, at these heights."""
+        rows, columns = np.indices(self.shape)
+        x = self.left + (columns + 0.5) * self.cell
+        y = self.top - (rows + 0.5) * self.cell
+        return np.stack([x.ravel(), y.ravel(), heights.ravel()], axis=1)
+
+
+def exact_points(view: View, depth: Array) -> Array:
+    """World points of a map's pixel centres."""
+    rows, columns = np.nonzero(depth > 0)
+    rays = np.stack([columns + 0.5, rows + 0.5, np.ones(len(rows))], axis=1) @ np.linalg.inv(view.K).T
+    return np.asarray((rays * depth[rows, columns][:, None]) @ view.R + view.center)
+
+
+def sees(view: View, depth: Array, points: Array, tolerance: float) -> NDArray[np.bool_]:
+    """Whether a view's exact depth map has points on the surface that it sees."""
+    pixels, z = view.project(points)
+    places = np.floor(np.nan_to_num(pixels, nan=-1.0)).astype(np.int64)
+    inside = (z > 0) & ((places >= 0) & (places < [view.width, view.height])).all(axis=1)
+    seen = np.zeros(len(points), bool)
+    seen[inside] = np.abs(depth[places[inside, 1], places[inside, 0]] - z[inside]) < tolerance
+    return seen
+
+
+def report_heights(name: str, off: Array, cell: float) -> None:
+    """Print how far heights are off."""
+    median = float(np.median(off))
+    nmad = 1.4826 * float(np.median(np.abs(off - median)))
+    share = float((np.abs(off) <= 2 * cell).mean())
+    mean = float(np.abs(off).mean())
+    print(f"{name}: {len(off):,} cells, median {median:+.4f}, NMAD {nmad:.4f}, within 2 cells {share:.4f}, "
+          f"mean absolute {mean:.4f}")  # fmt: skip
+
+
+def main() -> None:
+    """Read, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("surface", type=Path)
+    parser.add_argument("model", type=Path)
+    parser.add_argument("depth", type=Path)
+    parser.add_argument("--depth-scale", type=float)
+    parser.add_argument("--lidar", type=Path)
+    given = parser.parse_args()
+    with rasterio.open(given.surface / "dsm.tif") as file:
+        height, _, _ = file.read().astype(np.float64)
+        cells = Cells(height.shape, file.transform.c, file.transform.f, file.transform.a)
+    with rasterio.open(given.surface / "orthophoto_images.tif") as file:
+        source = file.read(1)
+    names = json.loads((given.surface / "surface.json").read_text())["images"]
+    views = read_scene(given.model).views
+    endings = (".png", ".npy", ".tif")
+    truths = {
+        view.name: read_exact_depth(
+            next(path for ending in endings if (path := given.depth / (Path(view.name).stem + ending)).exists()),
+            shape=(view.height, view.width),
+            depth_scale=given.depth_scale,
+        ).astype(np.float64)
+        for view in views
+    }
+    truth = np.full(height.size, -np.inf)
+    for view in views:
+        points = exact_points(view, truths[view.name])
+        index, middle = cells.of(points)
+        np.maximum.at(truth, index[middle], points[middle, 2])
+    known = np.isfinite(truth)
+    tops = cells.points(truth)
+    seeing = np.zeros(height.size, np.int64)
+    right = np.zeros(height.size, bool)
+    for view in views:
+        seen = np.zeros(height.size, bool)
+        seen[known] = sees(view, truths[view.name], tops[known], 2 * cells.cell)
+        seeing += seen
+        right |= seen & (source.ravel() == names.index(view.name) + 1)
+    measured = (height.ravel() > -9999) & known
+    by_three = measured & (seeing >= 3)
+    report_heights("seen by three", height.ravel()[by_three] - truth[by_three], cells.cell)
+    report_heights("all", height.ravel()[measured] - truth[measured], cells.cell)
+    coloured = known & (source.ravel() > 0)
+    print(
+        f"orthophoto: {coloured.sum():,} cells, from an image that sees their surface {right[coloured].mean():.4f}"
+    )
+    print(f"of cells seen by three images {by_three.sum() / (known & (seeing >= 3)).sum():.4f} have a height")
+    if given.lidar is not None:
+        cloud = read_geometry(given.lidar)
+        points = cloud.points if isinstance(cloud, PointCloud) else cloud.vertices
+        index, middle = cells.of(points)
+        middle &= height.ravel()[index] > -9999
+        report_heights("LiDAR", height.ravel()[index[middle]] - points[middle, 2], cells.cell)
+
+
+if __name__ == "__main__":
+    main()

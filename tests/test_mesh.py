@@ -1,0 +1,242 @@
+"""Meshes of exact maps and clouds against the solids, read back by other programs, and what is refused."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from refusals import assert_refused
+from scipy.spatial import cKDTree
+from surveyed import BLUE, BOX, GREEN, GSD, RED, ROOF, surveyed_workspace
+
+from colmap_sph.app import cli
+from colmap_sph.errors import InputError, OptionError
+from colmap_sph.evaluation import read_geometry
+from colmap_sph.evaluation.geometry_io import Mesh
+from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.mesh import tsdf
+from colmap_sph.products.mesh.glb import write_glb
+from colmap_sph.products.mesh.make import MeshRequest, make_mesh
+from colmap_sph.products.mesh.options import MeshOptions
+from colmap_sph.products.mesh.triangles import Triangles, read_ply, write_ply
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import POINT
+
+PLENTY = 8 << 30
+
+
+def is_open3d_here() -> bool:
+    try:
+        tsdf.open3d()
+    except InputError:
+        return False
+    return True
+
+
+needs_open3d = pytest.mark.skipif(not is_open3d_here(), reason="Open3D, or what it needs, is not installed")
+
+
+def made(
+    workspace: Workspace, folder: Path, memory: int = PLENTY, place: Georeference | None = None, **options
+) -> Any:
+    """The mesh that was made, read from mesh.ply by trimesh."""
+    request = MeshRequest(workspace, place or Georeference(), MeshOptions(**options), folder, memory, 1)
+    make_mesh(request, lambda *_: None, lambda: None)
+    return trimesh.load(folder / "mesh.ply", process=False)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    return surveyed_workspace(tmp_path_factory.mktemp("surveyed") / "dense")
+
+
+@pytest.fixture(scope="module")
+def cloudy(tmp_path_factory):
+    """A workspace whose cloud is a sphere of radius 5 around (0, 0, 8): red above, green below."""
+    made_of = surveyed_workspace(tmp_path_factory.mktemp("cloudy") / "dense")
+    rng = np.random.default_rng(0)
+    directions = rng.normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1)[:, None]
+    points = np.zeros(len(directions), POINT)
+    points["xyz"] = 5 * directions + [0, 0, 8]
+    points["normal"] = directions
+    points["rgb"] = np.where(directions[:, 2:] > 0, RED, GREEN)
+    names = [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    names += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(points)}", *names, "end_header\n"]
+    made_of.fused_path.write_bytes("\n".join(head).encode() + points.tobytes())
+    return made_of
+
+
+def distance_to_solids(points):
+    """From the ground and the box on it."""
+    low, high = np.array([*BOX[0], 0.0]), np.array([*BOX[1], ROOF])
+    outside = np.linalg.norm(np.maximum(np.maximum(low - points, points - high), 0), axis=1)
+    inside = np.minimum(points - low, high - points).min(axis=1)
+    return np.minimum(np.abs(points[:, 2]), np.where(outside > 0, outside, inside))
+
+
+# ---- files -------------------------------------------------------------------------------------------------
+
+
+def pyramid() -> Triangles:
+    points = np.array([[1, 2, 3], [5, 2, 3], [1, 4, 3], [2, 3, 9]], np.float32)
+    colours = np.array([RED, GREEN, BLUE, (9, 8, 7)], np.uint8)
+    return Triangles(points, colours, np.array([[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]], np.int32))
+
+
+def test_a_glb_file_is_read_upright_by_others(tmp_path):
+    mesh = pyramid()
+    write_glb(tmp_path / "mesh.glb", mesh, np.eye(3))
+    found: Any = trimesh.load(tmp_path / "mesh.glb", process=False, force="mesh")
+    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    x, y, z = (mesh.points - middle).T
+    np.testing.assert_allclose(found.vertices, np.stack([x, z, -y], axis=1), atol=1e-6)
+    assert np.array_equal(found.faces, mesh.faces)
+    # Where there is a material, trimesh lets go of colours.
+    data = (tmp_path / "mesh.glb").read_bytes()
+    length = int.from_bytes(data[12:16], "little")
+    document = json.loads(data[20 : 20 + length])
+    accessor = document["accessors"][document["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"]]
+    view = document["bufferViews"][accessor["bufferView"]]
+    colours = np.frombuffer(data, np.uint8, view["byteLength"], 28 + length + view["byteOffset"]).reshape(-1, 4)
+    assert np.array_equal(colours[:, :3], mesh.colours)
+
+
+def test_a_ply_file_keeps_map_coordinates(tmp_path):
+    mesh = pyramid()
+    far = mesh.points + np.array([5e5, 5.4e6, 0.123456789])
+    write_ply(tmp_path / "far.ply", mesh, far)
+    found: Any = trimesh.load(tmp_path / "far.ply", process=False)
+    assert np.array_equal(found.vertices, far)
+    assert np.array_equal(found.faces, mesh.faces)
+    write_ply(tmp_path / "near.ply", mesh, mesh.points)
+    again = read_ply(tmp_path / "near.ply")
+    assert all(
+        np.array_equal(getattr(again, each), getattr(mesh, each)) for each in ("points", "colours", "faces")
+    )
+    geometry = read_geometry(tmp_path / "near.ply")
+    assert isinstance(geometry, Mesh)
+    assert np.array_equal(geometry.vertices, mesh.points)
+
+
+# ---- of depth maps -----------------------------------------------------------------------------------------
+
+
+@needs_open3d
+def test_the_mesh_of_depth_maps_is_the_solids(workspace, tmp_path):
+    mesh = made(workspace, tmp_path, min_images=2)
+    points = np.asarray(mesh.vertices)
+    inner = (np.abs(points[:, :2]) < 9).all(axis=1)
+    off = distance_to_solids(points[inner])
+    assert np.median(off) < 0.02 * GSD
+    assert np.percentile(off, 95) < GSD
+    # All of the roof is there, and most of the walls, which four images see.
+    middles, areas = mesh.triangles_center, mesh.area_faces
+    on_roof = (np.abs(middles[:, 2] - ROOF) < GSD) & (np.abs(middles[:, :2]) < [4, 3]).all(axis=1)
+    assert areas[on_roof].sum() == pytest.approx(48, rel=0.1)
+    assert (mesh.face_normals[on_roof][:, 2] > 0.5).mean() > 0.95
+    on_walls = (middles[:, 2] > GSD) & (middles[:, 2] < ROOF - GSD) & (np.abs(middles[:, :2]) < 5).all(axis=1)
+    assert areas[on_walls].sum() > 0.7 * (ROOF - 2 * GSD) * 28
+    colours = np.asarray(mesh.visual.vertex_colors)[:, :3].astype(int)
+    well_on_roof = (np.abs(points[:, 2] - ROOF) < 0.3 * GSD) & (np.abs(points[:, :2]) < [3.5, 2.5]).all(axis=1)
+    assert np.abs(colours[well_on_roof] - RED).max() <= 3
+
+
+@needs_open3d
+def test_blocks_do_not_show(workspace, tmp_path):
+    whole = made(workspace, tmp_path / "whole", voxel=2 * GSD)
+    with pytest.raises(OptionError, match=r"would do") as refused:
+        made(workspace, tmp_path / "none", memory=1 << 20, voxel=2 * GSD)
+    least = int(str(refused.value).split("MiB would do")[0].split()[-1]) << 20
+    blocks = made(workspace, tmp_path / "blocks", memory=least + (1 << 20), voxel=2 * GSD)
+    assert len(blocks.vertices) > len(whole.vertices)  # at the seams twice
+    assert blocks.area == pytest.approx(whole.area, rel=1e-3)
+    distance, _ = cKDTree(whole.vertices).query(blocks.vertices)
+    assert np.percentile(distance, 99) < 1e-3 * GSD
+
+
+@needs_open3d
+def test_a_mesh_on_the_map_has_its_coordinates(workspace, tmp_path):
+    place = Georeference("EPSG:25832", "", 2.0, np.eye(3), np.array([5e5, 5.4e6, 300]))
+    local = made(workspace, tmp_path / "local", voxel=3 * GSD)
+    far = made(workspace, tmp_path / "far", voxel=3 * GSD, place=place)
+    # Their order is Open3D's.
+    distance, _ = cKDTree(place.to_map(local.vertices)).query(far.vertices)
+    assert distance.max() < 1e-5
+
+
+# ---- of a cloud --------------------------------------------------------------------------------------------
+
+
+def test_poissons_mesh_of_a_sphere_is_a_sphere(cloudy, tmp_path):
+    mesh = made(cloudy, tmp_path, method="poisson", voxel=0.7, trim=0.0)
+    points = np.asarray(mesh.vertices) - [0, 0, 8]
+    assert np.abs(np.linalg.norm(points, axis=1) - 5).max() < 0.05
+    assert mesh.volume == pytest.approx(4 / 3 * np.pi * 125, rel=0.01)  # and its faces look outwards
+    above = np.asarray(mesh.visual.vertex_colors)[points[:, 2] > 1][:, :3].astype(int)
+    assert np.abs(above - RED).max() <= 3
+    assert (tmp_path / "mesh.glb").exists()
+
+
+def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path):
+    full = made(cloudy, tmp_path / "full", method="poisson", voxel=0.7, trim=0.0)
+    few = made(cloudy, tmp_path / "few", method="poisson", voxel=0.7, trim=0.0, simplify=0.2, formats=("ply",))
+    assert len(few.faces) == pytest.approx(0.2 * len(full.faces), rel=0.1)
+    assert few.volume == pytest.approx(full.volume, rel=0.01)
+    assert not (tmp_path / "few" / "mesh.glb").exists()
+
+
+# ---- what is refused ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"voxel": -1.0}, "voxel"),
+        ({"voxel": float("inf")}, "voxel"),
+        ({"simplify": 0.0}, "simplify"),
+        ({"simplify": 2.0}, "simplify"),
+        ({"min_images": 0}, "min_images"),
+        ({"trim": -1.0}, "trim"),
+        ({"formats": ()}, "formats"),
+    ],
+)
+def test_nonsense_is_refused(options, name):
+    assert_refused(MeshOptions(**options), name)
+
+
+def test_a_missing_open3d_is_one_sentence(workspace, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    with pytest.raises(InputError, match=r"pip install '\.\[mesh\]', .*poisson"):
+        made(workspace, tmp_path)
+
+
+def test_a_library_that_open3d_needs_is_named(workspace, tmp_path, monkeypatch):
+    def refuse(_):
+        raise ImportError("libusb-1.0.so.0: cannot open shared object file: No such file or directory")
+
+    monkeypatch.setattr(tsdf, "import_module", refuse)
+    with pytest.raises(
+        InputError, match=r"for lack of libusb-1\.0\.so\.0; .*apt install libusb-1\.0-0"
+    ) as refused:
+        made(workspace, tmp_path)
+    assert "\n" not in str(refused.value)
+
+
+def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
+    with pytest.raises(InputError, match=r"fused\.ply is missing"):
+        made(workspace, tmp_path, method="poisson")
+
+
+def test_the_command_says_what_it_made(cloudy, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("colmap_sph.app.products.mesh_command.num_cores", lambda: 1)
+    arguments = ["mesh", str(cloudy.root), "--output", str(tmp_path), "--method", "poisson", "--voxel", "0.8"]
+    assert cli.main([*arguments, "--trim", "0", "--formats", "ply"]) == 0
+    printed = capsys.readouterr()
+    assert printed.out.splitlines() == [str(tmp_path / "mesh.ply")]
+    assert "triangles" in printed.err
+    assert cli.main([*arguments, "--simplify", "3"]) == 2

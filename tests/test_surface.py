@@ -1,0 +1,346 @@
+"""Surface models and orthophotos of exact maps against the solids that were rendered, and what is refused."""
+
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import oracle
+import pytest
+import surveyed
+from refusals import assert_refused
+from surveyed import BLUE, BOX, GREEN, GSD, RED, ROOF, surveyed_workspace
+
+from colmap_sph import _native
+from colmap_sph import synthetic as syn
+from colmap_sph.app import cli
+from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
+from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.surface.make import SurfaceRequest, make_surface
+from colmap_sph.products.surface.options import SurfaceOptions
+from colmap_sph.project.map_files import read_depth_map, write_depth_map
+from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.surface.heights import highest_surface, hillshade
+
+rasterio = pytest.importorskip("rasterio")
+
+PLENTY = 4 << 30
+
+
+def made(
+    workspace: Workspace,
+    folder: Path,
+    memory: int = PLENTY,
+    place: Georeference | None = None,
+    *,
+    overwrite: bool = True,
+    **options,
+):
+    """Arrays of all files by their stems, the DSM's transform, and the summary."""
+    chosen = SurfaceOptions(**{"cell": GSD, **options})
+    request = SurfaceRequest(workspace, place or Georeference(), chosen, folder, memory, overwrite)
+    paths, summary = make_surface(request, lambda *_: None, lambda: None)
+    arrays = {}
+    for path in paths:
+        if path.suffix == ".tif":
+            with rasterio.open(path) as file:
+                arrays[path.stem] = file.read()
+                transform = file.transform
+    return arrays, transform, summary
+
+
+def places(arrays, transform):
+    """x and y (h, w) of the cells' centres."""
+    rows, columns = np.mgrid[: arrays["dsm"].shape[1], : arrays["dsm"].shape[2]] + 0.5
+    return transform.c + transform.a * columns, transform.f + transform.e * rows
+
+
+def signed_distance(x, y):
+    """To the outline of the box, negative inside of it."""
+    return np.maximum(np.maximum(BOX[0, 0] - x, x - BOX[1, 0]), np.maximum(BOX[0, 1] - y, y - BOX[1, 1]))
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    return surveyed_workspace(tmp_path_factory.mktemp("surveyed") / "dense")
+
+
+@pytest.fixture(scope="module")
+def products(workspace, tmp_path_factory):
+    return made(workspace, tmp_path_factory.mktemp("products"))
+
+
+# ---- the surface -------------------------------------------------------------------------------------------
+
+
+def test_patches_are_drawn_as_the_oracle_draws_them():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(5, 6, (6, 7)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    normals = rng.normal(0, 0.4, (3, 6, 7)) - [[[0]], [[0]], [[1]]]
+    normals = (normals / np.linalg.norm(normals, axis=0)).astype(np.float32)
+    ray_from_pixel = np.linalg.inv(np.array([[9.0, 0, 3], [0, 9, 3], [0, 0, 1]]))
+    cells_from_camera = syn.look_at((1.0, -1, 2), (0, 0.2, 0))[0] * 4
+    given = (ray_from_pixel, np.ascontiguousarray(cells_from_camera), np.array([8.0, 28, 0]), 0.6, 1.5)
+    drawn = np.full((20, 24), -np.inf, np.float32)
+    _native.draw_heights(depth, normals, *given, drawn)
+    expected = oracle.draw_heights(depth, normals, *given, drawn.shape)
+    assert np.isfinite(expected).sum() > 50
+    np.testing.assert_allclose(drawn, expected, rtol=1e-5)
+
+
+def test_the_highest_surface_is_that_of_a_search_cell_by_cell():
+    rng = np.random.default_rng(1)
+    heights = rng.choice([0.0, 0.1, 0.2, 1.0, 1.1, 5.0], (7, 9, 11)).astype(np.float32)
+    heights[rng.random(heights.shape) < 0.4] = -np.inf
+    found = highest_surface(heights.copy(), 0.15, 3)
+    for row, column in np.ndindex(9, 11):
+        seen = sorted((h for h in heights[:, row, column].tolist() if h > -np.inf), reverse=True)
+        clusters = ([h for h in seen[k:] if h >= top - 0.15] for k, top in enumerate(seen))
+        first = next((each for each in clusters if len(each) >= min(3, len(seen))), [])
+        assert found.count[row, column] == len(first)
+        if first:
+            assert found.height[row, column] == pytest.approx(np.mean(first), abs=1e-6)
+        if len(first) > 1:
+            assert found.deviation[row, column] == pytest.approx(np.std(first, ddof=1), abs=1e-5)
+
+
+def test_the_surface_is_that_of_the_solids(products):
+    arrays, transform, summary = products
+    height, deviation, count = arrays["dsm"]
+    x, y = places(arrays, transform)
+    distance = signed_distance(x, y)
+    known = height > -9999
+    roof, ground = known & (distance < -GSD), known & (distance > GSD)
+    # All of the roof, and the ground around it, is in view of several cameras.
+    assert known[distance < -GSD].all()
+    assert known[(distance > GSD) & (distance < 5)].all()
+    assert np.abs(height[roof] - ROOF).max() < 1e-3
+    assert np.abs(height[ground]).max() < 1e-3
+    assert deviation[roof & (count > 1)].max() < 1e-3
+    assert count[roof].min() >= 3
+    assert summary.covered == pytest.approx(known.mean())
+
+
+def test_noise_becomes_the_standard_deviation(tmp_path):
+    noisy = surveyed_workspace(tmp_path / "dense", noise=0.2)
+    arrays, transform, _ = made(noisy, tmp_path / "out")
+    height, deviation, count = arrays["dsm"]
+    level = (height > -9999) & (signed_distance(*places(arrays, transform)) > 2 * GSD) & (count >= 9)
+    # The highest of two or three patches that overlap at a cell is a little above the mean.
+    assert np.abs(np.median(height[level])) < 0.2 * GSD
+    assert 0.1 * GSD < np.median(deviation[level]) < 0.25 * GSD
+    assert height[level].std() < np.median(deviation[level])
+
+
+def test_the_shade_is_that_of_a_sun_in_the_north_west():
+    y, x = np.mgrid[:20, :30].astype(np.float32)
+    level = hillshade(np.zeros((20, 30), np.float32), 1.0)
+    towards = hillshade(x + y, 1.0)  # rises to the south-east: faces the sun
+    away = hillshade(-x - y, 1.0)
+    assert level[10, 10] == pytest.approx(1 + 254 * np.sin(np.pi / 4), abs=1)
+    # The slope's normal is (-1, 1, 1) / √3 in x, y (north) and z, the sun's direction (-1, 1, √2) / 2.
+    assert towards[10, 10] == pytest.approx(1 + 254 * (2 + np.sqrt(2)) / (2 * np.sqrt(3)), abs=1)
+    assert away[10, 10] == 1
+
+
+# ---- the orthophoto ----------------------------------------------------------------------------------------
+
+
+def colour_of(arrays, colour):
+    rgb = np.moveaxis(arrays["orthophoto"][:3], 0, 2).astype(int)
+    return (np.abs(rgb - colour).max(axis=2) <= 3) & (arrays["orthophoto"][3] == 255)
+
+
+def test_each_cell_has_the_colour_of_its_own_surface(products):
+    arrays, transform, summary = products
+    distance = signed_distance(*places(arrays, transform))
+    known = arrays["dsm"][0] > -9999
+    # Beyond a pixel of the edges, where pixels of images have two colours.
+    assert colour_of(arrays, RED)[distance < -1.5 * GSD].all()
+    assert colour_of(arrays, GREEN)[known & (distance > 1.5 * GSD) & (distance < 5)].all()
+    assert not colour_of(arrays, BLUE).any()
+    assert not arrays["orthophoto_images"][0][arrays["orthophoto"][3] == 0].any()
+    assert len(summary.images) == 13
+
+
+def test_the_index_names_an_image_that_sees_the_cell(workspace, products):
+    arrays, transform, _ = products
+    x, y = places(arrays, transform)
+    scene, cameras = surveyed.surfaces(), surveyed.cameras()
+    source = arrays["orthophoto_images"][0]
+    assert len(np.unique(source)) > 4
+    truth = np.where(signed_distance(x, y) < 0, ROOF, 0.0)
+    clear = np.abs(signed_distance(x, y)) > 1.5 * GSD
+    for number, camera in enumerate(cameras, 1):
+        cells = (source == number) & clear
+        if cells.any():
+            points = np.stack([x[cells], y[cells], truth[cells]], axis=1)
+            pixels, depth = camera.project(points)
+            nearest = syn.trace_points(scene, camera, pixels).distance
+            assert (np.abs(nearest - depth) < 1e-3 * depth).mean() > 0.999
+
+
+def test_images_of_unequal_brightness_are_balanced(tmp_path):
+    uneven = surveyed_workspace(tmp_path / "dense", brightness={4: 0.75, 7: 1.2, 1: 0.85})
+    spread = {}
+    for balance in (True, False):
+        arrays, transform, _ = made(uneven, tmp_path / str(balance), balance=balance)
+        ground = (signed_distance(*places(arrays, transform)) > 1) & (arrays["orthophoto"][3] == 255)
+        spread[balance] = arrays["orthophoto"][1][ground].std()
+    assert spread[True] < 0.25 * spread[False]
+
+
+# ---- frames, tiles, holes ----------------------------------------------------------------------------------
+
+
+def test_tiles_do_not_show(workspace, products, tmp_path):
+    whole, _, _ = products
+    assert max(whole["dsm"].shape) > 300  # more than a tile
+    with pytest.raises(OptionError, match=r"would do") as refused:
+        made(workspace, tmp_path / "none", memory=1 << 20)
+    least = int(str(refused.value).split("MiB would do")[0].split()[-1]) << 20
+    tiles, _, _ = made(workspace, tmp_path / "tiles", memory=least)
+    assert (np.abs(whole["dsm"] - tiles["dsm"]) < 1e-4).mean() > 0.9999
+    assert (np.abs(whole["hillshade"] - tiles["hillshade"].astype(int)) <= 1).mean() > 0.9999
+    assert (whole["orthophoto_images"] == tiles["orthophoto_images"]).mean() > 0.999
+    assert not (tmp_path / "none").exists()
+
+
+def test_a_model_on_its_side_is_seen_from_above(tmp_path, products):
+    """As structure from motion leaves it: up is wherever."""
+    turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    shift = np.array([1.0, -2.0, 0.5])
+    turned = surveyed_workspace(tmp_path / "dense", turn=turn, shift=shift)
+    for up in ("auto", ",".join(map(str, turn[:, 2]))):
+        arrays, _, summary = made(turned, tmp_path / "out", up=up)
+        known = arrays["dsm"][0] > -9999
+        to_raster = np.array(summary.model_to_raster)
+        level = to_raster[:, :3] @ shift + to_raster[:, 3]
+        heights = arrays["dsm"][0][known] - level[2]
+        assert min((np.abs(heights) < 0.02).sum(), (np.abs(heights - ROOF) < 0.02).sum()) > 0.8 * 48 / GSD**2
+        assert np.minimum(np.abs(heights), np.abs(heights - ROOF)).max() < ROOF / 2
+        assert np.linalg.det(to_raster[:, :3]) == pytest.approx(1)
+
+
+def test_a_model_on_the_map_has_its_coordinates(workspace, tmp_path):
+    yaw = np.radians(30)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    place = Georeference(
+        "EPSG:25832", rasterio.crs.CRS.from_epsg(25832).to_wkt(), 2.0, turn, np.array([5e5, 5.4e6, 300])
+    )
+    arrays, transform, _ = made(workspace, tmp_path, place=place, cell=2 * GSD)
+    x, y = places(arrays, transform)
+    model = place.to_model(np.stack([x, y, np.full_like(x, 300)], axis=-1))
+    distance = signed_distance(model[..., 0], model[..., 1])
+    assert np.abs(arrays["dsm"][0][distance < -GSD] - (300 + 2 * ROOF)).max() < 1e-3
+    with rasterio.open(tmp_path / "dsm.tif") as file:
+        assert file.crs.to_epsg() == 25832
+        assert file.nodata == -9999
+        assert file.tags(ns="IMAGE_STRUCTURE")["LAYOUT"] == "COG"
+    with pytest.raises(OptionError, match=r"^up "):
+        made(workspace, tmp_path, place=place, up="z")
+
+
+def test_a_facade_is_seen_from_outside(workspace, tmp_path):
+    """The southern wall: 8 m wide, 4 m high, in the plane y = -3."""
+    corners = ("-4,-3,0", "4,-3,0", "-4,-3,4")
+    arrays, _, _ = made(workspace, tmp_path, plane=corners, cell=0.25, plane_depth=0.5, min_images=1)
+    height = arrays["dsm"][0]
+    assert height.shape == (16, 32)
+    known = height > -9999
+    assert known.mean() > 0.9
+    assert np.abs(height[known]).max() < 0.5
+    assert np.abs(height[2:-2][known[2:-2]]).max() < 1e-3
+    inner = np.zeros_like(known)
+    inner[3:-3, 3:-3] = True
+    assert colour_of(arrays, BLUE)[inner & known].mean() > 0.99
+    with pytest.raises(NoResultError, match=r"--plane"):
+        made(workspace, tmp_path, plane=("-4,-3,90", "4,-3,90", "-4,-3,94"))
+
+
+def test_holes_stay_or_are_filled_from_their_rims(tmp_path):
+    holed = surveyed_workspace(tmp_path / "dense")
+    # No image has a depth on some of the ground.
+    for path in sorted((holed.stereo_dir / "depth_maps").iterdir()):
+        camera = surveyed.cameras()[int(path.name[:2])]
+        depth = read_depth_map(path)
+        rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]]
+        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.K).T
+        points = (rays * depth[..., None] - camera.t) @ camera.R
+        depth[np.hypot(points[..., 0] - 7, points[..., 1]) < 1.5] = 0
+        write_depth_map(path, depth)
+    open_arrays, transform, _ = made(holed, tmp_path / "open")
+    x, y = places(open_arrays, transform)
+    hole = np.hypot(x - 7, y) < 1.2
+    assert (open_arrays["dsm"][0][hole] == -9999).all()
+    arrays, _, summary = made(holed, tmp_path / "filled", fill=10)
+    assert np.abs(arrays["dsm"][0][hole]).max() < 1e-3
+    assert (arrays["dsm"][2][hole] == 0).all()
+    assert colour_of(arrays, GREEN)[hole].mean() > 0.95
+    assert 0 < summary.filled < 0.2
+    near, _, _ = made(holed, tmp_path / "near", fill=2)
+    assert (near["dsm"][0][np.hypot(x - 7, y) < 0.8] == -9999).all()
+
+
+# ---- what is refused ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "names"),
+    [
+        ({"cell": -1.0}, ["cell"]),
+        ({"cell": float("nan")}, ["cell"]),
+        ({"min_images": 0}, ["min_images"]),
+        ({"fill": -1}, ["fill"]),
+        ({"up": "w"}, ["up"]),
+        ({"up": "0,0,0"}, ["up"]),
+        ({"plane": ("0,0,0", "1,0,0", "2,0,0")}, ["plane"]),
+        ({"plane": ("0,0,0", "1,0", "0,1,0")}, ["plane"]),
+        ({"plane": ("0,0,0", "1,0,0", "0,1,0"), "up": "z"}, ["up", "plane"]),
+        ({"plane_depth": 1.0}, ["plane_depth", "plane"]),
+    ],
+)
+def test_nonsense_is_refused(options, names):
+    assert_refused(SurfaceOptions(**options), *names)
+
+
+def test_a_raster_without_end_is_refused(workspace, tmp_path):
+    with pytest.raises(OptionError, match=r"larger cell"):
+        made(workspace, tmp_path, cell=1e-6)
+
+
+def test_a_workspace_without_maps_is_told_what_to_do(tmp_path):
+    bare = surveyed_workspace(tmp_path / "dense")
+    for path in (bare.stereo_dir / "depth_maps").iterdir():
+        path.unlink()
+    with pytest.raises(NoResultError, match=r"colmap_sph run"):
+        made(bare, tmp_path / "out")
+
+
+def test_a_missing_gdal_is_one_sentence(workspace, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rasterio", None)
+    with pytest.raises(InputError, match=r"pip install '\.\[geo\]'"):
+        made(workspace, tmp_path / "out")
+
+
+def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
+    (tmp_path / "dsm.tif").write_text("earlier")
+    monkeypatch.setattr("colmap_sph.products.surface.make.free_space", lambda _: 1000)
+    with pytest.raises(OutputError, match=r"make room"):
+        made(workspace, tmp_path)
+    with pytest.raises(OutputError, match=r"dsm\.tif is there already; give --overwrite"):
+        made(workspace, tmp_path, overwrite=False)
+    assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
+    assert (tmp_path / "dsm.tif").read_text() == "earlier"
+
+
+def test_the_command_says_what_it_made(workspace, tmp_path, capsys):
+    arguments = ["surface", str(workspace.root), "--output", str(tmp_path), "--cell", "0.5", "--no-orthophoto"]
+    assert cli.main(arguments) == 0
+    printed = capsys.readouterr()
+    assert [Path(line).name for line in printed.out.splitlines()] == ["dsm.tif", "hillshade.tif", "surface.json"]
+    assert "cells of 0.5" in printed.err
+    assert json.loads((tmp_path / "surface.json").read_text())["cell"] == 0.5
+    assert cli.main(["surface", str(tmp_path / "nowhere")]) == 2
