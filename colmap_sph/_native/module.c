@@ -2,7 +2,8 @@
  * allocates every array; sizes and bounds are checked, and the GIL is released around the work (boundary.h). */
 #include "boundary.h"
 
-static native_function *const *const groups[] = {matching_functions, depth_functions, fusion_functions};
+static native_function *const *const groups[] = {matching_functions, depth_functions, fusion_functions,
+                                                 ties_functions};
 
 enum { GROUPS = sizeof groups / sizeof *groups };
 
