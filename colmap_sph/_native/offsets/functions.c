@@ -5,14 +5,12 @@
 
 static int check_step(int step) { return check(step >= 0, "steps must not be negative"); }
 
-static int check_columns(const char *name, int columns) {
-    return check(columns >= 0 && columns <= 1 << 20, name);
-}
+static int check_columns(const char *name, int columns) { return check(columns >= 0 && columns <= 1 << 20, name); }
 
 #define KEEP_BETWEEN(X) \
     X(OUT, int32, offset, H, W) \
-    X(VALUE, int, first) \
-    X(VALUE, int, last)
+    X(VALUE, ptrdiff, first) \
+    X(VALUE, ptrdiff, last)
 ARGUMENTS(keep_between, KEEP_BETWEEN);
 
 static int run_keep_between(void *arguments) {
@@ -38,8 +36,9 @@ static int run_remove_small_segments(void *arguments) {
     return remove_small_segments(a->offset, a->size.H, a->size.W, a->min_segment);
 }
 
-FUNCTION(remove_small_segments, REMOVE_SMALL_SEGMENTS, check_remove_small_segments,
-         "Invalidate, in place, connected regions of fewer pixels, whose neighbours differ by about a pixel at most.");
+FUNCTION(
+    remove_small_segments, REMOVE_SMALL_SEGMENTS, check_remove_small_segments,
+    "Invalidate, in place, connected regions of fewer pixels, whose neighbours differ by about a pixel at most.");
 
 #define COUNT_FRACTIONS(X) \
     X(IN, int32, offset, H, W) \
@@ -157,7 +156,8 @@ static int run_mark_steps(void *arguments) {
     return 0;
 }
 
-FUNCTION(mark_steps, MARK_STEPS, check_mark_steps, "Mark the pixels on both sides of steps larger than `max_step`.");
+FUNCTION(mark_steps, MARK_STEPS, check_mark_steps,
+         "Mark the pixels on both sides of steps larger than `max_step`.");
 
 #define COUNT_SLOPES(X) \
     X(IN, int32, offset, H, W) \
@@ -185,16 +185,17 @@ FUNCTION(count_slopes, COUNT_SLOPES, check_count_slopes,
 
 #define DISPARITY_RANGE(X) \
     X(IN, float32, disparity, H, W) \
-    X(OUT, float32, range, 2)
+    X(OUT, float32, ends, 2)
 ARGUMENTS(disparity_range, DISPARITY_RANGE);
 
 static int run_disparity_range(void *arguments) {
     const disparity_range_arguments *a = arguments;
-    disparity_range(a->disparity, a->size.H * a->size.W, a->range);
+    disparity_range(a->disparity, a->size.H * a->size.W, a->ends);
     return 0;
 }
 
-FUNCTION(disparity_range, DISPARITY_RANGE, any, "Least and most of the finite disparities; 0 where there is none.");
+FUNCTION(disparity_range, DISPARITY_RANGE, any,
+         "Least and most of the finite disparities; 0 where there is none.");
 
 #define CODE_DISPARITY(X) \
     X(IN, float32, disparity, H, W) \

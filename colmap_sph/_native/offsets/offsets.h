@@ -10,7 +10,7 @@
 enum { SEGMENT_UNIT = 64, MAX_SEGMENT_STEP = 4 };
 
 /* Invalidates what does not lie between two offsets. */
-void keep_between(int32_t *offset, ptrdiff_t pixels, int32_t first, int32_t last);
+void keep_between(int32_t *offset, ptrdiff_t pixels, ptrdiff_t first, ptrdiff_t last);
 
 /* Invalidates connected regions of fewer pixels than `min_segment`; -1 without memory. */
 int remove_small_segments(int32_t *offset, ptrdiff_t height, ptrdiff_t width, ptrdiff_t min_segment);
@@ -51,7 +51,7 @@ typedef struct {
 slope_counts count_slopes(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int32_t edge, int32_t steep);
 
 /* Least and most of the finite disparities; 0, 0 where there is none. */
-void disparity_range(const float *disparity, ptrdiff_t pixels, float range[2]);
+void disparity_range(const float *disparity, ptrdiff_t pixels, float ends[2]);
 
 /* Disparities and their codes, 1 + the whole steps from the least one; 0 = none. */
 void code_disparity(const float *disparity, ptrdiff_t pixels, float least, float step, uint16_t *codes);

@@ -6,10 +6,13 @@
 
 #include "matching/matching.h"
 
-void keep_between(int32_t *offset, ptrdiff_t pixels, int32_t first, int32_t last) {
+void keep_between(int32_t *offset, ptrdiff_t pixels, ptrdiff_t first, ptrdiff_t last) {
+    const int none = first > last || first > INT32_MAX || last < INT32_MIN;
+    const int32_t least = none ? INT32_MAX : first < INT32_MIN ? INT32_MIN : (int32_t)first;
+    const int32_t most = none ? INT32_MIN : last > INT32_MAX ? INT32_MAX : (int32_t)last;
     for (ptrdiff_t p = 0; p < pixels; p++) {
         const int32_t o = offset[p];
-        offset[p] = o < first || o > last ? OFFSET_INVALID : o;
+        offset[p] = o < least || o > most ? OFFSET_INVALID : o;
     }
 }
 
@@ -43,8 +46,7 @@ void target_bases(search_bases bases, int margin, int as_it_is, int gap, int32_t
         for (int32_t x = 0; x < (int32_t)bases.width; x++) {
             const ptrdiff_t p = y * bases.width + x;
             const int32_t base = bases.base[p], nearest = -gap - x;
-            target_base[p] =
-                bases.torn[p] ? plus(base > nearest ? base : nearest, as_it_is) : plus(base, margin);
+            target_base[p] = bases.torn[p] ? plus(base > nearest ? base : nearest, as_it_is) : plus(base, margin);
         }
     }
 }
@@ -93,7 +95,7 @@ slope_counts count_slopes(const int32_t *offset, ptrdiff_t height, ptrdiff_t wid
     return counts;
 }
 
-void disparity_range(const float *disparity, ptrdiff_t pixels, float range[2]) {
+void disparity_range(const float *disparity, ptrdiff_t pixels, float ends[2]) {
     float least = INFINITY, most = -INFINITY;
     for (ptrdiff_t p = 0; p < pixels; p++) {
         const float d = disparity[p];
@@ -101,8 +103,8 @@ void disparity_range(const float *disparity, ptrdiff_t pixels, float range[2]) {
         least = found && d < least ? d : least;
         most = found && d > most ? d : most;
     }
-    range[0] = least <= most ? least : 0;
-    range[1] = least <= most ? most : 0;
+    ends[0] = least <= most ? least : 0;
+    ends[1] = least <= most ? most : 0;
 }
 
 void code_disparity(const float *disparity, ptrdiff_t pixels, float least, float step, uint16_t *codes) {

@@ -5,8 +5,8 @@
 #include "matching/matching.h"
 #include "offsets/offsets.h"
 
-/* Pixels of a row, from `first` to before `end`. `parent` is another run of the segment, before this one; itself for
- * the first, whose `size` is the segment's. */
+/* Pixels of a row, from `first` to before `end`. `parent` is another run of the segment, before this one; itself
+ * for the first, whose `size` is the segment's. */
 typedef struct {
     int32_t first, end, parent, size;
 } run;

@@ -47,7 +47,7 @@ static int check_place_windows(const void *arguments) {
 
 static int run_place_windows(void *arguments) {
     const place_windows_arguments *a = arguments;
-    const rectified_camera camera = {a->pixel_from_ray, a->origins.first,  a->origins.second,
+    const rectified_camera camera = {a->pixel_from_ray, a->origins.first, a->origins.second,
                                      a->scales.first,   a->scales.second, a->spherical};
     place_windows(a->places, a->slopes, camera, a->size.POINTS, a->size.H, a->size.W, a->columns, a->rows);
     return 0;
@@ -67,7 +67,8 @@ ARGUMENTS(make_templates, MAKE_TEMPLATES);
 static int check_make_templates(const void *arguments) {
     const make_templates_arguments *a = arguments;
     return check_window(a->size.H, a->size.W) &&
-           check(a->size.PIXELS == a->size.H * a->size.W, "values must have the windows' pixels, less their rim");
+           check(a->size.PIXELS == a->size.H * a->size.W,
+                 "values must have the size of the windows without their rim");
 }
 
 static int run_make_templates(void *arguments) {
@@ -104,8 +105,9 @@ static int run_step_windows(void *arguments) {
     return 0;
 }
 
-FUNCTION(step_windows, STEP_WINDOWS, check_step_windows,
-         "One step of the least squares of windows towards templates, their correlation and mean square difference.");
+FUNCTION(
+    step_windows, STEP_WINDOWS, check_step_windows,
+    "One step of the least squares of windows towards templates, their correlation and mean square difference.");
 
 native_function *const ties_functions[] = {&fit_surfaces_function, &place_windows_function,
                                            &make_templates_function, &step_windows_function, NULL};

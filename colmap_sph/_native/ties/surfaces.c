@@ -48,8 +48,8 @@ void fit_surfaces(disparity_map map, const double *places, ptrdiff_t count, doub
         plane[0] = plane[1] = plane[2] = 0;
         roughness[p] = INFINITY;
         if (column >= PLANE_RADIUS && column <= last_column && row >= PLANE_RADIUS && row <= last_row &&
-            fit_plane(map.disparity + (ptrdiff_t)row * map.width + (ptrdiff_t)column, map.width, least_found, plane,
-                      roughness + p)) {
+            fit_plane(map.disparity + (ptrdiff_t)row * map.width + (ptrdiff_t)column, map.width, least_found,
+                      plane, roughness + p)) {
             plane[0] += (places[2 * p] - column) * plane[1] + (places[2 * p + 1] - row) * plane[2];
         }
     }

@@ -7,8 +7,8 @@
 
 enum {
     PLANE_RADIUS = 4, /* of the window whose disparities must lie on a plane */
-    PARAMETERS = 4,     /* of a window's move: along and across, and the change of the two slopes */
-    MAX_WINDOW = 1024   /* pixels of a window */
+    PARAMETERS = 4,   /* of a window's move: along and across, and the change of the two slopes */
+    MAX_WINDOW = 1024 /* pixels of a window */
 };
 
 typedef struct {
@@ -24,8 +24,9 @@ void fit_surfaces(disparity_map map, const double *places, ptrdiff_t count, doub
 
 /* How a rectified pair's places are seen in one of its images. */
 typedef struct {
-    const double *pixel_from_ray;                                /* 3 x 3 */
-    double column_origin, row_origin, column_scale, row_scale; /* (place + origin) / scale is an angle, or tangent */
+    const double *pixel_from_ray; /* 3 x 3 */
+    double column_origin, row_origin, column_scale,
+        row_scale; /* (place + origin) / scale is an angle, or tangent */
     int spherical;
 } rectified_camera;
 
@@ -34,8 +35,8 @@ typedef struct {
 void place_windows(const double *places, const double *slopes, rectified_camera camera, ptrdiff_t count,
                    ptrdiff_t height, ptrdiff_t width, float *columns, float *rows);
 
-/* Windows, without their rim of one pixel, with mean 0 and standard deviation 1, but for `least_contrast`; how they
- * change with each parameter, 4 rows of pixels; and the 4 x 4 normal matrix of that. */
+/* Windows, without their rim of one pixel, with mean 0 and standard deviation 1, but for `least_contrast`; how
+ * they change with each parameter, 4 rows of pixels; and the 4 x 4 normal matrix of that. */
 void make_templates(const float *windows, ptrdiff_t count, ptrdiff_t height, ptrdiff_t width, float least_contrast,
                     float *values, float *jacobian, float *normal);
 

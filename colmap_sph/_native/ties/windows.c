@@ -25,7 +25,7 @@ ALWAYS_INLINE direction turned(direction d, float angle) {
 
 /* A window's row in the image: pixel i's ray is `along` its direction, and what the row has in common. */
 typedef struct {
-    double angle, step;      /* of the row's middle pixel, and from pixel to pixel */
+    double angle, step;     /* of the row's middle pixel, and from pixel to pixel */
     float along[3], row[3]; /* homogeneous pixel = along · sine + row · cosine */
 } window_row;
 
