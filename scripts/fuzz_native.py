@@ -535,7 +535,7 @@ def call_function(rng: Random) -> None:
         result = getattr(_native, name)(*arguments)
     except ALLOWED:
         return
-    if result is not None and name != "count_points":
+    if result is not None and name not in ("count_points", "count_slopes"):
         raise AssertionError(f"{name} returned {result!r}")
 
 

@@ -286,8 +286,8 @@ def _windows(
         columns,
         rows,
     )
-    maps = (part.reshape(-1, length) for part in (columns, rows))
-    values = cv2.remap(image, *maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    columns_there, rows_there = (part.reshape(-1, length) for part in (columns, rows))
+    values = cv2.remap(image, columns_there, rows_there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(values, dtype=np.float32).reshape(columns.shape)
 
 
