@@ -69,7 +69,7 @@ def test_a_spiral_is_one_segment():
         spiral[ring : 41 - ring, 40 - ring] = 7
         spiral[40 - ring, ring : 41 - ring] = 7
         spiral[ring + 2 : 41 - ring, ring] = 7
-    count = np.count_nonzero(spiral == 7)
+    count = int(np.count_nonzero(spiral == 7))
     kept = spiral.copy()
     remove_small_segments(kept, count)
     np.testing.assert_array_equal(kept, spiral)
