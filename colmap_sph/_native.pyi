@@ -657,4 +657,250 @@ def draw_heights(
     half : float
     max_ratio : float
     raster : (H, W) float32, written
+def fit_surfaces(
+    disparity: NDArray[np.float32],
+    places: NDArray[np.floating[Any]],
+    least_found: float,
+    planes: NDArray[np.float64],
+    roughness: NDArray[np.float32],
+    /,
+) -> None:
+    """Planes through the disparities around places, and how far these are from them; infinite where too few.
+
+    disparity : (H, W) float32
+    places : (POINTS, 2) float64
+    least_found : float
+    planes : (POINTS, 3) float64, written
+    roughness : (POINTS) float32, written
+    """
+
+def place_windows(
+    places: NDArray[np.floating[Any]],
+    slopes: NDArray[np.floating[Any]],
+    pixel_from_ray: NDArray[np.floating[Any]],
+    origins: tuple[float, float],
+    scales: tuple[float, float],
+    spherical: bool,
+    columns: NDArray[np.float32],
+    rows: NDArray[np.float32],
+    /,
+) -> None:
+    """Where an image shows the pixels of sloping windows around places of a rectified pair.
+
+    places : (POINTS, 2) float64
+    slopes : (POINTS, 2) float64
+    pixel_from_ray : (3, 3) float64
+    origins : tuple[float, float]
+    scales : tuple[float, float]
+    spherical : bool
+    columns : (POINTS, H, W) float32, written
+    rows : (POINTS, H, W) float32, written
+    """
+
+def make_templates(
+    windows: NDArray[np.float32],
+    least_contrast: float,
+    values: NDArray[np.float32],
+    jacobian: NDArray[np.float32],
+    normal: NDArray[np.float32],
+    /,
+) -> None:
+    """Windows with mean 0 and variance 1, how they change when they move and slope, and the normal matrices.
+
+    windows : (POINTS, H + 2, W + 2) float32
+    least_contrast : float
+    values : (POINTS, PIXELS) float32, written
+    jacobian : (POINTS, 4, PIXELS) float32, written
+    normal : (POINTS, 4, 4) float32, written
+    """
+
+def step_windows(
+    values: NDArray[np.float32],
+    jacobian: NDArray[np.float32],
+    inverse: NDArray[np.float32],
+    windows: NDArray[np.float32],
+    least_contrast: float,
+    move: NDArray[np.float32],
+    correlation: NDArray[np.float32],
+    variance: NDArray[np.float32],
+    /,
+) -> None:
+    """One step of the least squares of windows towards templates, their correlation and mean square difference.
+
+    values : (POINTS, PIXELS) float32
+    jacobian : (POINTS, 4, PIXELS) float32
+    inverse : (POINTS, 4, 4) float32
+    windows : (POINTS, PIXELS) float32
+    least_contrast : float
+    move : (POINTS, 4) float32, written
+    correlation : (POINTS) float32, written
+    variance : (POINTS) float32, written
+    """
+
+def keep_between(
+    offset: NDArray[np.int32],
+    first: int,
+    last: int,
+    /,
+) -> None:
+    """Invalidate, in place, what does not lie between two offsets.
+
+    offset : (H, W) int32, written
+    first : int
+    last : int
+    """
+
+def remove_small_segments(
+    offset: NDArray[np.int32],
+    min_segment: int,
+    /,
+) -> None:
+    """Invalidate, in place, connected regions of fewer pixels, whose neighbours differ by about a pixel at most.
+
+    offset : (H, W) int32, written
+    min_segment : int
+    """
+
+def count_fractions(
+    offset: NDArray[np.int32],
+    counts: NDArray[np.uint32],
+    /,
+) -> None:
+    """How many offsets have each fraction of a pixel, in 1/256.
+
+    offset : (H, W) int32
+    counts : (256) uint32, written
+    """
+
+def unwarp_torn(
+    offset: NDArray[np.int32],
+    torn: NDArray[np.uint8],
+    as_it_is: int,
+    unwarped: NDArray[np.int32],
+    /,
+) -> None:
+    """Offsets of torn pixels to the source, which the target has as it is from column `as_it_is` on.
+
+    offset : (H, W) int32
+    torn : (H, W) uint8
+    as_it_is : int
+    unwarped : (H, W) int32, written
+    """
+
+def first_offsets(
+    predicted: NDArray[np.int32],
+    base: NDArray[np.int32],
+    torn: NDArray[np.uint8],
+    first: NDArray[np.int32],
+    /,
+) -> None:
+    """First offsets to search, pixels: the predicted one + base, of torn pixels the base alone.
+
+    predicted : (H, W) int32
+    base : (H, W) int32
+    torn : (H, W) uint8
+    first : (H, W) int32, written
+    """
+
+def target_bases(
+    base: NDArray[np.int32],
+    torn: NDArray[np.uint8],
+    margin: int,
+    as_it_is: int,
+    gap: int,
+    target_base: NDArray[np.int32],
+    /,
+) -> None:
+    """First columns of the target to search, less the pixel's own; torn pixels search the source as it is.
+
+    base : (H, W) int32
+    torn : (H, W) uint8
+    margin : int
+    as_it_is : int
+    gap : int
+    target_base : (H, W) int32, written
+    """
+
+def bases_about(
+    offset: NDArray[np.int32],
+    depth: int,
+    first: int,
+    last: int,
+    /,
+) -> None:
+    """Make offsets, in place, the first of `depth` whole ones about them, between `first` and `last`.
+
+    offset : (H, W) int32, written
+    depth : int
+    first : int
+    last : int
+    """
+
+def mark_steps(
+    offset: NDArray[np.int32],
+    max_step: int,
+    marks: NDArray[np.uint8],
+    /,
+) -> None:
+    """Mark the pixels on both sides of steps larger than `max_step`.
+
+    offset : (H, W) int32
+    max_step : int
+    marks : (H, W) uint8, written
+    """
+
+def count_slopes(
+    offset: NDArray[np.int32],
+    edge: int,
+    slope: int,
+    /,
+) -> tuple[int, int]:
+    """Of every second pixel of every second row, those without an edge, and of these those on a steep slope.
+
+    offset : (H, W) int32
+    edge : int
+    slope : int
+    returned: surface
+    returned: steep
+    """
+
+def disparity_range(
+    disparity: NDArray[np.float32],
+    ends: NDArray[np.float32],
+    /,
+) -> None:
+    """Least and most of the finite disparities; 0 where there is none.
+
+    disparity : (H, W) float32
+    ends : (2) float32, written
+    """
+
+def code_disparity(
+    disparity: NDArray[np.float32],
+    least: float,
+    step: float,
+    codes: NDArray[np.uint16],
+    /,
+) -> None:
+    """Codes of disparities: 1 + the whole steps from the least one; 0 where there is none.
+
+    disparity : (H, W) float32
+    least : float
+    step : float
+    codes : (H, W) uint16, written
+    """
+
+def decode_disparity(
+    codes: NDArray[np.uint16],
+    least: float,
+    step: float,
+    disparity: NDArray[np.float32],
+    /,
+) -> None:
+    """Disparities of codes; NaN where there is none.
+
+    codes : (H, W) uint16
+    least : float
+    step : float
+    disparity : (H, W) float32, written
     """

@@ -216,7 +216,7 @@ def search_windows(least, most, predicted, depth, clearance, own_clearance):
     base = np.empty_like(predicted)
     for y, x in np.ndindex(predicted.shape):
         lowest, highest = (
-            min(max(float(values[y // 2, x // 2]) * 512, -(2**30)), 2**30) for values in (least, most)
+            min(max(float(values[y // 2, x // 2]) * 512, -(2**29)), 2**29) for values in (least, most)
         )
         room = 256 * (depth // 2 - clearance)
         above = max(int(highest) - int(predicted[y, x]) - room, 0)

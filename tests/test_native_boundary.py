@@ -119,6 +119,8 @@ def arguments(function):
             "shifts": np.zeros(256, f32),
             "out disparity": np.zeros((H, W), f32),
         },
+        **offsets_arguments(),
+        **ties_arguments(),
         "transfer_disparity": {
             "left": np.zeros((H, W), f32),
             "max_step": 2.0,
@@ -290,6 +292,93 @@ def arguments(function):
     return table[function]
 
 
+def offsets_arguments():
+    """Those of the functions that work on offsets between the kernels of matching."""
+
+    def ints():
+        return np.zeros((H, W), np.int32)
+
+    def torn():
+        return np.zeros((H, W), np.uint8)
+
+    return {
+        "keep_between": {"out offset": ints(), "first": -300, "last": 300},
+        "remove_small_segments": {"out offset": ints(), "min_segment": 20},
+        "count_fractions": {"offset": ints(), "out counts": np.zeros(256, np.uint32)},
+        "unwarp_torn": {"offset": ints(), "torn": torn(), "as_it_is": 70, "out unwarped": ints()},
+        "first_offsets": {"predicted": ints(), "base": ints(), "torn": torn(), "out first": ints()},
+        "target_bases": {
+            "base": ints(),
+            "torn": torn(),
+            "margin": 32,
+            "as_it_is": 70,
+            "gap": 32,
+            "out target_base": ints(),
+        },
+        "bases_about": {"out offset": ints(), "depth": 32, "first": -40, "last": 40},
+        "mark_steps": {"offset": ints(), "max_step": 700, "out marks": np.zeros((H, W), np.uint8)},
+        "count_slopes": {"offset": ints(), "edge": 1000, "slope": 100},
+        "disparity_range": {"disparity": np.zeros((H, W), np.float32), "out ends": np.zeros(2, np.float32)},
+        "code_disparity": {
+            "disparity": np.zeros((H, W), np.float32),
+            "least": 0.0,
+            "step": 0.5,
+            "out codes": np.zeros((H, W), np.uint16),
+        },
+        "decode_disparity": {
+            "codes": np.zeros((H, W), np.uint16),
+            "least": 0.0,
+            "step": 0.5,
+            "out disparity": np.zeros((H, W), np.float32),
+        },
+    }
+
+
+def ties_arguments():
+    """Those of the functions that measure ties."""
+    count, side = 3, 5
+
+    def floats(*shape):
+        return np.zeros(shape, np.float32)
+
+    return {
+        "fit_surfaces": {
+            "disparity": floats(20, 30),
+            "places": np.full((count, 2), 9.5),
+            "least_found": 0.8,
+            "out planes": np.zeros((count, 3)),
+            "out roughness": floats(count),
+        },
+        "place_windows": {
+            "places": np.zeros((count, 2)),
+            "slopes": np.ones((count, 2)),
+            "pixel_from_ray": np.eye(3),
+            "origins": (0.0, 0.0),
+            "scales": (9.0, 9.0),
+            "spherical": True,
+            "out columns": floats(count, side, side),
+            "out rows": floats(count, side, side),
+        },
+        "make_templates": {
+            "windows": floats(count, side + 2, side + 2),
+            "least_contrast": 0.5,
+            "out values": floats(count, side**2),
+            "out jacobian": floats(count, 4, side**2),
+            "out normal": floats(count, 4, 4),
+        },
+        "step_windows": {
+            "values": floats(count, side**2),
+            "jacobian": floats(count, 4, side**2),
+            "inverse": floats(count, 4, 4),
+            "windows": floats(count, side**2),
+            "least_contrast": 0.5,
+            "out move": floats(count, 4),
+            "out correlation": floats(count),
+            "out variance": floats(count),
+        },
+    }
+
+
 def fused_maps():
     return {"depth": np.ones((H, W), np.float32), "normals": np.ones((3, H, W), np.float32)}
 
@@ -335,6 +424,8 @@ FUNCTIONS = [
     "fit_planes",
     "add_patch_equations",
     "refine_planes",
+    *offsets_arguments(),
+    *ties_arguments(),
 ]
 MATCHING = FUNCTIONS[:6]
 
@@ -355,6 +446,18 @@ FREE = {
     ("fit_offsets", "target"): {1},
     ("warp", "prediction"): {1},
     ("upsample_offsets", "out fine"): {0, 1},  # one less than twice as many will do, see below
+    **{
+        (function, name): {0, 1}
+        for function, name in (
+            ("keep_between", "out offset"),
+            ("remove_small_segments", "out offset"),
+            ("count_fractions", "offset"),
+            ("bases_about", "out offset"),
+            ("count_slopes", "offset"),
+            ("disparity_range", "disparity"),
+            ("fit_surfaces", "disparity"),
+        )
+    },
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -459,7 +562,8 @@ def test_arrays_are_let_go_of(function):
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_valid_arguments_are_accepted(function):
-    assert call(function, arguments(function)) == ((H * W, 2 * H * W) if function == "count_points" else None)
+    results = {"count_points": (H * W, 2 * H * W), "count_slopes": ((W - 1) // 2, 0)}
+    assert call(function, arguments(function)) == results.get(function)
 
 
 @pytest.mark.parametrize(("function", "name"), ARRAYS)
@@ -682,6 +786,36 @@ def test_windows_about_numbers_out_of_this_world():
         values["predicted"][:] = np.random.default_rng(0).choice([-(2**31), 0, 2**31 - 1], (2 * H - 1, 2 * W))
         call("search_windows", values)
         assert (np.abs(values["out base"] + 16) <= 10).all()
+
+
+@pytest.mark.parametrize(
+    ("function", "name", "wrong"),
+    [
+        *[("unwarp_torn", "as_it_is", value) for value in (-1, 2**20 + 1)],
+        *[("target_bases", name, value) for name in ("margin", "as_it_is", "gap") for value in (-1, 2**20 + 1)],
+        *[("bases_about", "depth", value) for value in (-1, 0, 1025)],
+        *[("bases_about", "first", value) for value in (41, 2**31 - 1)],
+        ("mark_steps", "max_step", -1),
+        *[("count_slopes", name, -1) for name in ("edge", "slope")],
+    ],
+)
+def test_bounds_of_the_passes_over_offsets_are_kept(function, name, wrong):
+    with pytest.raises(ValueError, match="must"):
+        call(function, {**arguments(function), name: wrong})
+
+
+@pytest.mark.parametrize("size", [(0, 5), (33, 32)])
+def test_windows_of_impossible_sizes_are_refused(size):
+    places = {f"out {name}": np.zeros((3, *size), np.float32) for name in ("columns", "rows")}
+    with pytest.raises(ValueError, match="1 to 1024 pixels"):
+        call("place_windows", {**arguments("place_windows"), **places})
+    windows = np.zeros((3, size[0] + 2, size[1] + 2), np.float32)
+    templates = {
+        name: np.zeros((*shape, size[0] * size[1]), np.float32)
+        for name, shape in (("out values", (3,)), ("out jacobian", (3, 4)))
+    }
+    with pytest.raises(ValueError, match="1 to 1024 pixels"):
+        call("make_templates", {**arguments("make_templates"), "windows": windows, **templates})
 
 
 def test_negative_slant_is_refused():

@@ -17,7 +17,7 @@ from colmap_sph.stereo.search.target import Matches, Target, make_target
 
 def predicted(offset: np.ndarray, base: np.ndarray | int = -16) -> Prediction:
     """Predictions in pixels."""
-    steps = np.round(np.asarray(offset, dtype=float) * SUBPIXEL).astype(np.int32)
+    steps = np.round(np.ascontiguousarray(offset, dtype=float) * SUBPIXEL).astype(np.int32)
     return Prediction(steps, np.broadcast_to(np.int32(base), steps.shape).copy(), 32)
 
 

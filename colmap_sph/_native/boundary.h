@@ -34,7 +34,7 @@
 /* H and W are rows and columns of the image or map in question, D disparities; the others speak for themselves. */
 #define SYMBOLS(X) \
     X(H) X(W) X(D) X(FINE_H) X(FINE_W) X(TARGET_W) X(SOURCE_W) X(BAND) X(MAP_H) X(MAP_W) X(PARTNER_H) X(PARTNER_W) \
-    X(PAIRS) X(SOURCES) X(ROWS) X(POINTS) X(WORDS)
+    X(PAIRS) X(SOURCES) X(ROWS) X(POINTS) X(WORDS) X(PIXELS)
 
 #define SYMBOL_INDEX(symbol) INDEX_##symbol,
 #define SYMBOL_SIZE(symbol) symbol = (INDEX_##symbol + 1) << SYMBOL_SHIFT,
@@ -152,8 +152,9 @@ int check(int condition, const char *message);
 int check_size(const char *name, int axis, ptrdiff_t size, ptrdiff_t expected);
 
 /* All functions of a group, NULL ends them. */
-extern native_function *const matching_functions[], *const depth_functions[], *const fusion_functions[],
-                                                                                  *const surface_functions[];
+extern native_function *const matching_functions[],
+    *const depth_functions[], *const fusion_functions[], *const surface_functions[],
+                                                             *const ties_functions[], *const offsets_functions[];
 
 /* (name, ((argument, role, type, ((symbol or None, number), ...)), ...)); NULL with an error set. */
 PyObject *signature_of(const native_function *function);

@@ -231,7 +231,9 @@ def match_pair(
         matches = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
         offset = matches.offset if unseeded is None else matches.or_better(unseeded)
         del matches, unseeded
-        _drop_outside(offset, low - SPARE, max(high + SPARE, low - SPARE + depth - 1))
+        # Windows about predictions reach further.
+        last = max(high + SPARE, low - SPARE + depth - 1)
+        _native.keep_between(offset, (low - SPARE) * SUBPIXEL, last * SUBPIXEL)
         if sky is not None:
             _drop_beyond(offset, farthest, sky, level)
         if level > 0 or options.median_filter:
@@ -247,11 +249,6 @@ def _sky_offset(min_disparity: float, max_disparity: float, infinity: float | No
         return None
     beyond = min_disparity - infinity
     return -infinity if 0 < beyond <= _NEAR_RANGE * (max_disparity - min_disparity) else None
-
-
-def _drop_outside(offset: NDArray[np.int32], first: int, last: int) -> None:
-    """Invalidate, in place, what does not lie between two offsets, pixels, as windows about predictions reach."""
-    offset[(offset < first * SUBPIXEL) | (offset > last * SUBPIXEL)] = INVALID
 
 
 def _drop_beyond(offset: NDArray[np.int32], farthest: int, sky: float, level: int) -> None:

@@ -3,70 +3,86 @@
 
 #include "matching/matching.h"
 
-/* The 3 x 3 offsets around a pixel; beyond the sides, the outermost. */
+/* Three offsets side by side in each of three rows; beyond the sides, the outermost. */
 typedef struct {
-    int64_t at[3][3];
-} neighbours;
+    const int32_t *above, *own, *below;
+} three_rows;
 
-static inline neighbours neighbours_of(const int32_t *offset, level_sizes size, ptrdiff_t y, ptrdiff_t x) {
-    neighbours n;
-    for (int j = 0; j < 3; j++) {
-        const int32_t *row = offset + within(y + j - 1, size.height) * size.width;
-        for (int i = 0; i < 3; i++) {
-            n.at[j][i] = row[within(x + i - 1, size.width)];
-        }
-    }
-    return n;
+static three_rows rows_around(const int32_t *offset, level_sizes size, ptrdiff_t y) {
+    const int32_t *above = offset + within(y - 1, size.height) * size.width;
+    return (three_rows){above, offset + y * size.width, offset + within(y + 1, size.height) * size.width};
 }
 
-static inline int are_near(const neighbours *n, int max_step) {
-    int64_t least = n->at[1][1], most = least;
-    for (int j = 0; j < 3; j++) {
-        for (int i = 0; i < 3; i++) {
-            least = n->at[j][i] < least ? n->at[j][i] : least;
-            most = n->at[j][i] > most ? n->at[j][i] : most;
-        }
-    }
-    return most - least <= max_step;
+ALWAYS_INLINE int64_t least_of(int64_t a, int64_t b, int64_t c) { return a < b ? (a < c ? a : c) : b < c ? b : c; }
+
+ALWAYS_INLINE int64_t most_of(int64_t a, int64_t b, int64_t c) { return a > b ? (a > c ? a : c) : b > c ? b : c; }
+
+/* Two pixels of a finer row, a quarter of a pixel from the middle towards the row beside it. */
+ALWAYS_INLINE void upsample_pixel(three_rows rows, const int32_t *beside, ptrdiff_t left, ptrdiff_t x,
+                                  ptrdiff_t right, int max_step, int32_t fine[2]) {
+    const int32_t *a = rows.above, *o = rows.own, *b = rows.below;
+    const int64_t least = least_of(least_of(a[left], a[x], a[right]), least_of(o[left], o[x], o[right]),
+                                   least_of(b[left], b[x], b[right]));
+    const int64_t most = most_of(most_of(a[left], a[x], a[right]), most_of(o[left], o[x], o[right]),
+                                 most_of(b[left], b[x], b[right]));
+    const int64_t middle = 9 * (int64_t)o[x] + 3 * (int64_t)beside[x] + 8;
+    const int64_t first = (middle + 3 * (int64_t)o[left] + beside[left]) >> 4;
+    const int64_t second = (middle + 3 * (int64_t)o[right] + beside[right]) >> 4;
+    const int interpolates = most - least <= max_step;
+    fine[0] = interpolates ? (int32_t)first : o[x];
+    fine[1] = interpolates ? (int32_t)second : o[x];
 }
 
 void upsample_offsets(const int32_t *offset, level_sizes size, int max_step, int32_t *fine) {
-    for (ptrdiff_t y = 0; y < size.height; y++) {
-        for (ptrdiff_t x = 0; x < size.width; x++) {
-            const neighbours n = neighbours_of(offset, size, y, x);
-            const int interpolates = are_near(&n, max_step);
-            for (int j = 0; j < 2 && 2 * y + j < size.fine_height; j++) {
-                for (int i = 0; i < 2 && 2 * x + i < size.fine_width; i++) {
-                    /* A quarter of a pixel from the middle, towards this side. */
-                    const int64_t *own = n.at[1], *beside = n.at[2 * j];
-                    const int64_t sum = 9 * own[1] + 3 * own[2 * i] + 3 * beside[1] + beside[2 * i];
-                    const int64_t value = interpolates ? (sum + 8) >> 4 : own[1];
-                    fine[(2 * y + j) * size.fine_width + 2 * x + i] = (int32_t)value;
-                }
-            }
+    const ptrdiff_t last = size.width - 1;
+    for (ptrdiff_t y = 0; y < size.fine_height && last >= 0; y++) {
+        const three_rows rows = rows_around(offset, size, y >> 1);
+        const int32_t *beside = y & 1 ? rows.below : rows.above;
+        int32_t *out = fine + y * size.fine_width, ends[2];
+        for (ptrdiff_t x = 1; x < last; x++) {
+            upsample_pixel(rows, beside, x - 1, x, x + 1, max_step, out + 2 * x);
+        }
+        upsample_pixel(rows, beside, within(last - 1, size.width), last, last, max_step, ends);
+        for (ptrdiff_t i = 0; i < 2 && 2 * last + i < size.fine_width; i++) {
+            out[2 * last + i] = ends[i];
+        }
+        if (last > 0) {
+            upsample_pixel(rows, beside, 0, 0, 1, max_step, out);
         }
     }
 }
 
+enum { FARTHEST = 1 << 29 };
+
 /* An offset in pixels of the level above, in 1/256 pixel. */
-static inline int64_t in_steps(float pixels) {
-    const float steps = pixels * 512, most = 1 << 30;
-    return steps > -most ? (int64_t)(steps < most ? steps : most) : -(int64_t)most;
+ALWAYS_INLINE int32_t in_steps(float pixels) {
+    const float steps = pixels * 512, most = FARTHEST;
+    return steps > -most ? (int32_t)(steps < most ? steps : most) : -FARTHEST;
+}
+
+/* Whole number of slots by which a pixel's window moves. */
+ALWAYS_INLINE int32_t shift_of(int32_t least, int32_t most, int32_t predicted, int32_t room, int32_t farthest) {
+    const int32_t near = predicted < -FARTHEST ? -FARTHEST : predicted > FARTHEST ? FARTHEST : predicted;
+    const int32_t above = most - near - room, below = near - least - room;
+    int32_t shift = (above > 0 ? above : 0) - (below > 0 ? below : 0);
+    shift = above > 0 && below > 0 ? shift / 2 : shift;
+    shift = shift < -farthest ? -farthest : shift > farthest ? farthest : shift;
+    return (shift + 128) >> 8;
 }
 
 void search_windows(const int32_t *predicted, const float *least, const float *most, level_sizes size,
                     search_limits limits, int32_t *base) {
-    const int64_t room = 128 * (int64_t)limits.depth - 256 * (int64_t)limits.clearance;
-    const int64_t farthest = 128 * (int64_t)limits.depth - 256 * (int64_t)limits.own_clearance;
+    const int32_t room = 128 * limits.depth - 256 * limits.clearance, half = limits.depth / 2;
+    const int32_t farthest = 128 * limits.depth - 256 * limits.own_clearance;
     for (ptrdiff_t y = 0; y < size.fine_height; y++) {
-        for (ptrdiff_t x = 0; x < size.fine_width; x++) {
-            const ptrdiff_t p = y * size.fine_width + x, coarse = (y >> 1) * size.width + (x >> 1);
-            const int64_t above = in_steps(most[coarse]) - predicted[p] - room;
-            const int64_t below = predicted[p] - in_steps(least[coarse]) - room;
-            int64_t shift = (above > 0 ? above : 0) - (below > 0 ? below : 0);
-            shift = above > 0 && below > 0 ? shift / 2 : shift;
-            shift = shift < -farthest ? -farthest : shift > farthest ? farthest : shift;
-            base[p] = (int32_t)((shift + 128) >> 8) - limits.depth / 2;
+        const ptrdiff_t coarse = (y >> 1) * size.width, fine = y * size.fine_width;
+        for (ptrdiff_t x = 0; x < size.width; x++) {
+            const int32_t low = in_steps(least[coarse + x]), high = in_steps(most[coarse + x]);
+            const ptrdiff_t p = fine + 2 * x;
+            base[p] = shift_of(low, high, predicted[p], room, farthest) - half;
+            if (2 * x + 1 < size.fine_width) {
+                base[p + 1] = shift_of(low, high, predicted[p + 1], room, farthest) - half;
+            }
         }
     }
 }

@@ -12,6 +12,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph import _native
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Result
@@ -56,11 +57,13 @@ def write_pair(
     Facts
         What `facts_of_pair` will say.
     """
-    found = np.isfinite(pair.disparity)
-    least = float(pair.disparity[found].min()) if found.any() else 0.0
-    most = float(pair.disparity[found].max()) if found.any() else 0.0
+    disparity = np.ascontiguousarray(pair.disparity)
+    ends = np.empty(2, dtype=np.float32)
+    _native.disparity_range(disparity, ends)
+    least, most = ends.tolist()
     step = max(_FINEST_STEP, (most - least) / (_CODES - 1))
-    codes = np.where(found, np.rint((pair.disparity - least) / step) + 1, 0).astype(np.uint16)
+    codes = np.empty(disparity.shape, dtype=np.uint16)
+    _native.code_disparity(disparity, least, step, codes)
     texts = _texts_of(pair.left, pair.right, pair.geometry)
     ties = ties or Ties.none()
     residual = row_residual(ties)
@@ -81,8 +84,8 @@ def read_pair_with_ties(path: Path, key: str | None = None) -> tuple[PairDispari
     head, (codes, *tables) = read_arrays(path, _PAIR, lambda head: _array_types(head, _geometry_of(head)))
     _check_key(path, head, key)
     least, step = head.numbers[:2]
-    disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
-    disparity[codes == 0] = np.nan
+    disparity = np.empty(codes.shape, dtype=np.float32)
+    _native.decode_disparity(codes, least, step, disparity)
     table = tables[0] if tables else np.empty((0, _TIE_COLUMNS), np.float32)
     ties = Ties(table[:, :2], table[:, 2:4], table[:, 4])
     return PairDisparity(head.texts[0], head.texts[1], _geometry_of(head), disparity), ties

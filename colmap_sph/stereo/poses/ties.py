@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph import _native
 from colmap_sph.scene import View
 from colmap_sph.stereo.rectified_pair import (
     Float,
@@ -38,10 +39,9 @@ _LEAST = 0.25
 # A corner is looked for in every cell of an image; so many cells along its longer side.
 _CELLS = 64
 _CORNER_WINDOW = 5
-# Radius of the windows that are matched, and of those whose disparities must be one surface, rectified pixels.
-_RADIUS = 7
-_SURFACE_RADIUS = 4
-# Of the disparities there so many must exist, and be within so many pixels of their plane.
+# Side of the windows that are matched, rectified pixels.
+_SIDE = 15
+# Of the disparities around a tie so many must exist, and be within so many pixels of their plane.
 _LEAST_FOUND = 0.8
 _MAX_ROUGHNESS = 1.0
 # Steps of the least squares: they converge fast where they do.
@@ -187,16 +187,17 @@ def find_ties(
         return Ties.none()
     fine = geometry.resampled(finer)
     places, planes = places * finer, planes * [finer, 1, 1]
-    template = _Template.of(_windows(left, fine, "left", _around(places, _RADIUS + 1)))
-    found = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
+    upright = np.tile([1.0, 0.0], (len(places), 1))
+    template = _Template.of(_windows(left, fine, "left", places, upright, _SIDE + 2))
+    start = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
+    found = start.copy()
     # The right column of the window's pixel (i, j) is that of its middle, plus slopes · (i, j).
     slopes = np.column_stack([1 - planes[:, 1], -planes[:, 2]])
     for _ in range(_STEPS):
-        window = _windows(right, fine, "right", _around(found, _RADIUS, slopes))
+        window = _windows(right, fine, "right", found, slopes, _SIDE)
         move, correlation, sigma = template.step(window)
         found -= np.column_stack([(slopes * move[:, :2]).sum(axis=1), move[:, 1]])
         slopes -= slopes[:, :1] * move[:, 2:]
-    start = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
     good = (correlation > _LEAST_CORRELATION) & (sigma < _MAX_SIGMA).all(axis=1)
     good &= (np.abs(move[:, :2]) < _CONVERGED).all(axis=1) & (np.abs(found - start) < MAX_MOVE).all(axis=1)
     measured = ((part[good] / finer).astype(np.float32) for part in (places, found, sigma[:, 1]))
@@ -206,38 +207,14 @@ def find_ties(
 def _on_surfaces(places: Float, disparity: NDArray[np.float32]) -> tuple[Float, Float]:
     """Those places, up to `MAX_TIES`, around which disparities lie on a plane, and (n, 3) the planes.
 
-    A plane is the disparity in the middle of the window, and its change per column and row.
+    A plane is the disparity at the place, and its change per column and row.
     """
-    height, width = disparity.shape
-    middle = np.rint(places).astype(int)
-    size = [width - 1, height - 1]
-    inside = ((middle >= _SURFACE_RADIUS) & (middle <= np.array(size) - _SURFACE_RADIUS)).all(axis=1)
-    places, middle = places[inside], middle[inside]
-    steps = np.arange(-_SURFACE_RADIUS, _SURFACE_RADIUS + 1)
-    window = disparity[middle[:, 1, None, None] + steps[:, None], middle[:, 0, None, None] + steps].astype(float)
-    column, row = (part.ravel() for part in np.meshgrid(steps, steps))
-    window = window.reshape(-1, len(column))  # there may be no window
-    there = np.isfinite(window)
-    found = there.mean(axis=1) >= _LEAST_FOUND
-    places, middle, window, there = (part[found] for part in (places, middle, window, there))
-    basis = np.stack([np.ones(len(column)), column, row], axis=1)
-    values = np.where(there, window, 0)
-    normal = (there @ (basis[:, :, None] * basis[:, None]).reshape(len(basis), -1)).reshape(-1, 3, 3)
-    planes = np.asarray(np.linalg.solve(normal, (values @ basis)[:, :, None]), float)[:, :, 0]
-    rough = np.where(there, np.abs(window - planes @ basis.T), 0).max(axis=1)
-    smooth = np.flatnonzero(rough <= _MAX_ROUGHNESS)
+    planes = np.empty((len(places), 3))
+    roughness = np.empty(len(places), dtype=np.float32)
+    _native.fit_surfaces(disparity, np.ascontiguousarray(places), _LEAST_FOUND, planes, roughness)
+    smooth = np.flatnonzero(roughness <= _MAX_ROUGHNESS)
     smooth = smooth[:: -(-len(smooth) // MAX_TIES) or 1]
-    planes[:, 0] += ((places - middle) * planes[:, 1:]).sum(axis=1)
-    return places[smooth], np.asarray(planes[smooth])
-
-
-def _around(places: Float, radius: int, slopes: Float | None = None) -> tuple[Float, Float]:
-    """(n, h, w) columns and (n, h, 1) rows of windows around places, with sloping columns if these are given."""
-    offsets = np.arange(-radius, radius + 1, dtype=float)
-    i, j = offsets[None, None, :], offsets[None, :, None]
-    along = i + 0 * j if slopes is None else slopes[:, 0, None, None] * i + slopes[:, 1, None, None] * j
-    columns = places[:, 0, None, None] + along
-    return columns, places[:, 1, None, None] + j
+    return places[smooth], planes[smooth]
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,16 +227,12 @@ class _Template:
 
     @classmethod
     def of(cls, windows: NDArray[np.float32]) -> "_Template":
-        """From (n, 2 r + 3, 2 r + 3) grey values, with a rim of one pixel for the gradients."""
-        inner = windows[:, 1:-1, 1:-1]
-        values, scale = _normalised(inner)
-        along = (windows[:, 1:-1, 2:] - windows[:, 1:-1, :-2]).reshape(values.shape) / (2 * scale)
-        across = (windows[:, 2:, 1:-1] - windows[:, :-2, 1:-1]).reshape(values.shape) / (2 * scale)
-        radius = inner.shape[1] // 2
-        j, i = (part.ravel() for part in np.mgrid[-radius : radius + 1, -radius : radius + 1])
-        jacobian = np.stack([along, across, along * i, along * j], axis=2)
-        jacobian -= jacobian.mean(axis=1, keepdims=True)
-        normal = jacobian.swapaxes(1, 2) @ jacobian
+        """From (n, h + 2, w + 2) grey values, with a rim of one pixel for the gradients."""
+        count, pixels = len(windows), (windows.shape[1] - 2) * (windows.shape[2] - 2)
+        values = np.empty((count, pixels), dtype=np.float32)
+        jacobian = np.empty((count, 4, pixels), dtype=np.float32)
+        normal = np.empty((count, 4, 4), dtype=np.float32)
+        _native.make_templates(windows, _LEAST_CONTRAST, values, jacobian, normal)
         # What a window does not tell moves it nowhere, and has no small standard deviation.
         normal += _REGULARISER * np.eye(4, dtype=np.float32)
         return cls(values, jacobian, np.linalg.inv(normal))
@@ -277,47 +250,45 @@ class _Template:
         sigma : (n, 2) float32 ndarray
             Standard deviations of the shift along and across, pixels.
         """
-        values, _ = _normalised(windows)
-        difference = values - self.values
-        move = (self.inverse @ (self.jacobian.swapaxes(1, 2) @ difference[:, :, None]))[:, :, 0]
-        variance = (difference**2).mean(axis=1)
-        correlation = (values * self.values).mean(axis=1)
+        count = len(windows)
+        move = np.empty((count, 4), dtype=np.float32)
+        correlation = np.empty(count, dtype=np.float32)
+        variance = np.empty(count, dtype=np.float32)
+        template = self.values, self.jacobian, self.inverse
+        flat = windows.reshape(count, -1)
+        _native.step_windows(*template, flat, _LEAST_CONTRAST, move, correlation, variance)
         spread = np.diagonal(self.inverse, axis1=1, axis2=2)[:, :2]
         return move, correlation, np.sqrt(_CORRELATED * variance[:, None] * spread)
-
-
-def _normalised(windows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """(n, pixels) windows with mean 0 and variance 1, and (n, 1) the standard deviations that they had."""
-    flat = windows.reshape(len(windows), -1)
-    flat = flat - flat.mean(axis=1, keepdims=True)
-    scale = np.sqrt((flat**2).mean(axis=1, keepdims=True)) + _LEAST_CONTRAST
-    return flat / scale, scale
 
 
 def _windows(
     photo: tuple[View, NDArray[np.uint8] | NDArray[np.float32]],
     geometry: RectifiedPair,
     side: Side,
-    places: tuple[Float, Float],
+    places: Float,
+    slopes: Float,
+    length: int,
 ) -> NDArray[np.float32]:
-    """Grey values at (n, h, w) columns and (n, h, 1) rows, straight from the image, whose border is repeated."""
+    """(n, length, length) grey values of windows, straight from the image, whose border is repeated.
+
+    Pixel (i, j) from the middle of a window lies at column place + slopes · (i, j), row place + j.
+    """
     view, image = photo
-    columns, rows = places
-    along = ((columns + geometry.column_origin(side)) / geometry.columns_per_radian).astype(np.float32)
-    across = ((rows + geometry.row_origin) / geometry.rows_per_radian).astype(np.float32)
-    # Rows are the same all along a window: most of a ray is known by them, see `resampling`.
-    if geometry.surface == "spherical":
-        sine, cosine, row_ray = np.sin(along), np.cos(along), (np.sin(across), np.cos(across))
-    else:
-        sine, cosine, row_ray = along, np.ones_like(along), (across, np.ones_like(across))
-    camera = pixel_from_rectified_ray(view, geometry).astype(np.float32)
-    x, y, z = (a * sine + (b * row_ray[0] + c * row_ray[1]) * cosine for a, b, c in camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # COLMAP counts from the pixel's corner, cv2.remap from its centre.
-        maps = [np.where(z > 0, part / z, -1) - np.float32(0.5) for part in (x, y)]
-    columns_there, rows_there = (part.reshape(-1, part.shape[-1]) for part in maps)
+    columns = np.empty((len(places), length, length), dtype=np.float32)
+    rows = np.empty_like(columns)
+    _native.place_windows(
+        places,
+        slopes,
+        pixel_from_rectified_ray(view, geometry),
+        (geometry.column_origin(side), geometry.row_origin),
+        (geometry.columns_per_radian, geometry.rows_per_radian),
+        geometry.surface == "spherical",
+        columns,
+        rows,
+    )
+    columns_there, rows_there = (part.reshape(-1, length) for part in (columns, rows))
     values = cv2.remap(image, columns_there, rows_there, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(values, dtype=np.float32).reshape(maps[0].shape)
+    return np.asarray(values, dtype=np.float32).reshape(columns.shape)
 
 
 def filled_residuals(measured: Sequence[float | None]) -> list[float]:

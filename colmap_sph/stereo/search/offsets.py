@@ -22,11 +22,6 @@ MEDIAN_SIDE = 5
 _MAX_NOISE = 2
 # What no offset reaches.
 _BEYOND = np.float32(1e9)
-# cv2.filterSpeckles works on 16 bits, of which the least stands for "none": with four steps to a pixel they hold
-# ranges of 8,000 pixels around the middle. Neighbours that differ by a pixel or less are of one segment.
-_SPECKLE_STEPS = 4
-_SPECKLE_RANGE = 32000
-_NO_SPECKLE = np.iinfo(np.int16).min
 # Pixel locking makes whole pixels come more often than others by no more than this share; see `evening_shifts`.
 _MAX_LOCKING = 0.15
 _SHIFT_STEPS = 4096
@@ -49,16 +44,12 @@ def smooth(offset: NDArray[np.int32]) -> None:
 
 
 def remove_small_segments(offset: NDArray[np.int32], min_segment: int) -> None:
-    """Invalidate, in place, connected regions smaller than `min_segment` pixels."""
-    if min_segment < 2:
-        return
-    valid = offset != INVALID
-    steps = offset // (SUBPIXEL // _SPECKLE_STEPS)
-    steps -= int(np.median(steps[::4][valid[::4]])) if valid[::4].any() else 0
-    small = np.clip(steps, -_SPECKLE_RANGE, _SPECKLE_RANGE, out=steps).astype(np.int16)
-    small[~valid] = _NO_SPECKLE
-    cv2.filterSpeckles(small, _NO_SPECKLE, min_segment - 1, _SPECKLE_STEPS)
-    offset[small == _NO_SPECKLE] = INVALID
+    """Invalidate, in place, connected regions smaller than `min_segment` pixels.
+
+    Neighbours that differ by a pixel or less, in whole quarters of a pixel, are of one region.
+    """
+    if min_segment > 1:
+        _native.remove_small_segments(offset, min_segment)
 
 
 def to_disparity(offset: NDArray[np.int32]) -> NDArray[np.float32]:
@@ -74,7 +65,8 @@ def evening_shifts(offset: NDArray[np.int32]) -> NDArray[np.float32]:
     Fine texture draws matches to whole pixels ("pixel locking"), by some hundredths of a pixel. Fractions that are
     uneven in another way are the scene's own, of surfaces that both cameras face, and stay.
     """
-    counts = np.bincount(offset[offset != INVALID] & (SUBPIXEL - 1), minlength=SUBPIXEL)
+    counts = np.empty(SUBPIXEL, dtype=np.uint32)
+    _native.count_fractions(offset, counts)
     turn = 2 * np.pi * np.arange(SUBPIXEL) / SUBPIXEL
     # The density is about 1 + a cos + b sin. Locking has no b: so much of a may be the scene's, too.
     a, b = (2 * (counts @ wave) / max(counts.sum(), 1) for wave in (np.cos(turn), np.sin(turn)))

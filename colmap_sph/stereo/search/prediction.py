@@ -73,10 +73,16 @@ class Prediction:
     @property
     def first(self) -> NDArray[np.int32]:
         """(H, W) int32 first offset to search, pixels."""
-        first = self.offset + np.int32(SUBPIXEL // 2)
-        first //= SUBPIXEL
-        first += self.base
-        return first if self.torn is None else np.where(self.torn, self.base, first)
+        if not self.warps:
+            return self.base
+        first = np.empty_like(self.base)
+        _native.first_offsets(self.offset, self.base, self.torn_bytes, first)
+        return first
+
+    @property
+    def torn_bytes(self) -> NDArray[np.uint8]:
+        """(H, W) uint8: 1 where windows are torn, else 0."""
+        return np.zeros(self.base.shape, np.uint8) if self.torn is None else self.torn.view(np.uint8)
 
     @property
     def margin(self) -> int:
@@ -187,33 +193,24 @@ def _windows_about(
     middle = (least + most) / 2
     centre = 2 * np.where(fits, middle, np.clip(middle, own - reach, own + reach))
     base = _upsampled(_in_steps(centre), shape)
-    base += SUBPIXEL // 2
-    base //= SUBPIXEL
-    base -= depth // 2
     low, high = offsets
     first = low - SPARE
-    return np.clip(base, first, max(high + 1 + SPARE - depth, first), out=base)
+    _native.bases_about(base, depth, first, max(high + 1 + SPARE - depth, first))
+    return base
 
 
 def is_flat(predicted: NDArray[np.int32]) -> bool:
     """Whether hardly any surface is stretched or slanted."""
-    places = predicted[::2, ::2]
-    across = np.abs(np.diff(places, axis=1)[:-1])
-    slope = np.maximum(across, np.abs(np.diff(places, axis=0)[:, :-1]))
-    surface = int(np.count_nonzero(slope <= 2 * _EDGE * SUBPIXEL))
-    steep = surface - int(np.count_nonzero(slope <= 2 * _STEEP * SUBPIXEL))
+    # Slopes are taken over two pixels.
+    surface, steep = _native.count_slopes(predicted, int(2 * _EDGE * SUBPIXEL), int(2 * _STEEP * SUBPIXEL))
     return steep <= _FLAT_SHARE * surface
 
 
 def torn_by(predicted: NDArray[np.int32]) -> NDArray[np.bool_]:
     """(H, W) bool: what lies as near to a step of the prediction as a window reaches."""
-    steps = np.zeros(predicted.shape, dtype=np.uint8)
-    across, down = (np.abs(np.diff(predicted, axis=axis)) > _TEAR * SUBPIXEL for axis in (1, 0))
-    steps[:, 1:] |= across
-    steps[:, :-1] |= across
-    steps[1:] |= down
-    steps[:-1] |= down
-    return np.asarray(cv2.dilate(steps, np.ones((2 * _TORN_RADIUS + 1,) * 2, dtype=np.uint8)) > 0)
+    steps = np.empty(predicted.shape, dtype=np.uint8)
+    _native.mark_steps(predicted, _TEAR * SUBPIXEL, steps)
+    return np.asarray(cv2.dilate(steps, np.ones((2 * _TORN_RADIUS + 1,) * 2, dtype=np.uint8))).view(np.bool_)
 
 
 def searched_depth(low: int, high: int, most: int) -> int:
@@ -267,6 +264,5 @@ def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDAr
     _, labels = cv2.distanceTransformWithLabels(
         (~valid).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
     )
-    of_label = np.zeros(int(labels.max()) + 1, dtype=np.float32)
-    of_label[labels[valid]] = values[valid]
-    return np.asarray(of_label[labels], dtype=np.float32)
+    # Labels count the valid pixels, row by row, from 1.
+    return np.asarray(values[valid][labels - 1], dtype=np.float32)

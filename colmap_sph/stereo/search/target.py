@@ -57,10 +57,8 @@ class Target:
             return offset
         unwarped = np.empty_like(offset)
         _native.unwarp_offsets(offset, self.prediction.offset, self.prediction.margin, unwarped)
-        torn = self.prediction.torn
-        if torn is not None:
-            found = offset[torn]
-            unwarped[torn] = np.where(found == INVALID, INVALID, found - np.int32(self.as_it_is * SUBPIXEL))
+        if self.prediction.torn is not None:
+            _native.unwarp_torn(offset, self.prediction.torn_bytes, self.as_it_is, unwarped)
         return unwarped
 
 
@@ -132,9 +130,8 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     warped, columns = _warped(right, prediction)
     words = census(warped)
     del warped
-    base = prediction.base + np.int32(prediction.margin)
-    torn = prediction.torn
-    if torn is None:
+    if prediction.torn is None:
+        base = prediction.base + np.int32(prediction.margin)
         return Target(words, columns, base, right_width, words.shape[1], prediction)
     # Windows of torn pixels that begin left of the right image must not reach what lies before it here.
     gap = prediction.depth
@@ -145,8 +142,8 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     del words  # the widest arrays of a level, one at a time
     both[:, as_it_is:] = census(right)
     columns = np.concatenate([columns, np.full((height, gap), -1, dtype=np.int32), own_columns], axis=1)
-    nearest = -gap - np.arange(torn.shape[1], dtype=np.int32)
-    np.copyto(base, np.maximum(prediction.base, nearest) + np.int32(as_it_is), where=torn)
+    base = np.empty_like(prediction.base)
+    _native.target_bases(prediction.base, prediction.torn_bytes, prediction.margin, as_it_is, gap, base)
     return Target(both, columns, base, right_width, as_it_is, prediction)
 
 
