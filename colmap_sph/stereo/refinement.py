@@ -124,9 +124,11 @@ def refine_maps(
             smooth = NormalOptions(radius=options.smoothing_radius)
             moved = replace(estimate, depth=depth)
             smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
-            fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
-            normals[fitted] = smooth_normals[fitted]
-            depth[fitted] = smooth_depth[fitted]
+            lone = smooth_depth == 0  # a pixel without neighbours keeps its plane
+            smooth_normals[lone] = normals[lone]
+            smooth_depth[lone] = depth[lone]
+            normals[:] = smooth_normals
+            depth[:] = smooth_depth
         for first in range(0, view.height, _BAND_ROWS):
             rows = slice(first, min(first + _BAND_ROWS, view.height), 1)
             planes = _planes_of_maps(view, normals, depth, rows)
@@ -136,7 +138,7 @@ def refine_maps(
             sigma = _freedom(estimate.sigma[rows], planes, options)
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma, slope_sigma, planes)
-            normals[rows], depth[rows] = _maps_of_planes(view, planes, rows)
+            _native.maps_of_planes(planes, view.K, first, normals, depth)
     return normals, depth
 
 
@@ -199,48 +201,6 @@ def _planes_of_maps(
     view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], rows: slice
 ) -> NDArray[np.float32]:
     """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
-    normals = normals[rows]
-    depth = depth[rows]
-    # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d. No matrix product: it would wake BLAS's
-    # threads for three columns.
-    (a, b, c), (_, d, e), _ = np.linalg.inv(view.K).astype(np.float32)
-    x, y, z = (normals[..., axis] for axis in range(3))
-    column, row = _pixels(view, rows)
-    planes = np.empty((3, *depth.shape), np.float32)
-    inverse, along_x, along_y = planes
-    np.multiply(x, a, out=along_x)
-    np.add(x * b, y * d, out=along_y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(1, depth, out=inverse)
-        scale = inverse / (along_x * column + along_y * row + (x * c + y * e + z))
-        planes[1:] *= scale
-    planes[:, ~((depth > 0) & np.isfinite(planes).all(axis=0))] = 0
+    planes = np.empty((3, len(range(*rows.indices(view.height))), view.width), np.float32)
+    _native.planes_of_maps(normals, depth, np.linalg.inv(view.K), rows.start, rows.step, planes)
     return planes
-
-
-def _maps_of_planes(
-    view: View, planes: NDArray[np.float32], rows: slice
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Inverse of `_planes_of_maps`: normals (h, W, 3) and depth (h, W)."""
-    inverse, along_x, along_y = planes
-    (a, b, c), (_, d, e), _ = view.K.astype(np.float32)
-    column, row = _pixels(view, rows)
-    normals = np.empty((*inverse.shape, 3), np.float32)
-    x, y, z = (normals[..., axis] for axis in range(3))
-    np.multiply(along_x, -a, out=x)
-    np.negative(along_x * b + along_y * d, out=y)
-    np.negative(along_x * c + along_y * e + (inverse - along_x * column - along_y * row), out=z)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        normals /= np.sqrt(x * x + y * y + z * z)[..., None]
-        depth = 1 / inverse
-    lost = ~(inverse > 0)
-    normals[lost] = 0
-    depth[lost] = 0
-    return normals, depth
-
-
-def _pixels(view: View, rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return (
-        np.arange(view.width, dtype=np.float32)[None],
-        np.arange(rows.start, rows.stop, rows.step, dtype=np.float32)[:, None],
-    )

@@ -38,63 +38,23 @@ static inline double arctangent2(double y, double x) {
     return y < 0 ? -sum : sum;
 }
 
-/* Nearest whole number; not by truncating u + 0.5, which would round the number before 0.5 up to 1. */
-static inline ptrdiff_t nearest(double u) {
-    const double whole = floor(u);
-    return (ptrdiff_t)whole + (u - whole >= 0.5);
-}
-
 typedef struct {
     const float *values;
     ptrdiff_t height, width;
 } disparity_map;
 
-/* How far a disparity lies from the mean of its neighbours, along the axis where that is more: matches in foliage
- * and at edges are less certain than those on smooth surfaces. A missing neighbour counts as a whole pixel. */
-static inline double roughness(const disparity_map *map, ptrdiff_t x, ptrdiff_t y) {
-    const float *centre = map->values + y * map->width + x;
-    const double across = x > 0 && x + 1 < map->width ? fabs(*centre - 0.5 * (centre[-1] + centre[1])) : NAN;
-    const double along =
-        y > 0 && y + 1 < map->height ? fabs(*centre - 0.5 * (centre[-map->width] + centre[map->width])) : NAN;
-    return fmax(isnan(across) ? 1 : across, isnan(along) ? 1 : along);
-}
-
-/* Disparity at (u, v) and its roughness: interpolated only between disparities of the surface of the nearest
- * pixel; NaN when that pixel has none. */
-static inline double sample_surface(const disparity_map *map, double u, double v, double max_step, double *rough) {
-    if (!(u > -0.5 && v > -0.5 && u < (double)map->width - 0.5 && v < (double)map->height - 0.5)) {
-        return NAN;
-    }
-    const ptrdiff_t x = nearest(u), y = nearest(v);
-    const double centre = map->values[y * map->width + x];
-    if (isnan(centre)) {
-        return NAN;
-    }
-    *rough = roughness(map, x, y);
-    /* The other corners of the cell around (u, v): beside, above or below, and across from the nearest one. */
-    const double du = u - (double)x, dv = v - (double)y;
-    const ptrdiff_t x1 = x + (du < 0 ? -1 : 1), y1 = y + (dv < 0 ? -1 : 1);
-    const int in_row = x1 >= 0 && x1 < map->width, in_column = y1 >= 0 && y1 < map->height;
-    const double fx = fabs(du), fy = fabs(dv);
-    const double beside = in_row ? map->values[y * map->width + x1] : NAN;
-    const double above = in_column ? map->values[y1 * map->width + x] : NAN;
-    const double across = in_row && in_column ? map->values[y1 * map->width + x1] : NAN;
-    const double weight = (1 - fx) * (1 - fy);
-    /* Comparisons are false for NaN. */
-    const double w1 = fabs(beside - centre) <= max_step ? fx * (1 - fy) : 0;
-    const double w2 = fabs(above - centre) <= max_step ? (1 - fx) * fy : 0;
-    const double w3 = fabs(across - centre) <= max_step ? fx * fy : 0;
-    const double sum = (w1 > 0 ? w1 * (beside - centre) : 0) + (w2 > 0 ? w2 * (above - centre) : 0) +
-                       (w3 > 0 ? w3 * (across - centre) : 0);
-    return centre + sum / (weight + w1 + w2 + w3);
-}
-
 enum { BLOCK = 256 };
 
 /* Pixels of one row of the depth map. Fixed sizes, so that the compiler can vectorise. */
 typedef struct {
-    double x[BLOCK], y[BLOCK], z[BLOCK]; /* ray in the rectified frame, of depth 1 in the camera */
-    double u[BLOCK], v[BLOCK];           /* column and row in the disparity map */
+    double x[BLOCK], y[BLOCK], z[BLOCK];      /* ray in the rectified frame, of depth 1 in the camera */
+    double u[BLOCK], v[BLOCK];                /* column and row in the disparity map; 0 where outside */
+    int32_t column[BLOCK], row[BLOCK];        /* the nearest pixel there ... */
+    int32_t to_right[BLOCK], to_below[BLOCK]; /* ... and where (u, v) lies from it: -1 or 1 */
+    int32_t inside[BLOCK];                    /* 1 or 0 */
+    float centre[BLOCK];                      /* disparity of the nearest pixel, and of those ... */
+    float left[BLOCK], right[BLOCK], above[BLOCK], below[BLOCK]; /* ... around it, NaN beyond the rim ... */
+    float across[BLOCK];                                         /* ... and that beyond (u, v) */
     double disparity[BLOCK], spread[BLOCK];
     double depth[BLOCK], sigma[BLOCK];
 } block;
@@ -121,6 +81,89 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
             k->u[i] = k->x[i] * scale * columns - column_origin;
             k->v[i] = k->y[i] * scale * rows - row_origin;
         }
+    }
+}
+
+/* Finds the nearest pixels of the disparity map; false where none is inside. */
+static inline int find_nearest(const disparity_map *map, block *k) {
+    const double end_u = (double)map->width - 0.5, end_v = (double)map->height - 0.5;
+    for (int i = 0; i < BLOCK; i++) {
+        const int inside = (k->u[i] > -0.5) & (k->v[i] > -0.5) & (k->u[i] < end_u) & (k->v[i] < end_v);
+        /* From 1 on, so that cutting off the fraction rounds down; not by adding 0.5, which would round the number
+         * before 0.5 up to 1. */
+        const double u = inside ? k->u[i] : 0, v = inside ? k->v[i] : 0;
+        const int32_t before_u = (int32_t)(u + 1) - 1, before_v = (int32_t)(v + 1) - 1;
+        k->column[i] = before_u + (u - before_u >= 0.5);
+        k->row[i] = before_v + (v - before_v >= 0.5);
+        k->to_right[i] = u - k->column[i] < 0 ? -1 : 1;
+        k->to_below[i] = v - k->row[i] < 0 ? -1 : 1;
+        k->u[i] = u;
+        k->v[i] = v;
+        k->inside[i] = inside;
+    }
+    int any = 0;
+    for (int i = 0; i < BLOCK; i++) {
+        any |= k->inside[i];
+    }
+    return any;
+}
+
+/* Reads the disparities around the nearest pixels; false where these have none. */
+static inline int read_around(const disparity_map *map, int count, block *k) {
+    const ptrdiff_t width = map->width, last_row = map->height - 1, last_column = width - 1;
+    int any = 0;
+    for (int i = 0; i < BLOCK; i++) {
+        k->centre[i] = NAN;
+    }
+    for (int i = 0; i < count; i++) {
+        const ptrdiff_t x = k->column[i], y = k->row[i];
+        const float *centre = map->values + y * width + x;
+        if (!k->inside[i] || isnan(*centre)) {
+            continue;
+        }
+        const int has_left = x > 0, has_right = x < last_column, has_above = y > 0, has_below = y < last_row;
+        const int has_beside = k->to_right[i] > 0 ? has_right : has_left;
+        const int has_beyond = k->to_below[i] > 0 ? has_below : has_above;
+        k->centre[i] = *centre;
+        k->left[i] = has_left ? centre[-1] : NAN;
+        k->right[i] = has_right ? centre[1] : NAN;
+        k->above[i] = has_above ? centre[-width] : NAN;
+        k->below[i] = has_below ? centre[width] : NAN;
+        k->across[i] = has_beside && has_beyond ? centre[k->to_below[i] * width + k->to_right[i]] : NAN;
+        any = 1;
+    }
+    return any;
+}
+
+/* Variance of the disparities: they are rough by how far they lie from the mean of their neighbours, along the
+ * axis where that is more; matches in foliage and at edges are less certain than those on smooth surfaces. A
+ * missing neighbour counts as a whole pixel. */
+static inline void find_spread(const pair_geometry *g, block *k) {
+    for (int i = 0; i < BLOCK; i++) {
+        const double along_row = fabs(k->centre[i] - 0.5 * (k->left[i] + k->right[i]));
+        const double along_column = fabs(k->centre[i] - 0.5 * (k->above[i] + k->below[i]));
+        const double r = isnan(along_row) ? 1 : along_row, c = isnan(along_column) ? 1 : along_column;
+        const double more = r > c ? r : c;
+        const double rough = ROUGHNESS_SHARE * (more < g->max_disparity_step ? more : g->max_disparity_step);
+        k->spread[i] = sqrt(g->disparity_sigma * g->disparity_sigma + rough * rough);
+    }
+}
+
+/* Disparities at (u, v): interpolated only between those of the surface of the nearest pixel; NaN when that has
+ * none. */
+static inline void interpolate(double max_step, block *k) {
+    for (int i = 0; i < BLOCK; i++) {
+        const double du = k->u[i] - k->column[i], dv = k->v[i] - k->row[i], fx = fabs(du), fy = fabs(dv);
+        const double centre = k->centre[i], beside = du < 0 ? k->left[i] : k->right[i];
+        const double beyond = dv < 0 ? k->above[i] : k->below[i], across = k->across[i];
+        const double weight = (1 - fx) * (1 - fy);
+        /* Comparisons are false for NaN. */
+        const double w1 = fabs(beside - centre) <= max_step ? fx * (1 - fy) : 0;
+        const double w2 = fabs(beyond - centre) <= max_step ? (1 - fx) * fy : 0;
+        const double w3 = fabs(across - centre) <= max_step ? fx * fy : 0;
+        const double sum = (w1 > 0 ? w1 * (beside - centre) : 0) + (w2 > 0 ? w2 * (beyond - centre) : 0) +
+                           (w3 > 0 ? w3 * (across - centre) : 0);
+        k->disparity[i] = centre + sum / (weight + w1 + w2 + w3);
     }
 }
 
@@ -180,35 +223,27 @@ void VERSION_OF(depth_candidates)(const float *disparity, ptrdiff_t map_height, 
                                   float *depth, float *sigma) {
     const disparity_map map = {disparity, map_height, map_width};
     block k;
+    memset(&k, 0, sizeof k);
     for (ptrdiff_t y = 0; y < rows; y++) {
         for (ptrdiff_t start = 0; start < columns; start += BLOCK) {
             const int count = columns - start < BLOCK ? (int)(columns - start) : BLOCK;
+            const ptrdiff_t first = y * columns + start;
             locate(g, (double)(first_row + y), (double)start, &k);
-            int found = 0;
-            for (int i = 0; i < BLOCK; i++) {
-                double rough = 0;
-                k.disparity[i] =
-                    i < count ? sample_surface(&map, k.u[i], k.v[i], g->max_disparity_step, &rough) : NAN;
-                rough = ROUGHNESS_SHARE * (rough < g->max_disparity_step ? rough : g->max_disparity_step);
-                k.spread[i] = g->disparity_sigma * g->disparity_sigma + rough * rough;
-                found += !isnan(k.disparity[i]);
-            }
-            if (!found) {
-                memset(depth + y * columns + start, 0, (size_t)count * sizeof *depth);
-                memset(sigma + y * columns + start, 0, (size_t)count * sizeof *sigma);
+            if (!find_nearest(&map, &k) || !read_around(&map, count, &k)) {
+                memset(depth + first, 0, (size_t)count * sizeof *depth);
+                memset(sigma + first, 0, (size_t)count * sizeof *sigma);
                 continue;
             }
-            for (int i = 0; i < BLOCK; i++) {
-                k.spread[i] = sqrt(k.spread[i]);
-            }
+            find_spread(g, &k);
+            interpolate(g->max_disparity_step, &k);
             if (g->spherical) {
                 triangulate_sphere(g, &k);
             } else {
                 triangulate_plane(g, &k);
             }
             for (int i = 0; i < count; i++) {
-                depth[y * columns + start + i] = (float)k.depth[i];
-                sigma[y * columns + start + i] = (float)k.sigma[i];
+                depth[first + i] = (float)k.depth[i];
+                sigma[first + i] = (float)k.sigma[i];
             }
         }
     }

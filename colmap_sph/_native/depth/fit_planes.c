@@ -91,7 +91,8 @@ static inline void solve(const normal_equations *sums, block *k) {
     }
 }
 
-static inline void begin(const float *centre, const float *sigma, ptrdiff_t count, float tolerance, block *k) {
+/* False where no pixel has a depth. */
+static inline int begin(const float *centre, const float *sigma, ptrdiff_t count, float tolerance, block *k) {
     for (int l = 0; l < LANES; l++) {
         const float w = l < count ? centre[l] : 0;
         k->good[l] = w >= SMALLEST;
@@ -100,6 +101,11 @@ static inline void begin(const float *centre, const float *sigma, ptrdiff_t coun
         k->noise[l] = clamp(k->good[l] ? tolerance * sigma[l] * k->scale[l] : 1, LEAST_NOISE, 1);
         k->value[l] = k->du[l] = k->dv[l] = 0;
     }
+    int any = 0;
+    for (int l = 0; l < LANES; l++) {
+        any |= k->good[l];
+    }
+    return any;
 }
 
 /* Whether the pixel is off its plane, or glances at it with little support. `value` is the plane's inverse depth
@@ -157,7 +163,11 @@ int VERSION_OF(fit_planes)(const float *inverse_depth, const float *inverse_sigm
             const ptrdiff_t p = row * width + column, count = width - column < LANES ? width - column : LANES;
             const float *window = padded + (row + radius) * stride + column + radius;
             block k;
-            begin(window, inverse_sigma + p, count, fit->tolerance, &k);
+            if (!begin(window, inverse_sigma + p, count, fit->tolerance, &k)) {
+                memset(normals + 3 * p, 0, (size_t)(3 * count) * sizeof *normals);
+                memset(fitted_depth + p, 0, (size_t)count * sizeof *fitted_depth);
+                continue;
+            }
             for (int round = 0; round < ROUNDS; round++) {
                 /* The first round allows for a slope of the surface, the later ones for noise only. */
                 const float widening = round == 0 ? (float)(1 + radius) : round == 1 ? 2 : 1;

@@ -12,6 +12,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph import _native
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Result
@@ -81,8 +82,8 @@ def read_pair_with_ties(path: Path, key: str | None = None) -> tuple[PairDispari
     head, (codes, *tables) = read_arrays(path, _PAIR, lambda head: _array_types(head, _geometry_of(head)))
     _check_key(path, head, key)
     least, step = head.numbers[:2]
-    disparity = (codes - np.float32(1)) * np.float32(step) + np.float32(least)
-    disparity[codes == 0] = np.nan
+    disparity = np.empty(codes.shape, np.float32)
+    _native.disparity_of_codes(codes, least, step, disparity)
     table = tables[0] if tables else np.empty((0, _TIE_COLUMNS), np.float32)
     ties = Ties(table[:, :2], table[:, 2:4], table[:, 4])
     return PairDisparity(head.texts[0], head.texts[1], _geometry_of(head), disparity), ties
