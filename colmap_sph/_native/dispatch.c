@@ -58,7 +58,6 @@ static int has_avx2(void) {
 
 #ifdef COLMAP_SPH_HAVE_AVX512
 #define census_avx512 census_avx2
-#define compare_depths_avx512 compare_depths_avx2
 WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
 

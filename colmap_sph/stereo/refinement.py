@@ -23,7 +23,7 @@ from colmap_sph.stereo.normals import NormalOptions, fit_normals
 # Rows whose equations are in memory at a time.
 _BAND_ROWS = 32
 # Which partners say most is found on every so many rows.
-_SURVEY_ROWS = 16
+_SURVEY_ROWS = 32
 # Partners that bring the planes near in the rounds before the last.
 _FIRST_PARTNERS = 3
 # Standard deviation of a match on a smooth surface, pixels.
@@ -100,7 +100,7 @@ def refine_maps(
         Its grey image.
     estimate : DepthEstimate
         Confirmed depth, whose standard deviations say how far the planes may move.
-    normals, depth : (H, W, 3) and (H, W) float32 ndarray
+    normals, depth : (H, W, 3) and (H, W) float32 ndarray, C-contiguous
         The planes that `fit_normals` fitted to it; changed.
     sources : sequence of (View, (h, w) uint8 ndarray)
         Partners and their grey images.
@@ -119,6 +119,7 @@ def refine_maps(
     partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
     if options.rounds:
         partners = _most_telling(view, image, estimate, normals, depth, partners, options)
+    K = np.ascontiguousarray(view.K)
     for done in range(options.rounds):
         if done:
             smooth = NormalOptions(radius=options.smoothing_radius)
@@ -138,7 +139,7 @@ def refine_maps(
             sigma = _freedom(estimate.sigma[rows], planes, options)
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma, slope_sigma, planes)
-            _native.maps_of_planes(planes, view.K, first, normals, depth)
+            _native.maps_of_planes(planes, K, first, normals, depth)
     return normals, depth
 
 
@@ -202,5 +203,6 @@ def _planes_of_maps(
 ) -> NDArray[np.float32]:
     """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
     planes = np.empty((3, len(range(*rows.indices(view.height))), view.width), np.float32)
-    _native.planes_of_maps(normals, depth, np.linalg.inv(view.K), rows.start, rows.step, planes)
+    inverse_K = np.ascontiguousarray(np.linalg.inv(view.K))
+    _native.planes_of_maps(normals, depth, inverse_K, rows.start, rows.step, planes)
     return planes

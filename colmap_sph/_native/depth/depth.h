@@ -114,7 +114,7 @@ typedef void compare_depths_fn(const depth_map *reference, const depth_map *part
 
 depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2, depth_candidates_avx512;
 vote_depth_fn vote_depth_scalar, vote_depth_avx2, vote_depth_avx512;
-compare_depths_fn compare_depths_scalar, compare_depths_avx2;
+compare_depths_fn compare_depths_scalar, compare_depths_avx2, compare_depths_avx512;
 fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512;
 add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512;
 

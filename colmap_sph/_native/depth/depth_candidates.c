@@ -10,7 +10,7 @@
 #include "version.h"
 
 /* Of a disparity's roughness, what counts as its standard deviation (measured on rendered and real blocks). */
-static const double ROUGHNESS_SHARE = 0.5;
+static const float ROUGHNESS_SHARE = 0.5f;
 static const double HALF_PI = 1.57079632679489661923;
 
 /* atan2 without branches or library calls, so that the compiler can vectorise it; absolute error < 1e-9. */
@@ -48,6 +48,7 @@ enum { BLOCK = 256 };
 /* Pixels of one row of the depth map. Fixed sizes, so that the compiler can vectorise. */
 typedef struct {
     double x[BLOCK], y[BLOCK], z[BLOCK];      /* ray in the rectified frame, of depth 1 in the camera */
+    double across_axis[BLOCK];                /* its distance from the baseline; sphere only */
     double u[BLOCK], v[BLOCK];                /* column and row in the disparity map; 0 where outside */
     int32_t column[BLOCK], row[BLOCK];        /* the nearest pixel there ... */
     int32_t to_right[BLOCK], to_below[BLOCK]; /* ... and where (u, v) lies from it: -1 or 1 */
@@ -55,8 +56,8 @@ typedef struct {
     float centre[BLOCK];                      /* disparity of the nearest pixel, and of those ... */
     float left[BLOCK], right[BLOCK], above[BLOCK], below[BLOCK]; /* ... around it, NaN beyond the rim ... */
     float across[BLOCK];                                         /* ... and that beyond (u, v) */
-    double disparity[BLOCK], spread[BLOCK];
-    double depth[BLOCK], sigma[BLOCK];
+    float change[BLOCK], spread[BLOCK]; /* of the disparity from there to (u, v); its standard deviation */
+    float depth[BLOCK], sigma[BLOCK];
 } block;
 
 static inline void locate(const pair_geometry *g, double row, double first_column, block *k) {
@@ -72,6 +73,7 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
     if (g->spherical) {
         for (int i = 0; i < BLOCK; i++) {
             const double across = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
+            k->across_axis[i] = across;
             k->u[i] = arctangent2(k->x[i], across) * columns - column_origin;
             k->v[i] = arctangent2(k->y[i], k->z[i]) * rows - row_origin;
         }
@@ -135,47 +137,46 @@ static inline int read_around(const disparity_map *map, int count, block *k) {
     return any;
 }
 
-/* Variance of the disparities: they are rough by how far they lie from the mean of their neighbours, along the
- * axis where that is more; matches in foliage and at edges are less certain than those on smooth surfaces. A
- * missing neighbour counts as a whole pixel. */
+/* Standard deviation of the disparities: they are rough by how far they lie from the mean of their neighbours,
+ * along the axis where that is more; matches in foliage and at edges are less certain than those on smooth
+ * surfaces. A missing neighbour counts as a whole pixel. */
 static inline void find_spread(const pair_geometry *g, block *k) {
+    const float most = (float)g->max_disparity_step, share = ROUGHNESS_SHARE;
+    const float variance = (float)(g->disparity_sigma * g->disparity_sigma);
     for (int i = 0; i < BLOCK; i++) {
-        const double along_row = fabs(k->centre[i] - 0.5 * (k->left[i] + k->right[i]));
-        const double along_column = fabs(k->centre[i] - 0.5 * (k->above[i] + k->below[i]));
-        const double r = isnan(along_row) ? 1 : along_row, c = isnan(along_column) ? 1 : along_column;
-        const double more = r > c ? r : c;
-        const double rough = ROUGHNESS_SHARE * (more < g->max_disparity_step ? more : g->max_disparity_step);
-        k->spread[i] = sqrt(g->disparity_sigma * g->disparity_sigma + rough * rough);
+        const float along_row = fabsf(k->centre[i] - 0.5f * (k->left[i] + k->right[i]));
+        const float along_column = fabsf(k->centre[i] - 0.5f * (k->above[i] + k->below[i]));
+        const float r = isnan(along_row) ? 1 : along_row, c = isnan(along_column) ? 1 : along_column;
+        const float more = r > c ? r : c, rough = share * (more < most ? more : most);
+        k->spread[i] = sqrtf(variance + rough * rough);
     }
 }
 
-/* Disparities at (u, v): interpolated only between those of the surface of the nearest pixel; NaN when that has
- * none. */
-static inline void interpolate(double max_step, block *k) {
+/* Disparities at (u, v) less those of the nearest pixels: interpolated only between those of one surface; NaN
+ * where there is none. */
+static inline void interpolate(double max_disparity_step, block *k) {
+    const float max_step = (float)max_disparity_step;
     for (int i = 0; i < BLOCK; i++) {
-        const double du = k->u[i] - k->column[i], dv = k->v[i] - k->row[i], fx = fabs(du), fy = fabs(dv);
-        const double centre = k->centre[i], beside = du < 0 ? k->left[i] : k->right[i];
-        const double beyond = dv < 0 ? k->above[i] : k->below[i], across = k->across[i];
-        const double weight = (1 - fx) * (1 - fy);
+        const float du = (float)(k->u[i] - k->column[i]), dv = (float)(k->v[i] - k->row[i]);
+        const float fx = fabsf(du), fy = fabsf(dv), centre = k->centre[i];
+        const float beside = (k->to_right[i] < 0 ? k->left[i] : k->right[i]) - centre;
+        const float beyond = (k->to_below[i] < 0 ? k->above[i] : k->below[i]) - centre;
+        const float across = k->across[i] - centre, weight = (1 - fx) * (1 - fy);
         /* Comparisons are false for NaN. */
-        const double w1 = fabs(beside - centre) <= max_step ? fx * (1 - fy) : 0;
-        const double w2 = fabs(beyond - centre) <= max_step ? (1 - fx) * fy : 0;
-        const double w3 = fabs(across - centre) <= max_step ? fx * fy : 0;
-        const double sum = (w1 > 0 ? w1 * (beside - centre) : 0) + (w2 > 0 ? w2 * (beyond - centre) : 0) +
-                           (w3 > 0 ? w3 * (across - centre) : 0);
-        k->disparity[i] = centre + sum / (weight + w1 + w2 + w3);
+        const float w1 = fabsf(beside) <= max_step ? fx * (1 - fy) : 0;
+        const float w2 = fabsf(beyond) <= max_step ? (1 - fx) * fy : 0;
+        const float w3 = fabsf(across) <= max_step ? fx * fy : 0;
+        const float sum = (w1 > 0 ? w1 * beside : 0) + (w2 > 0 ? w2 * beyond : 0) + (w3 > 0 ? w3 * across : 0);
+        k->change[i] = sum / (weight + w1 + w2 + w3);
     }
 }
 
-/* Cotangent within (0, pi / 2) by the series of sine and cosine: relative error < 1e-12. */
+/* Cotangent within (0, pi / 2) by the series of sine and cosine: absolute error < 1e-9. */
 static inline double cotangent(double angle) {
     const double s = angle * angle;
-    double sine = 1.0 / (18 * 19), cosine = 1.0 / (17 * 18);
+    double sine = 1.0 / (14 * 15), cosine = 1.0 / (15 * 16);
 /* Divisors as factors: divisions take longest of all. */
 #define TERM(sum, divisor) sum = (1 - s * sum) * (1.0 / (divisor))
-    TERM(sine, 16 * 17);
-    TERM(cosine, 15 * 16);
-    TERM(sine, 14 * 15);
     TERM(cosine, 13 * 14);
     TERM(sine, 12 * 13);
     TERM(cosine, 11 * 12);
@@ -193,28 +194,29 @@ static inline double cotangent(double angle) {
     return (1 - s * cosine) / (angle * (1 - s * sine));
 }
 
+/* With the ray r of depth 1, sin t = x / |r| and cos t = across / |r|: depth, the distance over |r|, has |r|^2 as
+ * its only divisor. */
 static inline void triangulate_sphere(const pair_geometry *g, block *k) {
     const double side = g->is_left ? 1 : -1, radians = 1 / g->columns_per_radian;
     for (int i = 0; i < BLOCK; i++) {
-        const double delta = (k->disparity[i] + g->disparity_origin) * radians;
-        const double across = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
-        const double norm = sqrt(k->x[i] * k->x[i] + across * across);
-        const double sine = k->x[i] / norm, cosine = across / norm, cot = cotangent(delta);
-        const double distance = g->baseline * (cosine * cot + side * sine);
-        const double slope = g->baseline * cosine * (1 + cot * cot);
-        const int found = delta > 0 && delta < HALF_PI && distance > 0; /* false for NaN */
-        k->depth[i] = found ? distance / norm : 0;
-        k->sigma[i] = found ? slope * k->spread[i] * radians / norm : 0;
+        const double delta = ((double)k->centre[i] + k->change[i] + g->disparity_origin) * radians;
+        const double cot = cotangent(delta), across = k->across_axis[i];
+        const double scale = g->baseline / (k->x[i] * k->x[i] + across * across);
+        const double depth = scale * (across * cot + side * k->x[i]);
+        const double slope = scale * across * (1 + cot * cot);
+        const int found = delta > 0 && delta < HALF_PI && depth > 0; /* false for NaN */
+        k->depth[i] = found ? (float)depth : 0;
+        k->sigma[i] = found ? (float)(slope * radians * k->spread[i]) : 0;
     }
 }
 
 static inline void triangulate_plane(const pair_geometry *g, block *k) {
     for (int i = 0; i < BLOCK; i++) {
-        const double d = k->disparity[i] + g->disparity_origin;
-        const double z = g->baseline * g->columns_per_radian / d;
+        const double d = (double)k->centre[i] + k->change[i] + g->disparity_origin;
+        const double inverse = 1 / (d * k->z[i]), z = g->baseline * g->columns_per_radian * inverse;
         const int found = d > 0 && k->z[i] > 0;
-        k->depth[i] = found ? z / k->z[i] : 0;
-        k->sigma[i] = found ? z / d * k->spread[i] / k->z[i] : 0;
+        k->depth[i] = found ? (float)z : 0;
+        k->sigma[i] = found ? (float)(z * inverse * k->z[i] * k->spread[i]) : 0;
     }
 }
 
@@ -242,8 +244,8 @@ void VERSION_OF(depth_candidates)(const float *disparity, ptrdiff_t map_height, 
                 triangulate_plane(g, &k);
             }
             for (int i = 0; i < count; i++) {
-                depth[first + i] = (float)k.depth[i];
-                sigma[first + i] = (float)k.sigma[i];
+                depth[first + i] = k.depth[i];
+                sigma[first + i] = k.sigma[i];
             }
         }
     }
