@@ -215,7 +215,7 @@ def test_planes_meet_the_neighbouring_rays_where_maps_say(first, step):
 
     def inverse_depth(right, down):
         point = (pixels @ np.linalg.inv(K).T) * depth[..., None].astype(float)
-        ray = (pixels + [right, down, 0]) @ np.linalg.inv(K).T
+        ray = (pixels + np.array([right, down, 0])) @ np.linalg.inv(K).T
         return (normals * ray).sum(axis=-1)[rows][found] / (normals * point).sum(axis=-1)[rows][found]
 
     own = inverse_depth(0, 0)
