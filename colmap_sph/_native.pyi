@@ -306,6 +306,7 @@ def depth_candidates(
     """
 
 def vote_depth(
+    backend: str,
     depths: NDArray[np.float32],
     sigmas: NDArray[np.float32],
     stations: NDArray[np.int32],
@@ -317,6 +318,7 @@ def vote_depth(
 ) -> None:
     """The largest consistent cluster of candidates per pixel: its weighted mean, deviation and size in stations.
 
+    backend : str
     depths : (PAIRS, H, W) float32
     sigmas : (PAIRS, H, W) float32
     stations : (PAIRS) int32
@@ -453,6 +455,42 @@ def add_patch_equations(
     contrast : float
     min_score : float
     equations : (12, ROWS, W) float32, written
+    """
+
+def planes_of_maps(
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    inverse_K: NDArray[np.floating[Any]],
+    first_row: int,
+    row_step: int,
+    planes: NDArray[np.float32],
+    /,
+) -> None:
+    """Inverse depth and its change per column and row on every `row_step`-th row of maps; 0 where there is none.
+
+    normals : (H, W, 3) float32
+    depth : (H, W) float32
+    inverse_K : (3, 3) float64
+    first_row : int
+    row_step : int
+    planes : (3, ROWS, W) float32, written
+    """
+
+def maps_of_planes(
+    planes: NDArray[np.float32],
+    K: NDArray[np.floating[Any]],
+    first_row: int,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    /,
+) -> None:
+    """The inverse of planes_of_maps, into the maps' rows from `first_row` on.
+
+    planes : (3, ROWS, W) float32
+    K : (3, 3) float64
+    first_row : int
+    normals : (H, W, 3) float32, written
+    depth : (H, W) float32, written
     """
 
 def refine_planes(
@@ -657,6 +695,8 @@ def draw_heights(
     half : float
     max_ratio : float
     raster : (H, W) float32, written
+    """
+
 def fit_surfaces(
     disparity: NDArray[np.float32],
     places: NDArray[np.floating[Any]],

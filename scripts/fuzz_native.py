@@ -288,6 +288,7 @@ def vote_depth(rng: Random) -> Arguments:
     inputs = [filled(rng, (pairs, h, w), np.float32) for _ in range(2)]
     stations = np.sort(filled(rng, (pairs,), np.int32))
     return [
+        backend(rng),
         *inputs,
         stations,
         number(rng),
@@ -407,6 +408,23 @@ def add_patch_equations(rng: Random) -> Arguments:
     return [backend(rng), image, sources, matrices, planes, first, step, number(rng), number(rng) / 10, equations]
 
 
+def planes_of_maps(rng: Random) -> Arguments:
+    h, w = size(rng)
+    step = int(rng.integers(1, 4))
+    first = int(rng.integers(0, h + 1))
+    rows = int(rng.integers(0, (h - first + step - 1) // step + 1))
+    maps = [filled(rng, (h, w, 3), np.float32), filled(rng, (h, w), np.float32)]
+    return [*maps, filled(rng, (3, 3), np.float64), first, step, np.zeros((3, rows, w), np.float32)]
+
+
+def maps_of_planes(rng: Random) -> Arguments:
+    h, w = size(rng)
+    first, end = sorted(int(row) for row in rng.integers(0, h + 1, 2))
+    planes = filled(rng, (3, end - first, w), np.float32)
+    maps = [np.zeros((h, w, 3), np.float32), np.zeros((h, w), np.float32)]
+    return [planes, filled(rng, (3, 3), np.float64), first, *maps]
+
+
 def refine_planes(rng: Random) -> Arguments:
     shape = size(rng)
     inputs = [filled(rng, (12, *shape), np.float32), filled(rng, shape, np.float32)]
@@ -457,6 +475,8 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         confirm_depth,
         fit_planes,
         add_patch_equations,
+        planes_of_maps,
+        maps_of_planes,
         refine_planes,
         keep_between,
         remove_small_segments,

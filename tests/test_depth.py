@@ -248,12 +248,17 @@ def test_transfer_agrees_with_exact_geometry(name):
 
 
 def vote(depths, sigmas, tolerance, stations=None):
-    shape = depths.shape[1:]
-    depth, sigma = np.full(shape, 9, np.float32), np.full(shape, 9, np.float32)
-    support = np.full(shape, 9, np.uint8)
+    """Depth, sigma and support, the same to the bit by every backend."""
     numbers = np.arange(len(depths)) if stations is None else np.array(stations)
-    _native.vote_depth(depths, sigmas, numbers.astype(np.int32), tolerance, depth, sigma, support)
-    return depth, sigma, support
+    results = []
+    for kernels in _native.backends():
+        maps = [np.full(depths.shape[1:], 9, kind) for kind in (np.float32, np.float32, np.uint8)]
+        _native.vote_depth(kernels, depths, sigmas, numbers.astype(np.int32), tolerance, *maps)
+        results.append(maps)
+    for other in results[1:]:
+        for found, expected in zip(other, results[0], strict=True):
+            np.testing.assert_array_equal(found.view(np.uint8), expected.view(np.uint8))
+    return results[0]
 
 
 @property_test

@@ -143,6 +143,7 @@ def arguments(function):
             "out sigma": np.zeros((5, 6), f32),
         },
         "vote_depth": {
+            "backend": "scalar",
             "depths": np.zeros((3, H, W), f32),
             "sigmas": np.zeros((3, H, W), f32),
             "stations": np.array([1, 1, 2], np.int32),
@@ -281,6 +282,21 @@ def arguments(function):
             "contrast": 20.0,
             "min_score": 0.5,
             "out equations": np.zeros((12, H, W), f32),
+        },
+        "planes_of_maps": {
+            "normals": np.ones((H, W, 3), f32),
+            "depth": np.ones((H, W), f32),
+            "inverse_K": np.eye(3),
+            "first_row": 0,
+            "row_step": 1,
+            "out planes": np.zeros((3, H, W), f32),
+        },
+        "maps_of_planes": {
+            "planes": np.ones((3, H, W), f32),
+            "K": np.eye(3),
+            "first_row": 0,
+            "out normals": np.zeros((H, W, 3), f32),
+            "out depth": np.zeros((H, W), f32),
         },
         "refine_planes": {
             "equations": np.zeros((12, H, W), f32),
@@ -423,6 +439,8 @@ FUNCTIONS = [
     "confirm_depth",
     "fit_planes",
     "add_patch_equations",
+    "planes_of_maps",
+    "maps_of_planes",
     "refine_planes",
     *offsets_arguments(),
     *ties_arguments(),
@@ -463,6 +481,8 @@ FREE = {
     ("depth_candidates", "disparity"): {0, 1},
     ("add_patch_equations", "image"): {0},
     ("draw_heights", "out raster"): {0, 1},
+    ("planes_of_maps", "out planes"): {1},
+    ("maps_of_planes", "planes"): {1},
 }
 
 
@@ -915,10 +935,11 @@ def test_sources_must_be_a_tuple(sources):
         call("add_patch_equations", {**arguments("add_patch_equations"), "sources": sources})
 
 
+@pytest.mark.parametrize("function", ["add_patch_equations", "planes_of_maps", "maps_of_planes"])
 @pytest.mark.parametrize("first_row", [-1, 1, 2**62])
-def test_rows_beyond_the_image_are_refused(first_row):
+def test_rows_beyond_the_image_are_refused(function, first_row):
     with pytest.raises(ValueError, match="rows"):
-        call("add_patch_equations", {**arguments("add_patch_equations"), "first_row": first_row})
+        call(function, {**arguments(function), "first_row": first_row})
 
 
 @pytest.mark.parametrize(("rows", "step"), [(H, 0), (H, -1), (H, 2), (2, H), (2, 2**63 - 1), (1, 0)])
@@ -927,6 +948,8 @@ def test_steps_beyond_the_image_are_refused(rows, step):
     changed = {"planes": planes, "row_step": step, "out equations": equations}
     with pytest.raises(ValueError, match="rows must lie in the image"):
         call("add_patch_equations", {**arguments("add_patch_equations"), **changed})
+    with pytest.raises(ValueError, match="rows must lie in the image"):
+        call("planes_of_maps", {**arguments("planes_of_maps"), "row_step": step, "out planes": planes})
 
 
 @pytest.mark.parametrize(("rows", "step"), [(1, 2**63 - 1), (2, H - 1), (0, 5)])
@@ -1031,6 +1054,7 @@ def test_empty_maps_are_no_work(shape):
     assert not depth.any()
     _native.depth_candidates("scalar", partner, *geometry, empty, empty.copy())
     _native.vote_depth(
+        "scalar",
         np.ones((3, *shape), np.float32),
         np.ones((3, *shape), np.float32),
         *(np.arange(3, dtype=np.int32), 3.0, empty, empty.copy(), bytes_),
@@ -1075,7 +1099,7 @@ def test_vote_of_no_pairs_is_no_depth():
         np.ones((2, 3), np.uint8),
     )
     none = np.zeros((0, 2, 3), np.float32)
-    _native.vote_depth(none, none, np.zeros(0, np.int32), 3.0, depth, sigma, support)
+    _native.vote_depth("scalar", none, none, np.zeros(0, np.int32), 3.0, depth, sigma, support)
     assert not depth.any() and not sigma.any() and not support.any()
 
 

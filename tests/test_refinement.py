@@ -195,6 +195,51 @@ def test_a_shifted_image_gives_its_shift(shift):
     assert (planes[0][~matched] == 1).all()
 
 
+@pytest.mark.parametrize(("first", "step"), [(0, 1), (3, 4)])
+def test_planes_meet_the_neighbouring_rays_where_maps_say(first, step):
+    """Inverse depths of a pixel's plane on the rays beside and below it, from their intersection."""
+    rng = np.random.default_rng(4)
+    height, width = 13, 70
+    K = np.array([[50, 0.4, 30.0], [0, 55, 7], [0, 0, 1]])
+    column, row = np.meshgrid(np.arange(width), np.arange(height))
+    pixels = np.stack([column, row, np.ones_like(row)], axis=-1)
+    normals = np.dstack([rng.uniform(-0.5, 0.5, (height, width, 2)), -np.ones((height, width))])
+    normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).astype(np.float32)
+    depth = rng.uniform(3, 9, (height, width)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    normals[depth == 0] = 0
+    rows = slice(first, None, step)
+    planes = np.full((3, len(range(height)[rows]), width), 9, np.float32)
+    _native.planes_of_maps(normals, depth, np.linalg.inv(K), first, step, planes)
+    found = depth[rows] > 0
+
+    def inverse_depth(right, down):
+        point = (pixels @ np.linalg.inv(K).T) * depth[..., None].astype(float)
+        ray = (pixels + np.array([right, down, 0])) @ np.linalg.inv(K).T
+        return (normals * ray).sum(axis=-1)[rows][found] / (normals * point).sum(axis=-1)[rows][found]
+
+    own = inverse_depth(0, 0)
+    expected = [own, inverse_depth(1, 0) - own, inverse_depth(0, 1) - own]
+    np.testing.assert_allclose(planes[:, found], expected, rtol=1e-4, atol=1e-6)
+    assert not planes[:, ~found].any()
+
+
+def test_maps_of_planes_are_those_they_came_from():
+    rng = np.random.default_rng(5)
+    K = np.array([[50, 0.4, 30.0], [0, 55, 7], [0, 0, 1]])
+    planes = np.stack([rng.uniform(0.1, 0.3, (6, 70)), *rng.uniform(-2e-3, 2e-3, (2, 6, 70))]).astype(np.float32)
+    planes[:, rng.random((6, 70)) < 0.2] = 0
+    normals, depth = np.full((9, 70, 3), 9, np.float32), np.full((9, 70), 9, np.float32)
+    _native.maps_of_planes(planes, K, 2, normals, depth)
+    assert (normals[[0, 1, 8]] == 9).all() and (depth[[0, 1, 8]] == 9).all()
+    found = planes[0] > 0
+    assert not normals[2:8][~found].any() and not depth[2:8][~found].any()
+    np.testing.assert_allclose(np.linalg.norm(normals[2:8][found], axis=-1), 1, rtol=1e-6)
+    again = np.zeros_like(planes)
+    _native.planes_of_maps(np.ascontiguousarray(normals[:8]), depth[:8], np.linalg.inv(K), 2, 1, again)
+    np.testing.assert_allclose(again, planes, rtol=1e-4, atol=1e-7)
+
+
 def test_planes_without_equations_or_freedom_stay():
     equations = np.ones((12, 2, 3), np.float32)
     equations[[7, 8, 10]] = 0

@@ -38,6 +38,7 @@
      fit_offsets_##version, \
      mean_offsets_##version, \
      depth_candidates_##version, \
+     vote_depth_##version, \
      compare_depths_##version, \
      fit_planes_##version, \
      add_patch_equations_##version}
@@ -57,8 +58,6 @@ static int has_avx2(void) {
 
 #ifdef COLMAP_SPH_HAVE_AVX512
 #define census_avx512 census_avx2
-#define depth_candidates_avx512 depth_candidates_avx2
-#define compare_depths_avx512 compare_depths_avx2
 WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
 

@@ -15,6 +15,7 @@ typedef struct {
     fit_offsets_fn *fit_offsets;
     mean_offsets_fn *mean_offsets;
     depth_candidates_fn *depth_candidates;
+    vote_depth_fn *vote_depth;
     compare_depths_fn *compare_depths;
     fit_planes_fn *fit_planes;
     add_patch_equations_fn *add_patch_equations;

@@ -23,7 +23,7 @@ from colmap_sph.stereo.normals import NormalOptions, fit_normals
 # Rows whose equations are in memory at a time.
 _BAND_ROWS = 32
 # Which partners say most is found on every so many rows.
-_SURVEY_ROWS = 16
+_SURVEY_ROWS = 32
 # Partners that bring the planes near in the rounds before the last.
 _FIRST_PARTNERS = 3
 # Standard deviation of a match on a smooth surface, pixels.
@@ -100,7 +100,7 @@ def refine_maps(
         Its grey image.
     estimate : DepthEstimate
         Confirmed depth, whose standard deviations say how far the planes may move.
-    normals, depth : (H, W, 3) and (H, W) float32 ndarray
+    normals, depth : (H, W, 3) and (H, W) float32 ndarray, C-contiguous
         The planes that `fit_normals` fitted to it; changed.
     sources : sequence of (View, (h, w) uint8 ndarray)
         Partners and their grey images.
@@ -119,14 +119,17 @@ def refine_maps(
     partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
     if options.rounds:
         partners = _most_telling(view, image, estimate, normals, depth, partners, options)
+    K = np.ascontiguousarray(view.K)
     for done in range(options.rounds):
         if done:
             smooth = NormalOptions(radius=options.smoothing_radius)
             moved = replace(estimate, depth=depth)
             smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
-            fitted = smooth_depth > 0  # a pixel without neighbours keeps its plane
-            normals[fitted] = smooth_normals[fitted]
-            depth[fitted] = smooth_depth[fitted]
+            lone = smooth_depth == 0  # a pixel without neighbours keeps its plane
+            smooth_normals[lone] = normals[lone]
+            smooth_depth[lone] = depth[lone]
+            normals[:] = smooth_normals
+            depth[:] = smooth_depth
         for first in range(0, view.height, _BAND_ROWS):
             rows = slice(first, min(first + _BAND_ROWS, view.height), 1)
             planes = _planes_of_maps(view, normals, depth, rows)
@@ -136,7 +139,7 @@ def refine_maps(
             sigma = _freedom(estimate.sigma[rows], planes, options)
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma, slope_sigma, planes)
-            normals[rows], depth[rows] = _maps_of_planes(view, planes, rows)
+            _native.maps_of_planes(planes, K, first, normals, depth)
     return normals, depth
 
 
@@ -199,48 +202,7 @@ def _planes_of_maps(
     view: View, normals: NDArray[np.float32], depth: NDArray[np.float32], rows: slice
 ) -> NDArray[np.float32]:
     """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
-    normals = normals[rows]
-    depth = depth[rows]
-    # On a plane n · x = d the inverse depth of pixel p is K⁻ᵀ n · p / d. No matrix product: it would wake BLAS's
-    # threads for three columns.
-    (a, b, c), (_, d, e), _ = np.linalg.inv(view.K).astype(np.float32)
-    x, y, z = (normals[..., axis] for axis in range(3))
-    column, row = _pixels(view, rows)
-    planes = np.empty((3, *depth.shape), np.float32)
-    inverse, along_x, along_y = planes
-    np.multiply(x, a, out=along_x)
-    np.add(x * b, y * d, out=along_y)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        np.divide(1, depth, out=inverse)
-        scale = inverse / (along_x * column + along_y * row + (x * c + y * e + z))
-        planes[1:] *= scale
-    planes[:, ~((depth > 0) & np.isfinite(planes).all(axis=0))] = 0
+    planes = np.empty((3, len(range(*rows.indices(view.height))), view.width), np.float32)
+    inverse_K = np.ascontiguousarray(np.linalg.inv(view.K))
+    _native.planes_of_maps(normals, depth, inverse_K, rows.start, rows.step, planes)
     return planes
-
-
-def _maps_of_planes(
-    view: View, planes: NDArray[np.float32], rows: slice
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Inverse of `_planes_of_maps`: normals (h, W, 3) and depth (h, W)."""
-    inverse, along_x, along_y = planes
-    (a, b, c), (_, d, e), _ = view.K.astype(np.float32)
-    column, row = _pixels(view, rows)
-    normals = np.empty((*inverse.shape, 3), np.float32)
-    x, y, z = (normals[..., axis] for axis in range(3))
-    np.multiply(along_x, -a, out=x)
-    np.negative(along_x * b + along_y * d, out=y)
-    np.negative(along_x * c + along_y * e + (inverse - along_x * column - along_y * row), out=z)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        normals /= np.sqrt(x * x + y * y + z * z)[..., None]
-        depth = 1 / inverse
-    lost = ~(inverse > 0)
-    normals[lost] = 0
-    depth[lost] = 0
-    return normals, depth
-
-
-def _pixels(view: View, rows: slice) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    return (
-        np.arange(view.width, dtype=np.float32)[None],
-        np.arange(rows.start, rows.stop, rows.step, dtype=np.float32)[:, None],
-    )

@@ -98,6 +98,22 @@ def depth_candidates(
     first, end, _ = rows.indices(view.height)
     depth = np.empty((end - first, view.width), dtype=np.float32)
     sigma = np.empty_like(depth)
+    _triangulate(view, disparity, geometry, side, options, residual, first, depth, sigma)
+    return depth, sigma
+
+
+def _triangulate(
+    view: View,
+    disparity: NDArray[np.float32],
+    geometry: RectifiedPair,
+    side: Side,
+    options: VoteOptions,
+    residual: float,
+    first: int,
+    depth: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+) -> None:
+    """Write what `depth_candidates` gives, for rows from `first` on."""
     _native.depth_candidates(
         backend(),
         disparity,
@@ -114,7 +130,6 @@ def depth_candidates(
         depth,
         sigma,
     )
-    return depth, sigma
 
 
 def _disparity_sigma(view: View, geometry: RectifiedPair, options: VoteOptions, residual: float) -> float:
@@ -179,15 +194,17 @@ def vote_depth(
     numbers = np.arange(len(sources)) if stations is None else np.asarray(stations)
     shifts = [0.0] * len(sources) if residuals is None else residuals
     step = max(_BAND_BYTES // (8 * view.width * max(len(sources), 1)), 1)
+    room = np.empty(2 * len(sources) * min(step, view.height) * view.width, np.float32)
     for first in range(0, view.height if sources else 0, step):
-        rows = slice(first, first + step)
-        candidates = [
-            depth_candidates(view, *source, options, rows, residual)
-            for source, residual in zip(sources, shifts, strict=True)
-        ]
+        rows = slice(first, min(first + step, view.height))
+        size = (2, len(sources), rows.stop - first, view.width)
+        depths, sigmas = room[: math.prod(size)].reshape(size)
+        for source, residual, *found in zip(sources, shifts, depths, sigmas, strict=True):
+            _triangulate(view, *source, options, residual, first, *found)
         _native.vote_depth(
-            np.stack([depth for depth, _ in candidates]),
-            np.stack([sigma for _, sigma in candidates]),
+            backend(),
+            depths,
+            sigmas,
             numbers.astype(np.int32),
             options.tolerance,
             voted.depth[rows],

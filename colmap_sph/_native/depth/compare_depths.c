@@ -37,7 +37,7 @@ static inline int project(const view_transfer *transfer, const depth_map *partne
     const double last_u = (double)(partner->width - 1), last_v = (double)(partner->height - 1);
     for (int i = 0; i < BLOCK; i++) {
         const vector seen = transform(m, t, first_column + i, row, k->depth[i]);
-        const double u = seen.x / seen.z, v = seen.y / seen.z;
+        const double scale = 1 / seen.z, u = seen.x * scale, v = seen.y * scale;
         /* False for NaN. */
         const int inside = (k->depth[i] > 0) & (seen.z > 0) & (u >= 0) & (v >= 0) & (u <= last_u) & (v <= last_v);
         k->u[i] = inside ? u : 0;
@@ -100,7 +100,7 @@ static inline void carry_back(const view_transfer *transfer, float max_reproject
     const double max_error_squared = (double)max_reprojection_error * max_reprojection_error;
     for (int i = 0; i < BLOCK; i++) {
         const vector back = transform(m, t, k->u[i], k->v[i], k->found[i]);
-        const double du = back.x / back.z - (first_column + i), dv = back.y / back.z - row;
+        const double scale = 1 / back.z, du = back.x * scale - (first_column + i), dv = back.y * scale - row;
         k->near[i] = (back.z > 0) & (du * du + dv * dv <= max_error_squared);
         k->carried[i] = (float)back.z;
     }

@@ -24,6 +24,11 @@ typedef void depth_candidates_fn(const float *disparity, ptrdiff_t map_height, p
                                  const pair_geometry *geometry, ptrdiff_t first_row, ptrdiff_t rows,
                                  ptrdiff_t columns, float *depth, float *sigma);
 
+/* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. Candidates
+ * of one station count as one; `stations` has the number of each candidate's, ascending. */
+typedef int vote_depth_fn(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t count,
+                          ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support);
+
 enum { MAX_FIT_RADIUS = 16 };
 
 typedef struct {
@@ -107,8 +112,9 @@ typedef struct {
 typedef void compare_depths_fn(const depth_map *reference, const depth_map *partner, const view_transfer *transfer,
                                consistency_gates gates, const consistency_sums *sums);
 
-depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2;
-compare_depths_fn compare_depths_scalar, compare_depths_avx2;
+depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2, depth_candidates_avx512;
+vote_depth_fn vote_depth_scalar, vote_depth_avx2, vote_depth_avx512;
+compare_depths_fn compare_depths_scalar, compare_depths_avx2, compare_depths_avx512;
 fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512;
 add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512;
 
@@ -117,11 +123,6 @@ add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add
 /* Carry a disparity map from the left image's columns to the right image's, row by row (NaN = none). */
 void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
                         float max_step, float *right);
-
-/* The largest mutually consistent cluster of `count` candidates per pixel, its weighted mean and size. Candidates
- * of one station count as one; `stations` has the number of each candidate's, ascending. */
-void vote_depth(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t count,
-                ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support);
 
 enum { SURFACE_RADIUS = 3 };
 
@@ -138,6 +139,15 @@ typedef struct {
 void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                    const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
                    uint8_t *contradicting, float *weighted_depth, float *weight);
+
+/* The planes (see `add_patch_equations_fn`) of normals (interleaved x, y, z) and depths of some rows of a map;
+ * zeros where there is none. */
+void planes_of_maps(const float *normals, const float *depth, ptrdiff_t width, const double *inverse_K,
+                    patch_rows rows, float *planes);
+
+/* And back, into so many rows of the maps from `first_row` on. */
+void maps_of_planes(const float *planes, ptrdiff_t rows, ptrdiff_t width, const double *K, ptrdiff_t first_row,
+                    float *normals, float *depth);
 
 /* Moves planes by the solution of their equations: of the inverse depth with standard deviation `sigma`, of its
  * change per pixel with `slope_sigma` times the inverse depth. Planes without equations stay. */

@@ -10,7 +10,7 @@
 #include "version.h"
 
 /* Of a disparity's roughness, what counts as its standard deviation (measured on rendered and real blocks). */
-static const double ROUGHNESS_SHARE = 0.5;
+static const float ROUGHNESS_SHARE = 0.5f;
 static const double HALF_PI = 1.57079632679489661923;
 
 /* atan2 without branches or library calls, so that the compiler can vectorise it; absolute error < 1e-9. */
@@ -38,65 +38,26 @@ static inline double arctangent2(double y, double x) {
     return y < 0 ? -sum : sum;
 }
 
-/* Nearest whole number; not by truncating u + 0.5, which would round the number before 0.5 up to 1. */
-static inline ptrdiff_t nearest(double u) {
-    const double whole = floor(u);
-    return (ptrdiff_t)whole + (u - whole >= 0.5);
-}
-
 typedef struct {
     const float *values;
     ptrdiff_t height, width;
 } disparity_map;
 
-/* How far a disparity lies from the mean of its neighbours, along the axis where that is more: matches in foliage
- * and at edges are less certain than those on smooth surfaces. A missing neighbour counts as a whole pixel. */
-static inline double roughness(const disparity_map *map, ptrdiff_t x, ptrdiff_t y) {
-    const float *centre = map->values + y * map->width + x;
-    const double across = x > 0 && x + 1 < map->width ? fabs(*centre - 0.5 * (centre[-1] + centre[1])) : NAN;
-    const double along =
-        y > 0 && y + 1 < map->height ? fabs(*centre - 0.5 * (centre[-map->width] + centre[map->width])) : NAN;
-    return fmax(isnan(across) ? 1 : across, isnan(along) ? 1 : along);
-}
-
-/* Disparity at (u, v) and its roughness: interpolated only between disparities of the surface of the nearest
- * pixel; NaN when that pixel has none. */
-static inline double sample_surface(const disparity_map *map, double u, double v, double max_step, double *rough) {
-    if (!(u > -0.5 && v > -0.5 && u < (double)map->width - 0.5 && v < (double)map->height - 0.5)) {
-        return NAN;
-    }
-    const ptrdiff_t x = nearest(u), y = nearest(v);
-    const double centre = map->values[y * map->width + x];
-    if (isnan(centre)) {
-        return NAN;
-    }
-    *rough = roughness(map, x, y);
-    /* The other corners of the cell around (u, v): beside, above or below, and across from the nearest one. */
-    const double du = u - (double)x, dv = v - (double)y;
-    const ptrdiff_t x1 = x + (du < 0 ? -1 : 1), y1 = y + (dv < 0 ? -1 : 1);
-    const int in_row = x1 >= 0 && x1 < map->width, in_column = y1 >= 0 && y1 < map->height;
-    const double fx = fabs(du), fy = fabs(dv);
-    const double beside = in_row ? map->values[y * map->width + x1] : NAN;
-    const double above = in_column ? map->values[y1 * map->width + x] : NAN;
-    const double across = in_row && in_column ? map->values[y1 * map->width + x1] : NAN;
-    const double weight = (1 - fx) * (1 - fy);
-    /* Comparisons are false for NaN. */
-    const double w1 = fabs(beside - centre) <= max_step ? fx * (1 - fy) : 0;
-    const double w2 = fabs(above - centre) <= max_step ? (1 - fx) * fy : 0;
-    const double w3 = fabs(across - centre) <= max_step ? fx * fy : 0;
-    const double sum = (w1 > 0 ? w1 * (beside - centre) : 0) + (w2 > 0 ? w2 * (above - centre) : 0) +
-                       (w3 > 0 ? w3 * (across - centre) : 0);
-    return centre + sum / (weight + w1 + w2 + w3);
-}
-
 enum { BLOCK = 256 };
 
 /* Pixels of one row of the depth map. Fixed sizes, so that the compiler can vectorise. */
 typedef struct {
-    double x[BLOCK], y[BLOCK], z[BLOCK]; /* ray in the rectified frame, of depth 1 in the camera */
-    double u[BLOCK], v[BLOCK];           /* column and row in the disparity map */
-    double disparity[BLOCK], spread[BLOCK];
-    double depth[BLOCK], sigma[BLOCK];
+    double x[BLOCK], y[BLOCK], z[BLOCK];      /* ray in the rectified frame, of depth 1 in the camera */
+    double across_axis[BLOCK];                /* its distance from the baseline; sphere only */
+    double u[BLOCK], v[BLOCK];                /* column and row in the disparity map; 0 where outside */
+    int32_t column[BLOCK], row[BLOCK];        /* the nearest pixel there ... */
+    int32_t to_right[BLOCK], to_below[BLOCK]; /* ... and where (u, v) lies from it: -1 or 1 */
+    int32_t inside[BLOCK];                    /* 1 or 0 */
+    float centre[BLOCK];                      /* disparity of the nearest pixel, and of those ... */
+    float left[BLOCK], right[BLOCK], above[BLOCK], below[BLOCK]; /* ... around it, NaN beyond the rim ... */
+    float across[BLOCK];                                         /* ... and that beyond (u, v) */
+    float change[BLOCK], spread[BLOCK]; /* of the disparity from there to (u, v); its standard deviation */
+    float depth[BLOCK], sigma[BLOCK];
 } block;
 
 static inline void locate(const pair_geometry *g, double row, double first_column, block *k) {
@@ -112,6 +73,7 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
     if (g->spherical) {
         for (int i = 0; i < BLOCK; i++) {
             const double across = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
+            k->across_axis[i] = across;
             k->u[i] = arctangent2(k->x[i], across) * columns - column_origin;
             k->v[i] = arctangent2(k->y[i], k->z[i]) * rows - row_origin;
         }
@@ -124,15 +86,97 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
     }
 }
 
-/* Cotangent within (0, pi / 2) by the series of sine and cosine: relative error < 1e-12. */
+/* Finds the nearest pixels of the disparity map; false where none is inside. */
+static inline int find_nearest(const disparity_map *map, block *k) {
+    const double end_u = (double)map->width - 0.5, end_v = (double)map->height - 0.5;
+    for (int i = 0; i < BLOCK; i++) {
+        const int inside = (k->u[i] > -0.5) & (k->v[i] > -0.5) & (k->u[i] < end_u) & (k->v[i] < end_v);
+        /* From 1 on, so that cutting off the fraction rounds down; not by adding 0.5, which would round the number
+         * before 0.5 up to 1. */
+        const double u = inside ? k->u[i] : 0, v = inside ? k->v[i] : 0;
+        const int32_t before_u = (int32_t)(u + 1) - 1, before_v = (int32_t)(v + 1) - 1;
+        k->column[i] = before_u + (u - before_u >= 0.5);
+        k->row[i] = before_v + (v - before_v >= 0.5);
+        k->to_right[i] = u - k->column[i] < 0 ? -1 : 1;
+        k->to_below[i] = v - k->row[i] < 0 ? -1 : 1;
+        k->u[i] = u;
+        k->v[i] = v;
+        k->inside[i] = inside;
+    }
+    int any = 0;
+    for (int i = 0; i < BLOCK; i++) {
+        any |= k->inside[i];
+    }
+    return any;
+}
+
+/* Reads the disparities around the nearest pixels; false where these have none. */
+static inline int read_around(const disparity_map *map, int count, block *k) {
+    const ptrdiff_t width = map->width, last_row = map->height - 1, last_column = width - 1;
+    int any = 0;
+    for (int i = 0; i < BLOCK; i++) {
+        k->centre[i] = NAN;
+    }
+    for (int i = 0; i < count; i++) {
+        const ptrdiff_t x = k->column[i], y = k->row[i];
+        const float *centre = map->values + y * width + x;
+        if (!k->inside[i] || isnan(*centre)) {
+            continue;
+        }
+        const int has_left = x > 0, has_right = x < last_column, has_above = y > 0, has_below = y < last_row;
+        const int has_beside = k->to_right[i] > 0 ? has_right : has_left;
+        const int has_beyond = k->to_below[i] > 0 ? has_below : has_above;
+        k->centre[i] = *centre;
+        k->left[i] = has_left ? centre[-1] : NAN;
+        k->right[i] = has_right ? centre[1] : NAN;
+        k->above[i] = has_above ? centre[-width] : NAN;
+        k->below[i] = has_below ? centre[width] : NAN;
+        k->across[i] = has_beside && has_beyond ? centre[k->to_below[i] * width + k->to_right[i]] : NAN;
+        any = 1;
+    }
+    return any;
+}
+
+/* Standard deviation of the disparities: they are rough by how far they lie from the mean of their neighbours,
+ * along the axis where that is more; matches in foliage and at edges are less certain than those on smooth
+ * surfaces. A missing neighbour counts as a whole pixel. */
+static inline void find_spread(const pair_geometry *g, block *k) {
+    const float most = (float)g->max_disparity_step, share = ROUGHNESS_SHARE;
+    const float variance = (float)(g->disparity_sigma * g->disparity_sigma);
+    for (int i = 0; i < BLOCK; i++) {
+        const float along_row = fabsf(k->centre[i] - 0.5f * (k->left[i] + k->right[i]));
+        const float along_column = fabsf(k->centre[i] - 0.5f * (k->above[i] + k->below[i]));
+        const float r = isnan(along_row) ? 1 : along_row, c = isnan(along_column) ? 1 : along_column;
+        const float more = r > c ? r : c, rough = share * (more < most ? more : most);
+        k->spread[i] = sqrtf(variance + rough * rough);
+    }
+}
+
+/* Disparities at (u, v) less those of the nearest pixels: interpolated only between those of one surface; NaN
+ * where there is none. */
+static inline void interpolate(double max_disparity_step, block *k) {
+    const float max_step = (float)max_disparity_step;
+    for (int i = 0; i < BLOCK; i++) {
+        const float du = (float)(k->u[i] - k->column[i]), dv = (float)(k->v[i] - k->row[i]);
+        const float fx = fabsf(du), fy = fabsf(dv), centre = k->centre[i];
+        const float beside = (k->to_right[i] < 0 ? k->left[i] : k->right[i]) - centre;
+        const float beyond = (k->to_below[i] < 0 ? k->above[i] : k->below[i]) - centre;
+        const float across = k->across[i] - centre, weight = (1 - fx) * (1 - fy);
+        /* Comparisons are false for NaN. */
+        const float w1 = fabsf(beside) <= max_step ? fx * (1 - fy) : 0;
+        const float w2 = fabsf(beyond) <= max_step ? (1 - fx) * fy : 0;
+        const float w3 = fabsf(across) <= max_step ? fx * fy : 0;
+        const float sum = (w1 > 0 ? w1 * beside : 0) + (w2 > 0 ? w2 * beyond : 0) + (w3 > 0 ? w3 * across : 0);
+        k->change[i] = sum / (weight + w1 + w2 + w3);
+    }
+}
+
+/* Cotangent within (0, pi / 2) by the series of sine and cosine: absolute error < 1e-9. */
 static inline double cotangent(double angle) {
     const double s = angle * angle;
-    double sine = 1.0 / (18 * 19), cosine = 1.0 / (17 * 18);
+    double sine = 1.0 / (14 * 15), cosine = 1.0 / (15 * 16);
 /* Divisors as factors: divisions take longest of all. */
 #define TERM(sum, divisor) sum = (1 - s * sum) * (1.0 / (divisor))
-    TERM(sine, 16 * 17);
-    TERM(cosine, 15 * 16);
-    TERM(sine, 14 * 15);
     TERM(cosine, 13 * 14);
     TERM(sine, 12 * 13);
     TERM(cosine, 11 * 12);
@@ -150,28 +194,29 @@ static inline double cotangent(double angle) {
     return (1 - s * cosine) / (angle * (1 - s * sine));
 }
 
+/* With the ray r of depth 1, sin t = x / |r| and cos t = across / |r|: depth, the distance over |r|, has |r|^2 as
+ * its only divisor. */
 static inline void triangulate_sphere(const pair_geometry *g, block *k) {
     const double side = g->is_left ? 1 : -1, radians = 1 / g->columns_per_radian;
     for (int i = 0; i < BLOCK; i++) {
-        const double delta = (k->disparity[i] + g->disparity_origin) * radians;
-        const double across = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
-        const double norm = sqrt(k->x[i] * k->x[i] + across * across);
-        const double sine = k->x[i] / norm, cosine = across / norm, cot = cotangent(delta);
-        const double distance = g->baseline * (cosine * cot + side * sine);
-        const double slope = g->baseline * cosine * (1 + cot * cot);
-        const int found = delta > 0 && delta < HALF_PI && distance > 0; /* false for NaN */
-        k->depth[i] = found ? distance / norm : 0;
-        k->sigma[i] = found ? slope * k->spread[i] * radians / norm : 0;
+        const double delta = ((double)k->centre[i] + k->change[i] + g->disparity_origin) * radians;
+        const double cot = cotangent(delta), across = k->across_axis[i];
+        const double scale = g->baseline / (k->x[i] * k->x[i] + across * across);
+        const double depth = scale * (across * cot + side * k->x[i]);
+        const double slope = scale * across * (1 + cot * cot);
+        const int found = delta > 0 && delta < HALF_PI && depth > 0; /* false for NaN */
+        k->depth[i] = found ? (float)depth : 0;
+        k->sigma[i] = found ? (float)(slope * radians * k->spread[i]) : 0;
     }
 }
 
 static inline void triangulate_plane(const pair_geometry *g, block *k) {
     for (int i = 0; i < BLOCK; i++) {
-        const double d = k->disparity[i] + g->disparity_origin;
-        const double z = g->baseline * g->columns_per_radian / d;
+        const double d = (double)k->centre[i] + k->change[i] + g->disparity_origin;
+        const double inverse = 1 / (d * k->z[i]), z = g->baseline * g->columns_per_radian * inverse;
         const int found = d > 0 && k->z[i] > 0;
-        k->depth[i] = found ? z / k->z[i] : 0;
-        k->sigma[i] = found ? z / d * k->spread[i] / k->z[i] : 0;
+        k->depth[i] = found ? (float)z : 0;
+        k->sigma[i] = found ? (float)(z * inverse * k->z[i] * k->spread[i]) : 0;
     }
 }
 
@@ -180,35 +225,27 @@ void VERSION_OF(depth_candidates)(const float *disparity, ptrdiff_t map_height, 
                                   float *depth, float *sigma) {
     const disparity_map map = {disparity, map_height, map_width};
     block k;
+    memset(&k, 0, sizeof k);
     for (ptrdiff_t y = 0; y < rows; y++) {
         for (ptrdiff_t start = 0; start < columns; start += BLOCK) {
             const int count = columns - start < BLOCK ? (int)(columns - start) : BLOCK;
+            const ptrdiff_t first = y * columns + start;
             locate(g, (double)(first_row + y), (double)start, &k);
-            int found = 0;
-            for (int i = 0; i < BLOCK; i++) {
-                double rough = 0;
-                k.disparity[i] =
-                    i < count ? sample_surface(&map, k.u[i], k.v[i], g->max_disparity_step, &rough) : NAN;
-                rough = ROUGHNESS_SHARE * (rough < g->max_disparity_step ? rough : g->max_disparity_step);
-                k.spread[i] = g->disparity_sigma * g->disparity_sigma + rough * rough;
-                found += !isnan(k.disparity[i]);
-            }
-            if (!found) {
-                memset(depth + y * columns + start, 0, (size_t)count * sizeof *depth);
-                memset(sigma + y * columns + start, 0, (size_t)count * sizeof *sigma);
+            if (!find_nearest(&map, &k) || !read_around(&map, count, &k)) {
+                memset(depth + first, 0, (size_t)count * sizeof *depth);
+                memset(sigma + first, 0, (size_t)count * sizeof *sigma);
                 continue;
             }
-            for (int i = 0; i < BLOCK; i++) {
-                k.spread[i] = sqrt(k.spread[i]);
-            }
+            find_spread(g, &k);
+            interpolate(g->max_disparity_step, &k);
             if (g->spherical) {
                 triangulate_sphere(g, &k);
             } else {
                 triangulate_plane(g, &k);
             }
             for (int i = 0; i < count; i++) {
-                depth[y * columns + start + i] = (float)k.depth[i];
-                sigma[y * columns + start + i] = (float)k.sigma[i];
+                depth[first + i] = k.depth[i];
+                sigma[first + i] = k.sigma[i];
             }
         }
     }

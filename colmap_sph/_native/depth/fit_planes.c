@@ -12,10 +12,11 @@
 
 enum { ROUNDS = 3 };
 
-/* Bounds that keep squares and reciprocals of 32-bit floats finite. */
-#define SMALLEST 1e-30f   /* inverse depth */
-#define LEAST_NOISE 1e-8f /* relative */
-#define FARTHEST 1e6f     /* relative inverse depth of a neighbour */
+/* Bounds that keep ratios and reciprocals of 32-bit floats finite: of inverse depths, and of relative noise. What
+ * overflows nevertheless, the square of how far a neighbour is from the plane, gives it no weight. */
+#define SMALLEST 1e-18f
+#define LARGEST 1e18f
+#define LEAST_NOISE 1e-8f
 
 /* One value per pixel of a block; inverse depths are relative to the centre's: (w - centre) / centre. */
 typedef struct {
@@ -48,7 +49,7 @@ static inline void accumulate(const float *window, ptrdiff_t stride, int radius,
             const float *tap = window + y * stride + x;
             const float fy = (float)y, near = falloff[abs(x)] * falloff[abs(y)];
             for (int l = 0; l < LANES; l++) {
-                const float w = clamp((tap[l] - k->centre[l]) * k->scale[l], -1, FARTHEST);
+                const float w = (tap[l] - k->centre[l]) * k->scale[l];
                 const float residual = w - (k->value[l] + k->du[l] * fx + k->dv[l] * fy);
                 const float robust = 1 / (1 + residual * residual * inverse_scale[l]);
                 const float weight = tap[l] > 0 ? near * robust * robust : 0;
@@ -91,7 +92,8 @@ static inline void solve(const normal_equations *sums, block *k) {
     }
 }
 
-static inline void begin(const float *centre, const float *sigma, ptrdiff_t count, float tolerance, block *k) {
+/* False where no pixel has a depth. */
+static inline int begin(const float *centre, const float *sigma, ptrdiff_t count, float tolerance, block *k) {
     for (int l = 0; l < LANES; l++) {
         const float w = l < count ? centre[l] : 0;
         k->good[l] = w >= SMALLEST;
@@ -100,6 +102,11 @@ static inline void begin(const float *centre, const float *sigma, ptrdiff_t coun
         k->noise[l] = clamp(k->good[l] ? tolerance * sigma[l] * k->scale[l] : 1, LEAST_NOISE, 1);
         k->value[l] = k->du[l] = k->dv[l] = 0;
     }
+    int any = 0;
+    for (int l = 0; l < LANES; l++) {
+        any |= k->good[l];
+    }
+    return any;
 }
 
 /* Whether the pixel is off its plane, or glances at it with little support. `value` is the plane's inverse depth
@@ -149,15 +156,21 @@ int VERSION_OF(fit_planes)(const float *inverse_depth, const float *inverse_sigm
         return -1;
     }
     for (ptrdiff_t row = 0; row < height; row++) {
-        memcpy(padded + (row + radius) * stride + radius, inverse_depth + row * width,
-               (size_t)width * sizeof *padded);
+        for (ptrdiff_t column = 0; column < width; column++) {
+            const float w = inverse_depth[row * width + column], bounded = w < LARGEST ? w : LARGEST;
+            padded[(row + radius) * stride + radius + column] = w >= SMALLEST ? bounded : 0;
+        }
     }
     for (ptrdiff_t row = 0; row < height; row++) {
         for (ptrdiff_t column = 0; column < width; column += LANES) {
             const ptrdiff_t p = row * width + column, count = width - column < LANES ? width - column : LANES;
             const float *window = padded + (row + radius) * stride + column + radius;
             block k;
-            begin(window, inverse_sigma + p, count, fit->tolerance, &k);
+            if (!begin(window, inverse_sigma + p, count, fit->tolerance, &k)) {
+                memset(normals + 3 * p, 0, (size_t)(3 * count) * sizeof *normals);
+                memset(fitted_depth + p, 0, (size_t)count * sizeof *fitted_depth);
+                continue;
+            }
             for (int round = 0; round < ROUNDS; round++) {
                 /* The first round allows for a slope of the surface, the later ones for noise only. */
                 const float widening = round == 0 ? (float)(1 + radius) : round == 1 ? 2 : 1;

@@ -39,6 +39,15 @@ FUNCTION(transfer_disparity, TRANSFER_DISPARITY, any,
     X(OUT, float32, sigma, H, W)
 ARGUMENTS(depth_candidates, DEPTH_CANDIDATES);
 
+static int check_maps(ptrdiff_t height, ptrdiff_t width) {
+    return check(height <= INT32_MAX && width <= INT32_MAX, "maps are limited to 2^31 - 1 rows and columns");
+}
+
+static int check_depth_candidates(const void *arguments) {
+    const depth_candidates_arguments *a = arguments;
+    return check_maps(a->size.MAP_H, a->size.MAP_W);
+}
+
 static int run_depth_candidates(void *arguments) {
     const depth_candidates_arguments *a = arguments;
     pair_geometry geometry = {.columns_per_radian = a->scales.first,
@@ -57,11 +66,12 @@ static int run_depth_candidates(void *arguments) {
     return 0;
 }
 
-FUNCTION(depth_candidates, DEPTH_CANDIDATES, any,
+FUNCTION(depth_candidates, DEPTH_CANDIDATES, check_depth_candidates,
          "z-depth and its standard deviation (0 = none) from a pair's disparities, for rows of a view from\n"
          "`first_row` on; `scales` and `origins` are of columns and rows of the disparity map.");
 
 #define VOTE_DEPTH(X) \
+    X(VALUE, backend, backend) \
     X(IN, float32, depths, PAIRS, H, W) \
     X(IN, float32, sigmas, PAIRS, H, W) \
     X(IN, int32, stations, PAIRS) \
@@ -82,9 +92,8 @@ static int check_vote_depth(const void *arguments) {
 
 static int run_vote_depth(void *arguments) {
     const vote_depth_arguments *a = arguments;
-    vote_depth(a->depths, a->sigmas, a->stations, a->size.PAIRS, a->size.H * a->size.W, a->tolerance, a->depth,
-               a->sigma, a->support);
-    return 0;
+    return a->backend->vote_depth(a->depths, a->sigmas, a->stations, a->size.PAIRS, a->size.H * a->size.W,
+                                  a->tolerance, a->depth, a->sigma, a->support);
 }
 
 FUNCTION(
@@ -109,10 +118,6 @@ FUNCTION(
     X(OUT, float32, weighted_depth, H, W) \
     X(OUT, float32, weight, H, W)
 ARGUMENTS(compare_depths, COMPARE_DEPTHS);
-
-static int check_maps(ptrdiff_t height, ptrdiff_t width) {
-    return check(height <= INT32_MAX && width <= INT32_MAX, "maps are limited to 2^31 - 1 rows and columns");
-}
 
 static int check_compare_depths(const void *arguments) {
     const compare_depths_arguments *a = arguments;
@@ -211,6 +216,11 @@ static int rows_fit(ptrdiff_t rows, ptrdiff_t step, ptrdiff_t count) {
     return count == 0 || (rows > 0 && count - 1 <= (rows - 1) / step);
 }
 
+static int check_rows(ptrdiff_t first, ptrdiff_t step, ptrdiff_t height, ptrdiff_t count) {
+    return check(first >= 0 && step >= 1 && rows_fit(height - first, step, count),
+                 "the rows must lie in the image");
+}
+
 static int check_add_patch_equations(const void *arguments) {
     const add_patch_equations_arguments *a = arguments;
     for (ptrdiff_t k = 0; k < a->size.SOURCES; k++) {
@@ -220,9 +230,7 @@ static int check_add_patch_equations(const void *arguments) {
             return 0;
         }
     }
-    return check(a->first_row >= 0 && a->row_step >= 1 &&
-                     rows_fit(a->size.H - a->first_row, a->row_step, a->size.ROWS),
-                 "the rows must lie in the image");
+    return check_rows(a->first_row, a->row_step, a->size.H, a->size.ROWS);
 }
 
 static int run_add_patch_equations(void *arguments) {
@@ -243,6 +251,53 @@ static int run_add_patch_equations(void *arguments) {
 FUNCTION(add_patch_equations, ADD_PATCH_EQUATIONS, check_add_patch_equations,
          "Add the normal equations of matching planes of every `row_step`-th row in each of the sources.");
 
+#define PLANES_OF_MAPS(X) \
+    X(IN, float32, normals, H, W, 3) \
+    X(IN, float32, depth, H, W) \
+    X(IN, float64, inverse_K, 3, 3) \
+    X(VALUE, ptrdiff, first_row) \
+    X(VALUE, ptrdiff, row_step) \
+    X(OUT, float32, planes, 3, ROWS, W)
+ARGUMENTS(planes_of_maps, PLANES_OF_MAPS);
+
+static int check_planes_of_maps(const void *arguments) {
+    const planes_of_maps_arguments *a = arguments;
+    return check_rows(a->first_row, a->row_step, a->size.H, a->size.ROWS);
+}
+
+static int run_planes_of_maps(void *arguments) {
+    const planes_of_maps_arguments *a = arguments;
+    const patch_rows rows = {a->first_row, a->row_step, a->size.ROWS};
+    planes_of_maps(a->normals, a->depth, a->size.W, a->inverse_K, rows, a->planes);
+    return 0;
+}
+
+FUNCTION(
+    planes_of_maps, PLANES_OF_MAPS, check_planes_of_maps,
+    "Inverse depth and its change per column and row on every `row_step`-th row of maps; 0 where there is none.");
+
+#define MAPS_OF_PLANES(X) \
+    X(IN, float32, planes, 3, ROWS, W) \
+    X(IN, float64, K, 3, 3) \
+    X(VALUE, ptrdiff, first_row) \
+    X(OUT, float32, normals, H, W, 3) \
+    X(OUT, float32, depth, H, W)
+ARGUMENTS(maps_of_planes, MAPS_OF_PLANES);
+
+static int check_maps_of_planes(const void *arguments) {
+    const maps_of_planes_arguments *a = arguments;
+    return check_rows(a->first_row, 1, a->size.H, a->size.ROWS);
+}
+
+static int run_maps_of_planes(void *arguments) {
+    const maps_of_planes_arguments *a = arguments;
+    maps_of_planes(a->planes, a->size.ROWS, a->size.W, a->K, a->first_row, a->normals, a->depth);
+    return 0;
+}
+
+FUNCTION(maps_of_planes, MAPS_OF_PLANES, check_maps_of_planes,
+         "The inverse of planes_of_maps, into the maps' rows from `first_row` on.");
+
 #define REFINE_PLANES(X) \
     X(IN, float32, equations, 12, H, W) \
     X(IN, float32, sigma, H, W) \
@@ -258,7 +313,14 @@ static int run_refine_planes(void *arguments) {
 
 FUNCTION(refine_planes, REFINE_PLANES, any, "Move planes by the solution of their equations.");
 
-native_function *const depth_functions[] = {
-    &transfer_disparity_function,  &depth_candidates_function, &vote_depth_function,
-    &compare_depths_function,      &confirm_depth_function,    &fit_planes_function,
-    &add_patch_equations_function, &refine_planes_function,    NULL};
+native_function *const depth_functions[] = {&transfer_disparity_function,
+                                            &depth_candidates_function,
+                                            &vote_depth_function,
+                                            &compare_depths_function,
+                                            &confirm_depth_function,
+                                            &fit_planes_function,
+                                            &add_patch_equations_function,
+                                            &planes_of_maps_function,
+                                            &maps_of_planes_function,
+                                            &refine_planes_function,
+                                            NULL};

@@ -15,9 +15,10 @@ static void put_segment(float *row, ptrdiff_t width, ptrdiff_t x, float d0, floa
     if (!(r1 > r0 && r1 >= 0 && r0 < (float)width)) {
         return; /* outside, or seen from behind: the left image's order is reversed in the right one */
     }
+    /* Cutting off the fraction rounds positive numbers down, without a call. */
+    const ptrdiff_t before = r0 > 0 ? (ptrdiff_t)r0 : 0, first = before + (r0 > (float)before);
+    const ptrdiff_t end = r1 < (float)width ? (ptrdiff_t)r1 + 1 : width;
     const float slope = (d1 - d0) / (r1 - r0);
-    const ptrdiff_t first = r0 > 0 ? (ptrdiff_t)ceilf(r0) : 0;
-    const ptrdiff_t end = r1 < (float)width ? (ptrdiff_t)floorf(r1) + 1 : width;
     for (ptrdiff_t r = first; r < end; r++) {
         put(row, width, r, d0 + ((float)r - r0) * slope);
     }

@@ -1,84 +1,145 @@
+/* The vote of a pixel's candidates. Neighbouring pixels are worked on side by side, each in a lane of its own, so
+ * that vector widths cannot change a result. */
+#include <math.h>
+#include <stdlib.h>
+#include <string.h>
+
 #include "depth/depth.h"
+#include "version.h"
 
 enum { MAX_CANDIDATES = 255 };
 
+typedef float lanes __attribute__((vector_size(4 * LANES)));
+typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
+
+/* A pair's candidates for the pixels of a block. */
 typedef struct {
-    float depth[MAX_CANDIDATES], variance[MAX_CANDIDATES];
-    int32_t station[MAX_CANDIDATES]; /* ascending */
-    int count;
+    lanes depth, variance;
+    int_lanes there;  /* -1, or 0 where it has none */
+    int ends_station; /* no later one of the block is of its station */
 } candidates;
 
-static inline int agree(const candidates *c, int a, int b, float tolerance_squared) {
-    const float difference = c->depth[a] - c->depth[b];
-    return difference * difference <= tolerance_squared * (c->variance[a] + c->variance[b]);
+/* Where most stations agree. */
+typedef struct {
+    lanes depth, variance;
+    int_lanes stations;
+} cluster;
+
+static inline lanes chosen(int_lanes mask, lanes value, lanes otherwise) {
+    return (lanes)((mask & (int_lanes)value) | (~mask & (int_lanes)otherwise));
+}
+
+static inline int any(int_lanes mask) {
+    int32_t found = 0;
+    for (int l = 0; l < LANES; l++) {
+        found |= mask[l];
+    }
+    return found != 0;
+}
+
+static inline int_lanes agree(const candidates *c, lanes depth, lanes variance, float tolerance_squared) {
+    const lanes difference = depth - c->depth;
+    return c->there & (int_lanes)(difference * difference <= tolerance_squared * (variance + c->variance));
+}
+
+/* The candidates of `count` pixels from `first` on, of the pairs that have any there, at most MAX_CANDIDATES of a
+ * pixel; returns how many pairs. */
+static inline ptrdiff_t collect(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t pairs,
+                                ptrdiff_t pixels, ptrdiff_t first, ptrdiff_t count, candidates *found) {
+    ptrdiff_t number = 0;
+    int32_t station = 0;
+    int_lanes before = {0};
+    for (ptrdiff_t k = 0; k < pairs; k++) {
+        lanes depth = {0}, sigma = {0};
+        memcpy(&depth, depths + k * pixels + first, (size_t)count * sizeof *depths);
+        memcpy(&sigma, sigmas + k * pixels + first, (size_t)count * sizeof *sigmas);
+        const int_lanes there = (int_lanes)(depth > 0) & (before < MAX_CANDIDATES);
+        if (!any(there)) {
+            continue;
+        }
+        before -= there;
+        if (number > 0) {
+            found[number - 1].ends_station = stations[k] != station;
+        }
+        found[number++] = (candidates){depth, sigma * sigma, there, 1};
+        station = stations[k];
+    }
+    return number;
 }
 
 /* The candidate with which most stations agree; among equals, the one with the smallest variance. */
-static int cluster_centre(const candidates *c, float tolerance_squared) {
-    int best = 0, best_count = 0;
-    for (int a = 0; a < c->count; a++) {
-        int count = 0, counted = 0;
-        for (int b = 0; b < c->count; b++) {
-            counted = b > 0 && c->station[b] == c->station[b - 1] ? counted : 0;
-            const int found = agree(c, a, b, tolerance_squared);
-            count += found && !counted;
-            counted |= found;
+static inline cluster largest_cluster(const candidates *found, ptrdiff_t number, float tolerance_squared) {
+    cluster best;
+    int_lanes begun = {0};
+    memset(&best, 0, sizeof best);
+    for (ptrdiff_t a = 0; a < number; a++) {
+        int_lanes stations = {0}, counted = {0};
+        for (ptrdiff_t b = 0; b < number; b++) {
+            counted |= agree(&found[b], found[a].depth, found[a].variance, tolerance_squared);
+            if (found[b].ends_station) {
+                stations -= counted;
+                counted = (int_lanes){0};
+            }
         }
-        if (count > best_count || (count == best_count && c->variance[a] < c->variance[best])) {
-            best = a;
-            best_count = count;
-        }
+        const int_lanes surer = (stations == best.stations) & (int_lanes)(found[a].variance < best.variance);
+        const int_lanes better = found[a].there & (~begun | (stations > best.stations) | surer);
+        best.depth = chosen(better, found[a].depth, best.depth);
+        best.variance = chosen(better, found[a].variance, best.variance);
+        best.stations = (better & stations) | (~better & best.stations);
+        begun |= found[a].there;
     }
     return best;
 }
 
-/* Weighted sum of the depths less the centre's, and of the weights, of what agrees with it; and of how many
- * stations. Each of these has the mean weight of its candidates. */
-static int sum_cluster(const candidates *c, int centre, float tolerance_squared, float *sum, float *weights) {
-    int stations = 0;
-    for (int b = 0; b < c->count;) {
-        const int32_t station = c->station[b];
-        float own_sum = 0, own_weights = 0;
-        int members = 0;
-        for (; b < c->count && c->station[b] == station; b++) {
-            if (agree(c, centre, b, tolerance_squared)) {
-                own_sum += (c->depth[b] - c->depth[centre]) / c->variance[b];
-                own_weights += 1 / c->variance[b];
-                members++;
-            }
-        }
-        if (members) {
-            *sum += own_sum / (float)members;
-            *weights += own_weights / (float)members;
-            stations++;
+/* Weighted mean of what agrees with the centre of the cluster, and its variance; each station has the mean weight
+ * of its candidates. The centre's stations are counted anew: as many. */
+static inline void mean_of_cluster(const candidates *found, ptrdiff_t number, const cluster *centre,
+                                   float tolerance_squared, lanes *mean, lanes *variance) {
+    const lanes none = {0};
+    lanes sum = none, weights = none, own_sum = none, own_weights = none, members = none;
+    for (ptrdiff_t b = 0; b < number; b++) {
+        const candidates *c = &found[b];
+        const int_lanes counts = agree(c, centre->depth, centre->variance, tolerance_squared);
+        own_sum += chosen(counts, (c->depth - centre->depth) / c->variance, none);
+        own_weights += chosen(counts, 1 / c->variance, none);
+        members += chosen(counts, none + 1, none);
+        if (c->ends_station) {
+            const int_lanes some = (int_lanes)(members > 0);
+            sum += chosen(some, own_sum / members, none);
+            weights += chosen(some, own_weights / members, none);
+            own_sum = own_weights = members = none;
         }
     }
-    return stations;
+    *mean = centre->depth + sum / weights;
+    *variance = 1 / weights;
 }
 
-void vote_depth(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t count,
-                ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support) {
+int VERSION_OF(vote_depth)(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t pairs,
+                           ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support) {
     const float tolerance_squared = tolerance * tolerance;
-    candidates c;
-    for (ptrdiff_t p = 0; p < pixels; p++) {
-        c.count = 0;
-        for (ptrdiff_t k = 0; k < count && c.count < MAX_CANDIDATES; k++) {
-            const float s = sigmas[k * pixels + p];
-            if (depths[k * pixels + p] > 0) {
-                c.depth[c.count] = depths[k * pixels + p];
-                c.station[c.count] = stations[k];
-                c.variance[c.count++] = s * s;
-            }
-        }
-        depth[p] = sigma[p] = 0;
-        support[p] = 0;
-        if (c.count == 0) {
+    candidates *found = aligned_alloc(sizeof(lanes), (size_t)(pairs + 1) * sizeof *found);
+    if (!found) {
+        return -1;
+    }
+    for (ptrdiff_t first = 0; first < pixels; first += LANES) {
+        const ptrdiff_t count = pixels - first < LANES ? pixels - first : LANES;
+        const ptrdiff_t number = collect(depths, sigmas, stations, pairs, pixels, first, count, found);
+        if (number == 0) {
+            memset(depth + first, 0, (size_t)count * sizeof *depth);
+            memset(sigma + first, 0, (size_t)count * sizeof *sigma);
+            memset(support + first, 0, (size_t)count);
             continue;
         }
-        const int centre = cluster_centre(&c, tolerance_squared);
-        float sum = 0, weights = 0;
-        support[p] = (uint8_t)sum_cluster(&c, centre, tolerance_squared, &sum, &weights);
-        depth[p] = c.depth[centre] + sum / weights;
-        sigma[p] = __builtin_sqrtf(1 / weights);
+        const cluster best = largest_cluster(found, number, tolerance_squared);
+        lanes mean, variance;
+        mean_of_cluster(found, number, &best, tolerance_squared, &mean, &variance);
+        for (ptrdiff_t l = 0; l < count; l++) {
+            const int there = best.depth[l] > 0;
+            depth[first + l] = there ? mean[l] : 0;
+            sigma[first + l] = there ? sqrtf(variance[l]) : 0;
+            support[first + l] = (uint8_t)best.stations[l];
+        }
     }
+    free(found);
+    return 0;
 }
