@@ -120,7 +120,7 @@ def split(model: str) -> tuple[np.ndarray, np.ndarray, tuple[float, ...]]:
     return np.array([values[0], values[number - 1]]), np.array(values[number : number + 2]), values[number + 2 :]
 
 
-@pytest.mark.parametrize("model", PARAMETERS.keys() - BACKWARD.keys() - {PANORAMA})
+@pytest.mark.parametrize("model", sorted(PARAMETERS.keys() - BACKWARD.keys() - {PANORAMA}))
 def test_pixels_of_rays_beyond_a_right_angle(model: str) -> None:
     focal, principal, extra = split(model)
     rays = rays_up_to(100)
