@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from colmap_sph.errors import OutputError
+from colmap_sph.products.publishing import check_no_folder
 from colmap_sph.project.claim import check_ways_out
 from colmap_sph.project.workspace import Workspace
 
@@ -16,5 +17,4 @@ def check_places(workspace: Workspace, folder: Path, names: Iterable[str], *, ov
     for path in (folder / name for name in names):
         if os.path.lexists(path) and not overwrite:
             raise OutputError(f"{path} is there already; give --overwrite, or another --output.")
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder, and a file goes there; remove it or choose another --output.")
+        check_no_folder(path)

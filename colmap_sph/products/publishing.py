@@ -15,6 +15,18 @@ MARK = "made_by_colmap_sph.txt"
 
 
 @contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Errors of the system while `path` is written, as one sentence about it."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written ({reason_of(error)}); check space and permissions, or choose another "
+            "--output."
+        ) from error
+
+
+@contextmanager
 def published(path: Path) -> Iterator[Path]:
     """A temporary path for a file, which becomes `path` when all went well, and is removed when not.
 
@@ -26,18 +38,13 @@ def published(path: Path) -> Iterator[Path]:
     make_dir(path.parent)
     temporary = path.parent / f".{path.name}.part"
     try:
-        temporary.unlink(missing_ok=True)  # of a process that was killed
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder, and a file goes there; remove it or choose another --output.")
-        yield temporary
-        sync_file(temporary)
-        temporary.replace(path)
-        sync_folder(path.parent)
-    except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written ({reason_of(error)}); check space and permissions, or choose another "
-            "--output."
-        ) from error
+        with _told(path):
+            temporary.unlink(missing_ok=True)  # of a process that was killed
+            check_no_folder(path)
+            yield temporary
+            sync_file(temporary)
+            temporary.replace(path)
+            sync_folder(path.parent)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -48,7 +55,7 @@ def scratch_beside(path: Path) -> Iterator[Path]:
     """An empty folder beside a temporary path, which is removed with all that is in it."""
     folder = path.with_name(f"{path.name}.parts")
     shutil.rmtree(folder, ignore_errors=True)  # of a process that was killed
-    folder.mkdir()
+    folder.mkdir()  # a new one, never one that a link leads to
     try:
         yield folder
     finally:
@@ -70,7 +77,7 @@ def published_folder(path: Path) -> Iterator[Path]:
     make_dir(path.parent)
     with scratch_beside(path.parent / f".{path.name}") as scratch:
         made = scratch / "made"
-        try:
+        with _told(path):
             made.mkdir()
             yield made
             (made / MARK).write_text(f"Made by colmap_sph {version('colmap_sph')}, which replaces this folder.\n")
@@ -78,14 +85,15 @@ def published_folder(path: Path) -> Iterator[Path]:
                 shutil.rmtree(path)
             made.replace(path)
             sync_folder(path.parent)
-        except OSError as error:
-            raise OutputError(
-                f"{path} cannot be written ({reason_of(error)}); check space and permissions, or choose another "
-                "--output."
-            ) from error
 
 
 def check_replaceable(path: Path) -> None:
     """Raise `OutputError` where something is in the way that no export has made."""
     if os.path.lexists(path) and not (path / MARK).is_file():
         raise OutputError(f"{path} is there already, and no export made it; choose another --output.")
+
+
+def check_no_folder(path: Path) -> None:
+    """Raise `OutputError` where a folder is in the place of a file."""
+    if path.is_dir():
+        raise OutputError(f"{path} is a folder, and a file goes there; remove it or choose another --output.")

@@ -3,6 +3,7 @@
 On the sphere rows and columns are angles λ and θ, on the plane they are tangents, see `rectified_pair`.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -101,14 +102,31 @@ def extent_on_sphere(
     if half <= 0:
         raise RectificationError("the two images share no epipolar plane")
     rotation = rolled(rotation, centre)
+    columns = [column_extent(*each, rotation, -half, half) for each in zip(views, outlines, signs, strict=True)]
+    return bounded_extent(rotation, half, columns, min_cosine, parallax_angles(left, right, rotation, points))
+
+
+def bounded_extent(
+    rotation: Float, half: float, columns: Sequence[Range], min_cosine: float, parallaxes: Float
+) -> Extent:
+    """The extent with as many rows to both sides, and columns no nearer to the epipoles than `min_cosine`.
+
+    Parameters
+    ----------
+    rotation : (3, 3) float64 ndarray
+    half : float
+        Radians; where it is π, rows go all around, and there is a seam.
+    columns : two of (float, float)
+        Least and most θ that the left and the right image show, radians.
+    min_cosine : float
+        See `extent_on_sphere`.
+    parallaxes : (n,) float64 ndarray
+        Of the sparse points, radians.
+    """
     limit = float(np.arccos(min_cosine))
-    columns: list[Range] = []
-    for each in zip(views, outlines, signs, strict=True):
-        low, high = column_extent(*each, rotation, -half, half)
-        columns.append((max(low, -limit), min(high, limit)))
-    parallaxes = parallax_angles(left, right, rotation, points)
+    left, right = ((max(low, -limit), min(high, limit)) for low, high in columns)
     seam = SEAM_ROWS if half >= np.pi else 0
-    return Extent(rotation, (-half, half), (columns[0], columns[1]), parallaxes, seam)
+    return Extent(rotation, (-half, half), (left, right), parallaxes, seam)
 
 
 def extent_on_plane(

@@ -6,10 +6,10 @@ from typing import Annotated
 
 import tyro
 
-from colmap_sph.app.report_command import opened
+from colmap_sph.app.products.opening import opened_on_map
 from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.products.export import Exporter, ExportOptions, export
-from colmap_sph.products.georeferencing import GeoreferenceOptions, georeferenced, report_lines
+from colmap_sph.products.georeferencing import GeoreferenceOptions
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,7 @@ class ExportCommand:
 def export_command(command: ExportCommand, terminal: Terminal) -> int:
     """`colmap_sph export`: paths of what was made on the standard output."""
     command.options.check()
-    workspace = opened(command.workspace)
-    georeference = georeferenced(workspace, command.georeference)
-    if command.georeference.align is not None:
-        terminal.say_lines("\n".join(report_lines(georeference)))
+    workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
     folder = command.output or workspace.root / "export"
     exporter = Exporter(workspace, command.options, georeference, folder)
     for path in export(exporter, terminal.status, overwrite=command.overwrite):

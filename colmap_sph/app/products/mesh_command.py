@@ -7,11 +7,11 @@ from typing import Annotated
 import tyro
 
 from colmap_sph.app.display import Display
-from colmap_sph.app.report_command import opened
+from colmap_sph.app.products.opening import opened_on_map
 from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.pipeline.options import num_cores
-from colmap_sph.products.georeferencing import GeoreferenceOptions, georeferenced, report_lines
+from colmap_sph.products.georeferencing import GeoreferenceOptions
 from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.options import MeshOptions
 
@@ -41,10 +41,7 @@ def mesh_command(command: MeshCommand, terminal: Terminal) -> int:
     """`colmap_sph mesh`: paths of what was made on the standard output."""
     command.options.check()
     memory = budget(parse_memory(command.memory))
-    workspace = opened(command.workspace)
-    georeference = georeferenced(workspace, command.georeference)
-    if command.georeference.align is not None:
-        terminal.say_lines("\n".join(report_lines(georeference)))
+    workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
     folder = command.output or workspace.root / "mesh"
     with Display(terminal) as display:
         request = MeshRequest(

@@ -7,10 +7,10 @@ from typing import Annotated
 import tyro
 
 from colmap_sph.app.display import Display
-from colmap_sph.app.report_command import opened
+from colmap_sph.app.products.opening import opened_on_map
 from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.pipeline.memory import budget, parse_memory
-from colmap_sph.products.georeferencing import GeoreferenceOptions, georeferenced, report_lines
+from colmap_sph.products.georeferencing import GeoreferenceOptions
 from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
 
@@ -42,10 +42,7 @@ def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
     """`colmap_sph surface`: paths of what was made on the standard output."""
     command.options.check()
     memory = budget(parse_memory(command.memory))
-    workspace = opened(command.workspace)
-    georeference = georeferenced(workspace, command.georeference)
-    if command.georeference.align is not None:
-        terminal.say_lines("\n".join(report_lines(georeference)))
+    workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
     folder = command.output or workspace.root / "surface"
     with Display(terminal) as display:
         request = SurfaceRequest(workspace, georeference, command.options, folder, memory, command.overwrite)

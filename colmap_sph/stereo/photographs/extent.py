@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import RectificationError
 from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.disparity_range import Range, parallax_angles
-from colmap_sph.stereo.extent import SEAM_ROWS, Extent, column_extent, epipole_sign, rolled, row_arc
+from colmap_sph.stereo.extent import Extent, bounded_extent, column_extent, epipole_sign, rolled, row_arc
 from colmap_sph.stereo.rectified_pair import Float
 
 # Half of the largest parallax that anything is matched at, radians.
@@ -61,18 +61,14 @@ def extent_of_photographs(
         raise RectificationError("the two images share no epipolar plane")
     centre, half = _around_all(common)
     rotation = rolled(rotation, centre)
-    limit = float(np.arccos(min_cosine))
     columns: list[Range] = []
     for photograph, shown in zip((left, right), outlines, strict=True):
         ranges = [
             column_extent(view, outline, epipole_sign(view, rotation, outline), rotation, -half, half)
             for view, outline in zip(photograph.views, shown, strict=True)
         ]
-        low, high = min(least for least, _ in ranges), max(most for _, most in ranges)
-        columns.append((max(low, -limit), min(high, limit)))
-    parallaxes = parallax_angles(left, right, rotation, points)
-    seam = SEAM_ROWS if half >= np.pi else 0
-    return Extent(rotation, (-half, half), (columns[0], columns[1]), parallaxes, seam)
+        columns.append((min(least for least, _ in ranges), max(most for _, most in ranges)))
+    return bounded_extent(rotation, half, columns, min_cosine, parallax_angles(left, right, rotation, points))
 
 
 def nearer_half(columns: Range, most: float) -> Range:

@@ -70,11 +70,6 @@ class Raster:
         matrix, shift = self.cells_from_scene
         return matrix @ view.R.T, matrix @ view.center + shift
 
-    def to_scene(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(…, 3) columns, rows and heights → points of the scene."""
-        matrix, shift = self.cells_from_scene
-        return np.asarray((cells - shift) @ np.linalg.inv(matrix).T)
-
     def to_cells(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """(…, 3) points of the scene → columns, rows and heights."""
         matrix, shift = self.cells_from_scene

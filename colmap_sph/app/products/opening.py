@@ -1,0 +1,18 @@
+"""A workspace as typed → what every product is made from: the workspace, and where its model lies on the map."""
+
+from pathlib import Path
+
+from colmap_sph.app.report_command import opened
+from colmap_sph.app.terminal import Terminal
+from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.georeferencing import GeoreferenceOptions, georeferenced, report_lines
+from colmap_sph.project.workspace import Workspace
+
+
+def opened_on_map(path: Path, options: GeoreferenceOptions, terminal: Terminal) -> tuple[Workspace, Georeference]:
+    """The workspace and its place on the map; tells what an alignment has left over."""
+    workspace = opened(path)
+    georeference = georeferenced(workspace, options)
+    if options.align is not None:
+        terminal.say_lines("\n".join(report_lines(georeference)))
+    return workspace, georeference
