@@ -10,6 +10,7 @@ import pytest
 import colmap_sph
 from colmap_sph import synthetic as syn
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.images.jpeg import rounding_step
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.blank import blank_pixels
@@ -50,15 +51,19 @@ def cameras():
     return [syn.Camera(syn.pinhole(FOCAL, WIDTH, HEIGHT), R, t, WIDTH, HEIGHT) for R, t in poses]
 
 
-def photograph(camera, seed):
+def photograph(camera, seed, quality=90):
     """(H, W, 3) BGR picture with a sky that is brighter lower down, sensor noise and JPEG's rounding."""
     view = syn.render(scene(), camera.K, camera.R, camera.t, WIDTH, HEIGHT)
     picture = view.image.astype(np.float32)
     picture[view.surface == SKY] += np.linspace(-30, 20, HEIGHT)[np.nonzero(view.surface == SKY)[0], None]
     picture += np.random.default_rng(seed).normal(0, 2, picture.shape)
     saved = np.clip(np.rint(picture), 0, 255).astype(np.uint8)[..., ::-1]
-    jpeg = cv2.imencode(".jpg", saved, [cv2.IMWRITE_JPEG_QUALITY, 90])[1]
-    return cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+    return cv2.imdecode(encoded(saved, quality), cv2.IMREAD_COLOR)
+
+
+def encoded(picture, quality):
+    """A JPEG file's bytes."""
+    return cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
 
 
 def surfaces_of(camera):
@@ -91,6 +96,16 @@ def masks():
     ]
 
 
+def masks_of_jpeg(quality):
+    """As `masks`, of pictures saved with this quality, with what their files say of it."""
+    found = []
+    for k, camera in enumerate(cameras()):
+        picture = photograph(camera, k, quality)
+        step = rounding_step(bytes(encoded(picture, quality)))
+        found.append((blank_pixels(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), step), surfaces_of(camera)[0]))
+    return found
+
+
 def share(masks, surface):
     return sum(blank[number == surface].sum() for blank, number in masks) / sum(
         (number == surface).sum() for _, number in masks
@@ -105,6 +120,15 @@ def test_sky_and_blown_out_walls_are_blank(masks):
 
 def test_texture_is_not_blank_however_weak(masks):
     assert share(masks, WEAK) < 0.02  # at its edges; its texture is no stronger than the noise
+    assert share(masks, GROUND) < 0.01
+
+
+@pytest.mark.parametrize("quality", [80, 70, 60, 50])
+def test_coarse_jpeg_does_not_make_texture_of_the_sky(quality):
+    masks = masks_of_jpeg(quality)
+    assert share(masks, SKY) > 0.95
+    assert share(masks, BLOWN_OUT) > 0.95
+    assert share(masks, WEAK) < 0.03
     assert share(masks, GROUND) < 0.01
 
 

@@ -1,5 +1,6 @@
 """Images are read as COLMAP reads them, damage is noticed, and copies have lost the tag that turns them."""
 
+import io
 import itertools
 import os
 import struct
@@ -12,11 +13,11 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 import pycolmap
 import pytest
-from PIL import Image, ImageOps, PngImagePlugin
+from PIL import Image, ImageOps, JpegImagePlugin, PngImagePlugin
 from projects import read_picture
 
 from colmap_sph.errors import InputError
-from colmap_sph.project.images.decoding import read_header, read_pixels
+from colmap_sph.project.images.decoding import jpeg_step, read_header, read_pixels
 from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.images.reading import image_problem, read_colours, read_grey, read_whole_grey
 
@@ -417,3 +418,42 @@ def test_jpeg_headers_of_any_length(num_segments: int, tmp_path: Path) -> None:
     header = read_header(path)
     assert (header.width, header.height, header.channels, header.dtype) == (WIDTH, HEIGHT, 3, "uint8")
     assert image_problem(path, WIDTH, HEIGHT) is None
+
+
+# ---- how coarsely JPEG rounds ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["plain", "grey", "progressive", "16-bit table", "with a preview"])
+@pytest.mark.parametrize("quality", [5, 50, 80, 100])
+def test_the_rounding_step_of_jpeg_is_that_of_its_table(tmp_path: Path, quality: int, kind: str) -> None:
+    path = tmp_path / "a.jpg"
+    picture = Image.fromarray(np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8))
+    if kind == "grey":
+        picture = picture.convert("L")
+    picture.save(path, quality=quality, progressive=kind == "progressive")
+    with Image.open(path) as image:
+        assert isinstance(image, JpegImagePlugin.JpegImageFile)
+        step = image.quantization[0][0]
+    data = path.read_bytes()
+    if kind == "16-bit table":
+        # T.81 allows it in extended files: the same numbers, twice as long.
+        start = data.index(b"\xff\xdb")
+        table = struct.pack(">HHB64H", 0xFFDB, 131, 0x10, *data[start + 5 : start + 69])
+        path.write_bytes(data[:start] + table + data[start + 69 :])
+    if kind == "with a preview":
+        # A small image of another quality in the header.
+        preview = io.BytesIO()
+        picture.save(preview, "jpeg", quality=95)
+        body = b"preview\0" + preview.getvalue()
+        path.write_bytes(data[:2] + struct.pack(">HH", 0xFFE5, len(body) + 2) + body + data[2:])
+    assert jpeg_step(path) == step
+
+
+def test_other_files_have_no_rounding_step(tmp_path: Path) -> None:
+    picture = Image.new("RGB", (WIDTH, HEIGHT))
+    picture.save(tmp_path / "a.png")
+    picture.save(tmp_path / "whole.jpg", quality=30)
+    (tmp_path / "cut.jpg").write_bytes((tmp_path / "whole.jpg").read_bytes()[:25])
+    (tmp_path / "empty.jpg").write_bytes(b"")
+    for name in ("a.png", "cut.jpg", "empty.jpg"):
+        assert jpeg_step(tmp_path / name) == 1

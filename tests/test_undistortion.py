@@ -22,10 +22,12 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.pipeline.stages.match import PhotoFile
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.ownership import undistorted_place
 from colmap_sph.project.state.records import begin
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.undistortion.process import ChildProcess
@@ -113,6 +115,25 @@ def test_any_camera_model_becomes_pinhole(tmp_path: Path, camera_model: str, ext
         features = [point.xy for point in model.image(view.image_id).points2D if point.has_point3D()]
         np.testing.assert_allclose(projected[:, :2] / projected[:, 2:], features, atol=1e-3)
         assert image_problem(workspace.image_path(view.name), view.width, view.height) is None
+
+
+@pytest.mark.parametrize("camera_model", ["PINHOLE", "SIMPLE_RADIAL", "FISHEYE"])
+def test_what_jpeg_has_rounded_is_known_of_every_copy(tmp_path: Path, camera_model: str) -> None:
+    sparse = make_project(tmp_path, camera_model, (0.1,) if camera_model == "SIMPLE_RADIAL" else ())
+    for path in (tmp_path / "images").rglob("*.png"):
+        picture = cv2.imread(str(path))
+        assert picture is not None
+        jpeg = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 50])[1]
+        path.write_bytes(jpeg.tobytes())
+    workspace = prepare(sparse, tmp_path / "dense")
+    for view in read_scene(workspace.sparse_dir).views:
+        file = PhotoFile(
+            view,
+            workspace.image_path(view.name),
+            workspace.mask_path(view.name),
+            undistorted_place(workspace, view.name).record,
+        )
+        assert file.jpeg_step == 16  # of T.81's table for brightness, table K.1
 
 
 def test_a_camera_that_is_none_leaves_the_workspace_that_is_there(tmp_path: Path) -> None:

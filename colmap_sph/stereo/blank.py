@@ -19,8 +19,10 @@ from colmap_sph.stereo.resampling import half_size
 Float = NDArray[np.float32]
 Mask = NDArray[np.uint8]
 
-# Scales, each of half the size of the one before it. At the coarsest a window covers 56 pixels.
-_LEVELS = 4
+# Scales, each of half the size of the one before it: three, and a fourth in images whose shorter side has at least
+# so many pixels. At the coarsest a window covers 28 or 56 pixels.
+_LEVELS = 3
+_FOUR_LEVELS_SIDE = 336
 # Side of the window that is looked at, pixels of any scale.
 _SIDE = 7
 # Images with a shorter side than this hold no window of the coarsest scale that could be trusted.
@@ -40,6 +42,9 @@ _MOST_GREY = 250
 # rounding of JPEG a little less.
 _MARGIN = 1.4
 _FALL = 0.56
+# JPEG rounds the mean of 8 x 8 pixels to multiples of an eighth of its step: so far from the truth may it be, in
+# steps. The slower waves in its blocks are rounded about as coarsely.
+_ROUNDING = 1 / 16
 # A blank region reaches beyond its coarse windows, which take in what is around it: by so many pixels of the next
 # coarser scale, …
 _REACH = 2
@@ -55,13 +60,15 @@ _CONTRAST_REACH = 2
 _BAND_ROWS = 256
 
 
-def blank_pixels(image: NDArray[np.uint8] | Float) -> Mask:
+def blank_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
     """Find the pixels that say nothing.
 
     Parameters
     ----------
     image : (H, W) uint8 or float32 ndarray
         Grey values, 0..255.
+    jpeg_step : int
+        To what multiples JPEG has rounded it, see `rounding_step`; 1 for other images.
 
     Returns
     -------
@@ -83,10 +90,12 @@ def blank_pixels(image: NDArray[np.uint8] | Float) -> Mask:
     if min(image.shape) < _LEAST_SIDE:
         return np.zeros(image.shape, np.uint8)
     scales = [image.astype(np.float32, copy=False)]
-    while len(scales) < _LEVELS:
+    levels = _LEVELS + (min(image.shape) >= _FOUR_LEVELS_SIDE)
+    while len(scales) < levels:
         scales.append(half_size(scales[-1]))
     noise, local = _noise(scales)
-    bounds = [_MARGIN * noise * _FALL ** (level - _NOISE_LEVEL) for level in range(_LEVELS)]
+    rounding = _ROUNDING * jpeg_step
+    bounds = [_MARGIN * max(noise * _FALL ** (level - _NOISE_LEVEL), rounding) for level in range(levels)]
     blank = _quiet(scales[-1], bounds[-1] / noise * local)
     for scale, bound in zip(scales[-2::-1], bounds[-2::-1], strict=True):
         if not blank.any():

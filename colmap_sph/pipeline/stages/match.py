@@ -14,15 +14,17 @@ from numpy.typing import NDArray
 from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
-from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.facts import Facts, UndistortedFacts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
 from colmap_sph.pipeline.stages.photo import Grey, Photo
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result
 from colmap_sph.project.files import make_dir
+from colmap_sph.project.images.decoding import jpeg_step
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
-from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs
+from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs, undistorted_place
+from colmap_sph.project.state.records import recorded_facts
 from colmap_sph.project.workspace import Known
 from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.blank import blank_pixels
@@ -71,11 +73,18 @@ _thread = threading.local()
 
 @dataclass(frozen=True, eq=False)
 class PhotoFile:
-    """A view without its sparse points, its image, and where its mask would be."""
+    """A view without its sparse points, its image, where its mask would be, and what tells how that was made."""
 
     view: View
     image: Path
     mask: Path
+    record: Path
+
+    @property
+    def jpeg_step(self) -> int:
+        """How coarsely the image was rounded, or the original that it was made of; see `blank_pixels`."""
+        made = recorded_facts(self.record, UndistortedFacts)
+        return max(jpeg_step(self.image), made.jpeg_step if made is not None else 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +190,7 @@ def _kept_mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.ui
 def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
     """255 where an image takes part in matching, else 0; None where all of it does."""
     mask = read_view_mask(photo.mask, photo.view)
-    blank = None if keep_blank else blank_pixels(image)
+    blank = None if keep_blank else blank_pixels(image, photo.jpeg_step)
     if blank is None or not blank.any():
         return mask
     counts = np.where(blank, np.uint8(0), np.uint8(255))
@@ -317,7 +326,10 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         if view.name not in self._photos:
             workspace = self.context.workspace
             self._photos[view.name] = PhotoFile(
-                view.without_points(), workspace.image_path(view.name), workspace.mask_path(view.name)
+                view.without_points(),
+                workspace.image_path(view.name),
+                workspace.mask_path(view.name),
+                undistorted_place(workspace, view.name).record,
             )
         return self._photos[view.name]
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.facts import Facts, UndistortedFacts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.project.cameras import plain_camera
 from colmap_sph.project.files import (
@@ -22,6 +22,7 @@ from colmap_sph.project.files import (
     set_aside,
     whole_digest,
 )
+from colmap_sph.project.images.decoding import jpeg_step
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
@@ -109,7 +110,8 @@ def make_undistorted_image(task: UndistortTask) -> Facts:
 
 
 def _publish(task: UndistortTask) -> None:
-    """Move what was made into its place."""
+    """Move what was made into its place, and keep how coarsely the original was rounded: the copy does not say."""
+    facts = UndistortedFacts(jpeg_step=jpeg_step(task.image.source))
     moves = {task.target: task.image.image_path}
     if task.image.has_mask:
         moves[task.mask_target] = task.image.mask_path
@@ -120,7 +122,7 @@ def _publish(task: UndistortTask) -> None:
     for target, made in moves.items():
         make_dir(target.parent)
         made.replace(target)
-    vouch_when_on_disk(task.record, task.key, digests)
+    vouch_when_on_disk(task.record, task.key, digests, facts)
 
 
 def _withdraw_mask(task: UndistortTask) -> None:

@@ -65,6 +65,20 @@ def is_jpeg(path: Path) -> bool:
     return _starts_with(path, jpeg.START)
 
 
+def jpeg_step(path: Path) -> int:
+    """See `jpeg.rounding_step`; 1 for files that are no JPEG images.
+
+    Raises
+    ------
+    OSError
+        It cannot be read.
+    """
+    if not is_jpeg(path):
+        return 1
+    with path.open("rb") as file:
+        return jpeg.rounding_step(file.read(_JPEG_HEADER_BYTES))
+
+
 def read_header(path: Path) -> Header:
     """Read what an image file says of itself; nothing is decoded.
 

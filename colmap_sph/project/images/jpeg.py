@@ -19,6 +19,9 @@ _FILL = 0xFF
 _SCAN = 0xDA
 _JFIF = 0xE0
 _SEQUENTIAL_FRAMES = (0xC0, 0xC1)
+_TABLES = 0xDB
+# Entries of a table, in bytes: of 8 or 16 bits each.
+_TABLE_BYTES = (64, 128)
 # Markers without a length: TEM, and RST0 to RST7.
 _BARE = frozenset((0x01, *range(0xD0, 0xD8)))
 # Bytes alike that the decoder may have taken before the padding it found: what it reads ahead.
@@ -97,6 +100,34 @@ def decode_small(data: bytes, longest: int) -> NDArray[np.uint8]:
         return np.asarray(simplejpeg.decode_jpeg(data, "BGR", fastdct=True, strict=False, min_factor=1, **sides))
     except ValueError as error:
         raise DamagedError(str(error)) from None
+
+
+def rounding_step(data: bytes) -> int:
+    """To what multiples of it the brightness of each block was rounded: an eighth of it in grey values.
+
+    Parameters
+    ----------
+    data : bytes
+        A JPEG file, or more than its header.
+
+    Returns
+    -------
+    int
+        The first entry of its first quantization table (ITU-T T.81, B.2.4.1), which is that of the brightness in
+        all but odd files; 1 where there is none.
+    """
+    try:
+        for marker, start, end in header_segments(data):
+            at = start + 4
+            while marker == _TABLES and at < end:
+                wide, number = divmod(data[at], 16)
+                step = int.from_bytes(data[at + 1 : at + 2 + wide], "big")
+                if number == 0:
+                    return max(step, 1)
+                at += 1 + _TABLE_BYTES[wide]
+    except (IndexError, struct.error):
+        pass  # the header is cut off
+    return 1
 
 
 def header_segments(data: bytes) -> Iterator[tuple[int, int, int]]:
