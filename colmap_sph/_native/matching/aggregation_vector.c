@@ -10,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "aligned_memory.h"
 #include "matching/aggregation_vector.h"
 #include "matching/rows.h"
 #include "version.h"
@@ -83,7 +84,7 @@ int VERSION_OF(sweep_begin)(sweep_state *state, const int32_t *base, const uint8
     *state =
         (sweep_state){.base = base, .image = image, .size = size, .penalties = penalties, .backward = backward};
     state->memory_size = VERTICAL_PATHS * path_bytes(size);
-    state->memory = aligned_alloc(64, state->memory_size + PENALTIES + ROWS * 3 * notes_bytes(size));
+    state->memory = allocate_aligned(64, state->memory_size + PENALTIES + ROWS * 3 * notes_bytes(size));
     if (!state->memory) {
         return -1;
     }

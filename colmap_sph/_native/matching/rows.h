@@ -33,7 +33,7 @@ typedef struct {
     size_t memory_size;
 } sweep_state;
 
-/* 0, or -1 without memory; ended by free(state->memory). */
+/* 0, or -1 without memory; ended by free_aligned(state->memory). */
 typedef int sweep_begin_fn(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
                            path_penalties penalties, int backward);
 /* The next `rows` rows, from y on. A forward sweep writes `detours`; a backward one, whose rows lie before the one
