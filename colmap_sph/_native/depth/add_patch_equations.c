@@ -28,7 +28,17 @@ typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
 #define REACH 32
 /* Variance, in grey values, of noise and rounding: windows of less contrast hardly match. */
 #define NOISE_VARIANCE 4.0f
-#define FALLOFF 0.05555556f /* 1 / (2 * 3^2): taps weigh by a Gaussian of three pixels */
+
+/* Taps weigh by a Gaussian of three pixels, exp(-(dx^2 + dy^2) / 18), here for distances of 1/2, 3/2 and 5/2: C
+ * libraries differ in expf. */
+static const float QUARTER_OF_WEIGHTS[SIDE / 2][SIDE / 2] = {
+    {0x1.f1f936p-1f, 0x1.bd9b34p-1f, 0x1.64d048p-1f},
+    {0x1.bd9b34p-1f, 0x1.8ebefap-1f, 0x1.3f4a74p-1f},
+    {0x1.64d048p-1f, 0x1.3f4a74p-1f, 0x1.ff5612p-2f},
+};
+
+/* How many rings of taps lie between a row or column of a window and its middle. */
+static int ring(int place) { return place < SIDE / 2 ? SIDE / 2 - 1 - place : place - SIDE / 2; }
 
 /* The pixels of a block, as all sources need them: where they are, and their planes; values r and weights w of
  * the taps of their windows, and weighted sums over these. */
@@ -324,8 +334,7 @@ void VERSION_OF(add_patch_equations)(const grey_image *reference, const patch_so
     float near[SIDE][SIDE];
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++) {
-            const float dx = (float)i - 0.5f * (SIDE - 1), dy = (float)j - 0.5f * (SIDE - 1);
-            near[j][i] = expf(-(dx * dx + dy * dy) * FALLOFF);
+            near[j][i] = QUARTER_OF_WEIGHTS[ring(j)][ring(i)];
         }
     }
     for (ptrdiff_t row = 0; row < rows.count; row++) {
