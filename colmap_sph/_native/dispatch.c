@@ -60,6 +60,18 @@ static const kernel_table avx512_kernels = TABLE(avx512);
 
 const char *const kernel_names[] = {"avx512", "avx2", "scalar", NULL};
 
+const char *const missing_kernels[] = {
+#if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX512)
+    "avx512",
+#endif
+#if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX2)
+    "avx2",
+#endif
+#if defined(__aarch64__) && !defined(COLMAP_SPH_HAVE_NEON)
+    "neon",
+#endif
+    NULL};
+
 const kernel_table *kernels_by_name(const char *name) {
     if (strcmp(name, "scalar") == 0) {
         return &scalar_kernels;
