@@ -303,6 +303,8 @@ static void run_add_patch_equations(const kernel_table *k, image_size size) {
     add_floats_to_hash(equations, PATCH_EQUATIONS * PIXELS);
 }
 
+#include "single.h"
+
 /* ---- all of them ------------------------------------------------------------------------------------------- */
 
 typedef struct {
@@ -312,10 +314,24 @@ typedef struct {
 } kernel;
 
 #define KERNEL(name, has_depth) {#name, run_##name, has_depth}
-static const kernel kernels[] = {
-    KERNEL(census, 0),     KERNEL(cost, 1),           KERNEL(aggregation, 1),  KERNEL(selection, 1),
-    KERNEL(match, 1),      KERNEL(fit_offsets, 0),    KERNEL(mean_offsets, 0), KERNEL(depth_candidates, 0),
-    KERNEL(vote_depth, 0), KERNEL(compare_depths, 0), KERNEL(fit_planes, 0),   KERNEL(add_patch_equations, 0)};
+static const kernel kernels[] = {KERNEL(census, 0),
+                                 KERNEL(cost, 1),
+                                 KERNEL(aggregation, 1),
+                                 KERNEL(selection, 1),
+                                 KERNEL(match, 1),
+                                 KERNEL(fit_offsets, 0),
+                                 KERNEL(mean_offsets, 0),
+                                 KERNEL(depth_candidates, 0),
+                                 KERNEL(vote_depth, 0),
+                                 KERNEL(compare_depths, 0),
+                                 KERNEL(fit_planes, 0),
+                                 KERNEL(add_patch_equations, 0),
+                                 KERNEL(transfer_disparity, 0),
+                                 KERNEL(place_windows, 0),
+                                 KERNEL(make_templates, 0),
+                                 KERNEL(planes_and_maps, 0),
+                                 KERNEL(fusion, 0),
+                                 KERNEL(draw_heights, 0)};
 enum { KERNELS = sizeof kernels / sizeof *kernels };
 
 static const image_size sizes[] = {{1, 1, 1, 32},      {1, 31, 40, 64},   {3, 33, 33, 32},  {5, 7, 9, 96},
