@@ -83,8 +83,9 @@ static inline int read_planes(const float *planes, ptrdiff_t stride, ptrdiff_t c
 static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t count, float near[SIDE][SIDE],
                              float scale, block_windows *k) {
     lanes centre;
-    uint8_t taps[2 * LANES] = {0};
-    float row[2 * LANES];
+    enum { TAPS = (SIDE - 1 + LANES + LANES - 1) / LANES * LANES };
+    uint8_t taps[TAPS] = {0};
+    float row[TAPS];
     for (ptrdiff_t l = 0; l < LANES; l++) {
         const uint8_t *c = corner + (l < count ? l : 0);
         centre[l] = 0.25f * (float)(c[0] + c[-1] + c[-width] + c[-width - 1]);
@@ -94,7 +95,7 @@ static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t c
     memset(&k->sum_rr, 0, sizeof k->sum_rr);
     for (int j = 0; j < SIDE; j++) {
         memcpy(taps, corner + (j - SIDE / 2) * width - SIDE / 2, (size_t)(SIDE - 1 + count));
-        for (int l = 0; l < 2 * LANES; l++) {
+        for (int l = 0; l < TAPS; l++) {
             row[l] = (float)taps[l];
         }
         for (int i = 0; i < SIDE; i++) {

@@ -328,7 +328,7 @@ void VERSION_OF(sweep_rows)(sweep_state *s, ptrdiff_t y, ptrdiff_t rows, const u
     }
 #endif
     switch (s->size.depth) {
-#if BYTES == 32
+#if BYTES <= 32
     case 32:
         SWEEP_OF(32);
         break;
