@@ -60,14 +60,32 @@ static inline lanes load(const float *values) {
     return loaded;
 }
 
+/* The same of fewer values, and back. Most often it is a whole block, of which compilers know how long it is. */
+static inline lanes load_some(const float *values, ptrdiff_t count) {
+    lanes loaded = {0};
+    if (count == LANES) {
+        return load(values);
+    }
+    memcpy(&loaded, values, (size_t)count * sizeof *values);
+    return loaded;
+}
+
+static inline void store_some(float *values, lanes stored, ptrdiff_t count) {
+    if (count == LANES) {
+        memcpy(values, &stored, sizeof stored);
+    } else {
+        memcpy(values, &stored, (size_t)count * sizeof *values);
+    }
+}
+
 /* False where no pixel has a plane. */
 static inline int read_planes(const float *planes, ptrdiff_t stride, ptrdiff_t column, ptrdiff_t row,
                               ptrdiff_t count, block_windows *k) {
     int any = 0;
-    memset(k->plane, 0, sizeof k->plane);
     for (int i = 0; i < 3; i++) {
-        for (ptrdiff_t l = 0; l < count; l++) {
-            k->plane[i][l] = planes[i * stride + l];
+        const lanes plane = load_some(planes + i * stride, count);
+        for (int l = 0; l < LANES; l++) {
+            k->plane[i][l] = plane[l];
         }
     }
     k->row = (double)row;
@@ -94,7 +112,12 @@ static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t c
     memset(&k->sum_r, 0, sizeof k->sum_r);
     memset(&k->sum_rr, 0, sizeof k->sum_rr);
     for (int j = 0; j < SIDE; j++) {
-        memcpy(taps, corner + (j - SIDE / 2) * width - SIDE / 2, (size_t)(SIDE - 1 + count));
+        const uint8_t *first = corner + (j - SIDE / 2) * width - SIDE / 2;
+        if (count == LANES) {
+            memcpy(taps, first, SIDE - 1 + LANES);
+        } else {
+            memcpy(taps, first, (size_t)(SIDE - 1 + count));
+        }
         for (int l = 0; l < TAPS; l++) {
             row[l] = (float)taps[l];
         }
@@ -301,9 +324,9 @@ static inline void add_block(const block_windows *windows, const block_sums *sum
  * not matter how many come in one call. */
 static inline void match_sources(const block_windows *windows, const patch_source *sources, ptrdiff_t source_count,
                                  float min_score, ptrdiff_t count, ptrdiff_t stride, float *equations) {
-    lanes e[PATCH_EQUATIONS] = {{0}};
+    lanes e[PATCH_EQUATIONS];
     for (int k = 0; k < PATCH_EQUATIONS; k++) {
-        memcpy(&e[k], equations + k * stride, (size_t)count * sizeof *equations);
+        e[k] = load_some(equations + k * stride, count);
     }
     for (ptrdiff_t i = 0; i < source_count; i++) {
         block_place place;
@@ -314,7 +337,7 @@ static inline void match_sources(const block_windows *windows, const patch_sourc
         }
     }
     for (int k = 0; k < PATCH_EQUATIONS; k++) {
-        memcpy(equations + k * stride, &e[k], (size_t)count * sizeof *equations);
+        store_some(equations + k * stride, e[k], count);
     }
 }
 
