@@ -199,7 +199,7 @@ static inline int_lanes load_words(const uint8_t *values, int_lanes offset) {
 /* A source, and where the taps of a block lie in it: those of a row through the middles of the windows, and how
  * far a row below is from there. */
 typedef struct {
-    const uint8_t *values;
+    const uint8_t *values, *below;
     int32_t width;
     lanes u[SIDE], v[SIDE];
     lanes uy, vy, uw, vw;
@@ -214,6 +214,7 @@ static inline void place_taps(const grey_image *source, const block_place *place
         taps->v[i] = v + vx * dx;
     }
     taps->values = source->values;
+    taps->below = source->values + source->width;
     taps->width = (int32_t)source->width;
     taps->uy = load(place->uy);
     taps->vy = load(place->vy);
@@ -227,7 +228,7 @@ static inline lanes sample(const block_taps *k, lanes u, lanes v, lanes *slope) 
     const int_lanes x = __builtin_convertvector(u, int_lanes), y = __builtin_convertvector(v, int_lanes);
     const lanes fu = u - __builtin_convertvector(x, lanes), fv = v - __builtin_convertvector(y, lanes);
     const int_lanes offset = k->base + y * k->width + x;
-    const int_lanes upper = load_words(k->values, offset), lower = load_words(k->values + k->width, offset);
+    const int_lanes upper = load_words(k->values, offset), lower = load_words(k->below, offset);
     const int_lanes a = upper & 255, c = lower & 255;
     /* Differences of integers are exact as well, and leave the units of floating-point numbers free. */
     const lanes across = __builtin_convertvector((upper >> 8 & 255) - a, lanes),
