@@ -58,7 +58,20 @@ WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
 #endif
 
-const char *const kernel_names[] = {"avx512", "avx2", "scalar", NULL};
+#ifdef COLMAP_SPH_HAVE_NEON
+/* Every aarch64 processor has NEON, which compilers use for the scalar versions, too. */
+#define fit_offsets_neon fit_offsets_scalar
+#define mean_offsets_neon mean_offsets_scalar
+#define depth_candidates_neon depth_candidates_scalar
+#define vote_depth_neon vote_depth_scalar
+#define compare_depths_neon compare_depths_scalar
+#define fit_planes_neon fit_planes_scalar
+#define add_patch_equations_neon add_patch_equations_scalar
+WHOLE_IMAGES(neon)
+static const kernel_table neon_kernels = TABLE(neon);
+#endif
+
+const char *const kernel_names[] = {"avx512", "avx2", "neon", "scalar", NULL};
 
 const char *const missing_kernels[] = {
 #if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX512)
@@ -76,6 +89,11 @@ const kernel_table *kernels_by_name(const char *name) {
     if (strcmp(name, "scalar") == 0) {
         return &scalar_kernels;
     }
+#ifdef COLMAP_SPH_HAVE_NEON
+    if (strcmp(name, "neon") == 0) {
+        return &neon_kernels;
+    }
+#endif
 #ifdef COLMAP_SPH_HAVE_AVX2
     if (strcmp(name, "avx2") == 0 && processor_has_avx2()) {
         return &avx2_kernels;
