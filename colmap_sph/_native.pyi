@@ -11,6 +11,9 @@ _Argument = tuple[str, str, str, _Size]
 def backends() -> list[str]:
     """Names of the kernel versions this processor runs, fastest first."""
 
+def missing() -> list[str]:
+    """Names of the kernel versions that a build for this kind of processor can have and this one has not."""
+
 def signatures() -> list[tuple[str, tuple[_Argument, ...]]]:
     """Of all other functions (name, ((argument, role, type, ((symbol or None, number), ...)), ...)).
 

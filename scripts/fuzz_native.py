@@ -606,7 +606,12 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="seed of the first call (default: 0)")
     parser.add_argument("--calls", type=int, default=10**9, help="number of calls, at most")
     options = parser.parse_args()
-    missing = {name for name in dir(_native) if not name.startswith("_")} - {"backends", "signatures", *FUNCTIONS}
+    missing = {name for name in dir(_native) if not name.startswith("_")} - {
+        "backends",
+        "missing",
+        "signatures",
+        *FUNCTIONS,
+    }
     if missing:
         print(f"{', '.join(sorted(missing))}: no entry in FUNCTIONS of {Path(__file__).name}")
         return 1

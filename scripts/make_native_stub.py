@@ -55,8 +55,9 @@ def function_text(name: str, arguments: tuple[tuple[str, str, str, object], ...]
 
 def stub() -> str:
     """The text of the stub."""
+    missing = "def missing() -> list[str]:\n"
     signatures = "def signatures() -> list[tuple[str, tuple[_Argument, ...]]]:\n"
-    texts = [HEAD + docstring("backends"), signatures + docstring("signatures")]
+    texts = [HEAD + docstring("backends"), missing + docstring("missing"), signatures + docstring("signatures")]
     return "\n".join(texts + [function_text(*signature) for signature in _native.signatures()])
 
 

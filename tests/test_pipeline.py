@@ -36,6 +36,7 @@ from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import SourceImages
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.partners.pairs import PairOptions, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
 from colmap_sph.stereo.vote import VoteOptions
@@ -138,6 +139,7 @@ def test_the_report_is_right(block: DemoBlock, finished: FinishedRun) -> None:
     assert written["points"] == report.points
     assert written["coverage"] == report.coverage
     assert written["options"]["pairs"]["num_pairs"] == 10
+    assert written["kernels"] == backend()
     assert not list(finished.dense.rglob("*.tmp"))
 
 

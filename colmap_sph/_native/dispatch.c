@@ -3,6 +3,7 @@
 #include <string.h>
 
 #include "matching/rows.h"
+#include "processor.h"
 
 /* The kernels on whole images that are made of row kernels. */
 #define WHOLE_IMAGES(version) \
@@ -49,40 +50,57 @@ static const kernel_table scalar_kernels = TABLE(scalar);
 #ifdef COLMAP_SPH_HAVE_AVX2
 WHOLE_IMAGES(avx2)
 static const kernel_table avx2_kernels = TABLE(avx2);
-
-static int has_avx2(void) {
-    __builtin_cpu_init();
-    return __builtin_cpu_supports("avx2") && __builtin_cpu_supports("popcnt");
-}
 #endif
 
 #ifdef COLMAP_SPH_HAVE_AVX512
 #define census_avx512 census_avx2
 WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
-
-static int has_avx512(void) {
-    __builtin_cpu_init();
-    return has_avx2() && __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512bw") &&
-           __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
-           __builtin_cpu_supports("avx512vbmi") && __builtin_cpu_supports("avx512ifma") &&
-           __builtin_cpu_supports("avx512vpopcntdq");
-}
 #endif
 
-const char *const kernel_names[] = {"avx512", "avx2", "scalar", NULL};
+#ifdef COLMAP_SPH_HAVE_NEON
+/* Every aarch64 processor has NEON, which compilers use for the scalar versions, too. */
+#define fit_offsets_neon fit_offsets_scalar
+#define mean_offsets_neon mean_offsets_scalar
+#define depth_candidates_neon depth_candidates_scalar
+#define vote_depth_neon vote_depth_scalar
+#define compare_depths_neon compare_depths_scalar
+#define fit_planes_neon fit_planes_scalar
+#define add_patch_equations_neon add_patch_equations_scalar
+WHOLE_IMAGES(neon)
+static const kernel_table neon_kernels = TABLE(neon);
+#endif
+
+const char *const kernel_names[] = {"avx512", "avx2", "neon", "scalar", NULL};
+
+const char *const missing_kernels[] = {
+#if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX512)
+    "avx512",
+#endif
+#if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX2)
+    "avx2",
+#endif
+#if defined(__aarch64__) && !defined(COLMAP_SPH_HAVE_NEON)
+    "neon",
+#endif
+    NULL};
 
 const kernel_table *kernels_by_name(const char *name) {
     if (strcmp(name, "scalar") == 0) {
         return &scalar_kernels;
     }
+#ifdef COLMAP_SPH_HAVE_NEON
+    if (strcmp(name, "neon") == 0) {
+        return &neon_kernels;
+    }
+#endif
 #ifdef COLMAP_SPH_HAVE_AVX2
-    if (strcmp(name, "avx2") == 0 && has_avx2()) {
+    if (strcmp(name, "avx2") == 0 && processor_has_avx2()) {
         return &avx2_kernels;
     }
 #endif
 #ifdef COLMAP_SPH_HAVE_AVX512
-    if (strcmp(name, "avx512") == 0 && has_avx512()) {
+    if (strcmp(name, "avx512") == 0 && processor_has_avx512()) {
         return &avx512_kernels;
     }
 #endif

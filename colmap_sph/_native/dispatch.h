@@ -24,6 +24,10 @@ typedef struct {
 /* The names of all tables, fastest first; NULL ends them. */
 extern const char *const kernel_names[];
 
+/* The names of tables that a build for this kind of processor can have and this one has not, as its compiler knows
+ * no such instructions or was taken for one of another processor; NULL ends them. */
+extern const char *const missing_kernels[];
+
 /* The table of this name, NULL when the processor or the build has no such version. */
 const kernel_table *kernels_by_name(const char *name);
 

@@ -27,6 +27,16 @@ static PyObject *py_backends(PyObject *self, PyObject *args) {
     return names;
 }
 
+static PyObject *py_missing(PyObject *self, PyObject *args) {
+    (void)self;
+    (void)args;
+    PyObject *names = PyList_New(0);
+    for (const char *const *name = missing_kernels; names && *name; name++) {
+        append(&names, PyUnicode_FromString(*name));
+    }
+    return names;
+}
+
 static PyObject *py_signatures(PyObject *self, PyObject *args) {
     (void)self;
     (void)args;
@@ -53,6 +63,9 @@ static int add_functions(PyObject *module) {
 static PyMethodDef methods[] = {
     {"backends", py_backends, METH_NOARGS,
      "backends($module, /)\n--\n\nNames of the kernel versions this processor runs, fastest first."},
+    {"missing", py_missing, METH_NOARGS,
+     "missing($module, /)\n--\n\n"
+     "Names of the kernel versions that a build for this kind of processor can have and this one has not."},
     {"signatures", py_signatures, METH_NOARGS,
      "signatures($module, /)\n--\n\n"
      "Of all other functions (name, ((argument, role, type, ((symbol or None, number), ...)), ...)).\n\n"

@@ -10,6 +10,8 @@
 /* Pixels side by side. Each has a lane of its own, so that their number cannot change a result. */
 #ifdef __AVX512F__
 enum { LANES = 16 };
+#elif defined(__aarch64__) /* as many as a register has: gcc does not divide larger vectors well */
+enum { LANES = 4 };
 #else
 enum { LANES = 8 };
 #endif

@@ -24,6 +24,7 @@ from colmap_sph.project.files import atomic_file, make_dir, remove
 from colmap_sph.project.project import Project
 from colmap_sph.project.region_file import AUTO
 from colmap_sph.project.state.records import read_json
+from colmap_sph.stereo.kernels import backend
 
 logger = logging.getLogger(__name__)
 
@@ -62,7 +63,12 @@ def write_report(context: Context) -> None:
 
 
 def _content(context: Context) -> dict[str, Any]:
-    return {"versions": versions(), "options": asdict(context.options), **asdict(context.report)}
+    return {
+        "versions": versions(),
+        "kernels": backend(),
+        "options": asdict(context.options),
+        **asdict(context.report),
+    }
 
 
 def keep_or_make_page(context: Context) -> None:

@@ -1,9 +1,12 @@
 """Which version of the compiled kernels is used; all versions give the same results to the bit."""
 
+import logging
 import os
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
+
+logger = logging.getLogger(__name__)
 
 
 def backend() -> str:
@@ -13,3 +16,18 @@ def backend() -> str:
     if wanted and wanted not in available:
         raise OptionError(f"COLMAP_SPH_KERNELS={wanted}: this processor has {', '.join(available)}.")
     return wanted or available[0]
+
+
+def shortcoming() -> str:
+    """What this build's kernels lack, in a sentence; empty where they are whole."""
+    missing: list[str] = _native.missing()
+    if not missing:
+        return ""
+    return (
+        f"This build of colmap_sph has no kernels for {' and '.join(missing)}: results are the same, but may take "
+        "several times longer. Install a wheel, or build it anew with a newer gcc or clang."
+    )
+
+
+if shortcoming():
+    logger.warning("%s", shortcoming())

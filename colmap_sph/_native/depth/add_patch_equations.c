@@ -28,7 +28,17 @@ typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
 #define REACH 32
 /* Variance, in grey values, of noise and rounding: windows of less contrast hardly match. */
 #define NOISE_VARIANCE 4.0f
-#define FALLOFF 0.05555556f /* 1 / (2 * 3^2): taps weigh by a Gaussian of three pixels */
+
+/* Taps weigh by a Gaussian of three pixels, exp(-(dx^2 + dy^2) / 18), here for distances of 1/2, 3/2 and 5/2: C
+ * libraries differ in expf. */
+static const float QUARTER_OF_WEIGHTS[SIDE / 2][SIDE / 2] = {
+    {0x1.f1f936p-1f, 0x1.bd9b34p-1f, 0x1.64d048p-1f},
+    {0x1.bd9b34p-1f, 0x1.8ebefap-1f, 0x1.3f4a74p-1f},
+    {0x1.64d048p-1f, 0x1.3f4a74p-1f, 0x1.ff5612p-2f},
+};
+
+/* How many rings of taps lie between a row or column of a window and its middle. */
+static int ring(int place) { return place < SIDE / 2 ? SIDE / 2 - 1 - place : place - SIDE / 2; }
 
 /* The pixels of a block, as all sources need them: where they are, and their planes; values r and weights w of
  * the taps of their windows, and weighted sums over these. */
@@ -60,14 +70,32 @@ static inline lanes load(const float *values) {
     return loaded;
 }
 
+/* The same of fewer values, and back. Most often it is a whole block, of which compilers know how long it is. */
+static inline lanes load_some(const float *values, ptrdiff_t count) {
+    lanes loaded = {0};
+    if (count == LANES) {
+        return load(values);
+    }
+    memcpy(&loaded, values, (size_t)count * sizeof *values);
+    return loaded;
+}
+
+static inline void store_some(float *values, lanes stored, ptrdiff_t count) {
+    if (count == LANES) {
+        memcpy(values, &stored, sizeof stored);
+    } else {
+        memcpy(values, &stored, (size_t)count * sizeof *values);
+    }
+}
+
 /* False where no pixel has a plane. */
 static inline int read_planes(const float *planes, ptrdiff_t stride, ptrdiff_t column, ptrdiff_t row,
                               ptrdiff_t count, block_windows *k) {
     int any = 0;
-    memset(k->plane, 0, sizeof k->plane);
     for (int i = 0; i < 3; i++) {
-        for (ptrdiff_t l = 0; l < count; l++) {
-            k->plane[i][l] = planes[i * stride + l];
+        const lanes plane = load_some(planes + i * stride, count);
+        for (int l = 0; l < LANES; l++) {
+            k->plane[i][l] = plane[l];
         }
     }
     k->row = (double)row;
@@ -83,8 +111,9 @@ static inline int read_planes(const float *planes, ptrdiff_t stride, ptrdiff_t c
 static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t count, float near[SIDE][SIDE],
                              float scale, block_windows *k) {
     lanes centre;
-    uint8_t taps[2 * LANES] = {0};
-    float row[2 * LANES];
+    enum { TAPS = (SIDE - 1 + LANES + LANES - 1) / LANES * LANES };
+    uint8_t taps[TAPS] = {0};
+    float row[TAPS];
     for (ptrdiff_t l = 0; l < LANES; l++) {
         const uint8_t *c = corner + (l < count ? l : 0);
         centre[l] = 0.25f * (float)(c[0] + c[-1] + c[-width] + c[-width - 1]);
@@ -93,8 +122,13 @@ static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t c
     memset(&k->sum_r, 0, sizeof k->sum_r);
     memset(&k->sum_rr, 0, sizeof k->sum_rr);
     for (int j = 0; j < SIDE; j++) {
-        memcpy(taps, corner + (j - SIDE / 2) * width - SIDE / 2, (size_t)(SIDE - 1 + count));
-        for (int l = 0; l < 2 * LANES; l++) {
+        const uint8_t *first = corner + (j - SIDE / 2) * width - SIDE / 2;
+        if (count == LANES) {
+            memcpy(taps, first, SIDE - 1 + LANES);
+        } else {
+            memcpy(taps, first, (size_t)(SIDE - 1 + count));
+        }
+        for (int l = 0; l < TAPS; l++) {
             row[l] = (float)taps[l];
         }
         for (int i = 0; i < SIDE; i++) {
@@ -175,7 +209,7 @@ static inline int_lanes load_words(const uint8_t *values, int_lanes offset) {
 /* A source, and where the taps of a block lie in it: those of a row through the middles of the windows, and how
  * far a row below is from there. */
 typedef struct {
-    const uint8_t *values;
+    const uint8_t *values, *below;
     int32_t width;
     lanes u[SIDE], v[SIDE];
     lanes uy, vy, uw, vw;
@@ -190,6 +224,7 @@ static inline void place_taps(const grey_image *source, const block_place *place
         taps->v[i] = v + vx * dx;
     }
     taps->values = source->values;
+    taps->below = source->values + source->width;
     taps->width = (int32_t)source->width;
     taps->uy = load(place->uy);
     taps->vy = load(place->vy);
@@ -203,7 +238,7 @@ static inline lanes sample(const block_taps *k, lanes u, lanes v, lanes *slope) 
     const int_lanes x = __builtin_convertvector(u, int_lanes), y = __builtin_convertvector(v, int_lanes);
     const lanes fu = u - __builtin_convertvector(x, lanes), fv = v - __builtin_convertvector(y, lanes);
     const int_lanes offset = k->base + y * k->width + x;
-    const int_lanes upper = load_words(k->values, offset), lower = load_words(k->values + k->width, offset);
+    const int_lanes upper = load_words(k->values, offset), lower = load_words(k->below, offset);
     const int_lanes a = upper & 255, c = lower & 255;
     /* Differences of integers are exact as well, and leave the units of floating-point numbers free. */
     const lanes across = __builtin_convertvector((upper >> 8 & 255) - a, lanes),
@@ -300,9 +335,9 @@ static inline void add_block(const block_windows *windows, const block_sums *sum
  * not matter how many come in one call. */
 static inline void match_sources(const block_windows *windows, const patch_source *sources, ptrdiff_t source_count,
                                  float min_score, ptrdiff_t count, ptrdiff_t stride, float *equations) {
-    lanes e[PATCH_EQUATIONS] = {{0}};
+    lanes e[PATCH_EQUATIONS];
     for (int k = 0; k < PATCH_EQUATIONS; k++) {
-        memcpy(&e[k], equations + k * stride, (size_t)count * sizeof *equations);
+        e[k] = load_some(equations + k * stride, count);
     }
     for (ptrdiff_t i = 0; i < source_count; i++) {
         block_place place;
@@ -313,7 +348,7 @@ static inline void match_sources(const block_windows *windows, const patch_sourc
         }
     }
     for (int k = 0; k < PATCH_EQUATIONS; k++) {
-        memcpy(equations + k * stride, &e[k], (size_t)count * sizeof *equations);
+        store_some(equations + k * stride, e[k], count);
     }
 }
 
@@ -324,8 +359,7 @@ void VERSION_OF(add_patch_equations)(const grey_image *reference, const patch_so
     float near[SIDE][SIDE];
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++) {
-            const float dx = (float)i - 0.5f * (SIDE - 1), dy = (float)j - 0.5f * (SIDE - 1);
-            near[j][i] = expf(-(dx * dx + dy * dy) * FALLOFF);
+            near[j][i] = QUARTER_OF_WEIGHTS[ring(j)][ring(i)];
         }
     }
     for (ptrdiff_t row = 0; row < rows.count; row++) {

@@ -18,6 +18,9 @@ enum { ROUNDS = 3 };
 #define LARGEST 1e18f
 #define LEAST_NOISE 1e-8f
 
+typedef float lanes __attribute__((vector_size(4 * LANES)));
+typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
+
 /* One value per pixel of a block; inverse depths are relative to the centre's: (w - centre) / centre. */
 typedef struct {
     float centre[LANES], scale[LANES]; /* inverse depth and its reciprocal */
@@ -31,47 +34,50 @@ typedef struct {
     float n[6][LANES], b[3][LANES];
 } normal_equations;
 
+static inline lanes load(const float *values) {
+    lanes loaded;
+    memcpy(&loaded, values, sizeof loaded);
+    return loaded;
+}
+
 /* NaN becomes `least`. */
 static inline float clamp(float v, float least, float most) { return v > least ? v < most ? v : most : least; }
 
 /* One round: neighbours weigh by distance from the centre and from the plane so far (Geman-McClure). */
 static inline void accumulate(const float *window, ptrdiff_t stride, int radius, const float *falloff,
                               float widening, const block *k, normal_equations *sums) {
-    float inverse_scale[LANES];
-    for (int l = 0; l < LANES; l++) {
-        inverse_scale[l] = 1 / (k->noise[l] * k->noise[l] * widening * widening);
-    }
-    memset(sums, 0, sizeof *sums);
+    const lanes centre = load(k->centre), scale = load(k->scale), noise = load(k->noise);
+    const lanes value = load(k->value), du = load(k->du), dv = load(k->dv);
+    const lanes inverse_scale = 1 / (noise * noise * widening * widening);
+    lanes n[6] = {{0}}, b[3] = {{0}};
     for (int x = -radius; x <= radius; x++) {
-        float a0[LANES] = {0}, a1[LANES] = {0}, a2[LANES] = {0}, b0[LANES] = {0}, b1[LANES] = {0};
+        lanes a0 = {0}, a1 = {0}, a2 = {0}, b0 = {0}, b1 = {0};
         const float fx = (float)x;
         for (int y = -radius; y <= radius; y++) {
-            const float *tap = window + y * stride + x;
+            const lanes tap = load(window + y * stride + x);
             const float fy = (float)y, near = falloff[abs(x)] * falloff[abs(y)];
-            for (int l = 0; l < LANES; l++) {
-                const float w = (tap[l] - k->centre[l]) * k->scale[l];
-                const float residual = w - (k->value[l] + k->du[l] * fx + k->dv[l] * fy);
-                const float robust = 1 / (1 + residual * residual * inverse_scale[l]);
-                const float weight = tap[l] > 0 ? near * robust * robust : 0;
-                a0[l] += weight;
-                a1[l] += weight * fy;
-                a2[l] += weight * fy * fy;
-                b0[l] += weight * w;
-                b1[l] += weight * w * fy;
-            }
+            const lanes w = (tap - centre) * scale;
+            const lanes residual = w - (value + du * fx + dv * fy);
+            const lanes robust = 1 / (1 + residual * residual * inverse_scale);
+            const lanes weight = (lanes)((int_lanes)(near * robust * robust) & (int_lanes)(tap > 0));
+            a0 += weight;
+            a1 += weight * fy;
+            a2 += weight * fy * fy;
+            b0 += weight * w;
+            b1 += weight * w * fy;
         }
-        for (int l = 0; l < LANES; l++) {
-            sums->n[0][l] += a0[l];
-            sums->n[1][l] += a0[l] * fx;
-            sums->n[2][l] += a1[l];
-            sums->n[3][l] += a0[l] * fx * fx;
-            sums->n[4][l] += a1[l] * fx;
-            sums->n[5][l] += a2[l];
-            sums->b[0][l] += b0[l];
-            sums->b[1][l] += b0[l] * fx;
-            sums->b[2][l] += b1[l];
-        }
+        n[0] += a0;
+        n[1] += a0 * fx;
+        n[2] += a1;
+        n[3] += a0 * fx * fx;
+        n[4] += a1 * fx;
+        n[5] += a2;
+        b[0] += b0;
+        b[1] += b0 * fx;
+        b[2] += b1;
     }
+    memcpy(sums->n, n, sizeof n);
+    memcpy(sums->b, b, sizeof b);
 }
 
 static inline void solve(const normal_equations *sums, block *k) {

@@ -40,7 +40,7 @@ void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_widt
             if (joined) {
                 put_segment(row, right_width, x, d[x], d[x + 1]);
             } else {
-                put(row, right_width, (ptrdiff_t)lrintf((float)x - d[x]), d[x]);
+                put(row, right_width, (ptrdiff_t)llrintf((float)x - d[x]), d[x]);
             }
         }
     }

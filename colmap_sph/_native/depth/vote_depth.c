@@ -1,9 +1,9 @@
 /* The vote of a pixel's candidates. Neighbouring pixels are worked on side by side, each in a lane of its own, so
  * that vector widths cannot change a result. */
 #include <math.h>
-#include <stdlib.h>
 #include <string.h>
 
+#include "aligned_memory.h"
 #include "depth/depth.h"
 #include "version.h"
 
@@ -117,7 +117,7 @@ static inline void mean_of_cluster(const candidates *found, ptrdiff_t number, co
 int VERSION_OF(vote_depth)(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t pairs,
                            ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support) {
     const float tolerance_squared = tolerance * tolerance;
-    candidates *found = aligned_alloc(sizeof(lanes), (size_t)(pairs + 1) * sizeof *found);
+    candidates *found = allocate_aligned(sizeof(lanes), (size_t)(pairs + 1) * sizeof *found);
     if (!found) {
         return -1;
     }
@@ -140,6 +140,6 @@ int VERSION_OF(vote_depth)(const float *depths, const float *sigmas, const int32
             support[first + l] = (uint8_t)best.stations[l];
         }
     }
-    free(found);
+    free_aligned(found);
     return 0;
 }

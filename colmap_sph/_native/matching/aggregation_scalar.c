@@ -15,6 +15,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "aligned_memory.h"
 #include "matching/rows.h"
 
 static uint8_t slot_or_max(const uint8_t *slots, ptrdiff_t depth, ptrdiff_t i) {
@@ -50,7 +51,7 @@ int sweep_begin_scalar(sweep_state *state, const int32_t *base, const uint8_t *i
         (sweep_state){.base = base, .image = image, .size = size, .penalties = penalties, .backward = backward};
     /* This row and the one before, of four paths; and a pixel's detours. */
     state->memory_size = (size_t)((8 * size.width + 1) * size.depth);
-    state->memory = malloc(state->memory_size);
+    state->memory = allocate_aligned(64, state->memory_size);
     return state->memory ? 0 : -1;
 }
 

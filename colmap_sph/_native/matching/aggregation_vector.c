@@ -10,6 +10,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "aligned_memory.h"
 #include "matching/aggregation_vector.h"
 #include "matching/rows.h"
 #include "version.h"
@@ -83,7 +84,7 @@ int VERSION_OF(sweep_begin)(sweep_state *state, const int32_t *base, const uint8
     *state =
         (sweep_state){.base = base, .image = image, .size = size, .penalties = penalties, .backward = backward};
     state->memory_size = VERTICAL_PATHS * path_bytes(size);
-    state->memory = aligned_alloc(64, state->memory_size + PENALTIES + ROWS * 3 * notes_bytes(size));
+    state->memory = allocate_aligned(64, state->memory_size + PENALTIES + ROWS * 3 * notes_bytes(size));
     if (!state->memory) {
         return -1;
     }
@@ -226,10 +227,15 @@ ALWAYS_INLINE void sweep_pixel(const sweep_state *s, moving_row *row, along_row 
     uint8_t *detours = row->detours + x * depth;
     uint8_t *sums = backward ? row->sums + x * depth : NULL;
     vector paths[PATHS][MAX_VECTORS], least[PATHS];
+#if BYTES == 16 /* or clang keeps `paths` in memory */
+#pragma GCC unroll 4
+#endif
     for (ptrdiff_t i = 0; i < vectors; i++) {
         const vector cost = load(pixel_cost + BYTES * i);
-        prefetch(pixel_cost, BYTES * i + direction * AHEAD);
-        prefetch(detours, BYTES * i + direction * AHEAD);
+        if (BYTES >= 32 || i % 4 == 0) { /* no more than twice per line of the cache */
+            prefetch(pixel_cost, BYTES * i + direction * AHEAD);
+            prefetch(detours, BYTES * i + direction * AHEAD);
+        }
         vector detour[PATHS];
         for (int k = 0; k < VERTICAL_PATHS; k++) {
             const uint8_t *slots = before[k] + BYTES * i;
@@ -251,6 +257,9 @@ ALWAYS_INLINE void sweep_pixel(const sweep_state *s, moving_row *row, along_row 
         }
     }
     spread_minima(least);
+#if BYTES == 16
+#pragma GCC unroll 4
+#endif
     for (ptrdiff_t i = 0; i < vectors; i++) {
         for (int k = 0; k < VERTICAL_PATHS; k++) {
             store(row->slots[k] + BYTES * i, subtract(paths[k][i], least[k]));
@@ -328,7 +337,7 @@ void VERSION_OF(sweep_rows)(sweep_state *s, ptrdiff_t y, ptrdiff_t rows, const u
     }
 #endif
     switch (s->size.depth) {
-#if BYTES == 32
+#if BYTES <= 32
     case 32:
         SWEEP_OF(32);
         break;

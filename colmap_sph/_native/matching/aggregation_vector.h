@@ -1,15 +1,50 @@
-/* What aggregation_vector.c does with a register of slots, 32 of them with AVX2 and 64 with AVX-512. */
+/* What aggregation_vector.c does with a register of slots: 32 of them with AVX2, 64 with AVX-512, 16 with NEON. */
 #ifndef COLMAP_SPH_AGGREGATION_VECTOR_H
 #define COLMAP_SPH_AGGREGATION_VECTOR_H
 
+#ifdef __aarch64__
+#include <arm_neon.h>
+#else
 #include <immintrin.h>
+#endif
 
 #include "common.h"
+
+#ifdef __aarch64__
+
+#define BYTES 16
+
+typedef uint8x16_t vector;
+
+ALWAYS_INLINE vector load(const uint8_t *p) { return vld1q_u8(p); }
+ALWAYS_INLINE void store(uint8_t *p, vector v) { vst1q_u8(p, v); }
+ALWAYS_INLINE vector repeat_byte(int byte) { return vdupq_n_u8((uint8_t)byte); }
+ALWAYS_INLINE vector repeat_word(uint32_t word) { return vreinterpretq_u8_u32(vdupq_n_u32(word)); }
+ALWAYS_INLINE vector lesser(vector a, vector b) { return vminq_u8(a, b); }
+ALWAYS_INLINE vector add(vector a, vector b) { return vaddq_u8(a, b); }
+ALWAYS_INLINE vector add_saturated(vector a, vector b) { return vqaddq_u8(a, b); }
+ALWAYS_INLINE vector average(vector a, vector b) { return vrhaddq_u8(a, b); }
+ALWAYS_INLINE vector subtract(vector a, vector b) { return vsubq_u8(a, b); }
+
+/* The last byte of `before` and all but the last of `v`. */
+ALWAYS_INLINE vector one_up(vector before, vector v) { return vextq_u8(before, v, 15); }
+
+/* All but the first byte of `v` and the first of `after`. */
+ALWAYS_INLINE vector one_down(vector v, vector after) { return vextq_u8(v, after, 1); }
+
+/* The least byte of each of four vectors, in all of its bytes. */
+ALWAYS_INLINE void spread_minima(vector v[4]) {
+    for (int k = 0; k < 4; k++) {
+        v[k] = vdupq_n_u8(vminvq_u8(v[k]));
+    }
+}
+
+#else
 
 #define SWAP_WORDS _mm_setr_epi8(2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13)
 #define SWAP_BYTES _mm_setr_epi8(1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14)
 
-#ifndef __AVX512F__
+#ifndef __AVX512F__ /* the same, with AVX2 */
 
 #define BYTES 32
 
@@ -25,17 +60,14 @@ ALWAYS_INLINE vector add_saturated(vector a, vector b) { return _mm256_adds_epu8
 ALWAYS_INLINE vector average(vector a, vector b) { return _mm256_avg_epu8(a, b); }
 ALWAYS_INLINE vector subtract(vector a, vector b) { return _mm256_sub_epi8(a, b); }
 
-/* The last byte of `before` and all but the last of `v`. */
 ALWAYS_INLINE vector one_up(vector before, vector v) {
     return _mm256_alignr_epi8(v, _mm256_permute2x128_si256(before, v, 0x21), 15);
 }
 
-/* All but the first byte of `v` and the first of `after`. */
 ALWAYS_INLINE vector one_down(vector v, vector after) {
     return _mm256_alignr_epi8(_mm256_permute2x128_si256(v, after, 0x21), v, 1);
 }
 
-/* The least byte of each of four vectors, in all of its bytes. */
 ALWAYS_INLINE void spread_minima(vector v[4]) {
     /* Halves of two vectors each, then quarters of all four; these swap what they have found until all have it.
      * Shuffles, since the units for shifts are busy with minima. */
@@ -90,6 +122,8 @@ ALWAYS_INLINE void spread_minima(vector v[4]) {
     v[2] = _mm512_shuffle_i64x2(m, m, 0xaa);
     v[3] = _mm512_shuffle_i64x2(m, m, 0xff);
 }
+
+#endif
 
 #endif
 

@@ -38,7 +38,8 @@ ALWAYS_INLINE void take_apart(const uint64_t *words, ptrdiff_t stride, uint8_t *
     const __m128i eight[4] = {_mm_unpacklo_epi32(four[0], four[2]), _mm_unpackhi_epi32(four[0], four[2]),
                               _mm_unpacklo_epi32(four[1], four[3]), _mm_unpackhi_epi32(four[1], four[3])};
     const __m128i nibble = _mm_set1_epi8(15);
-    const __m128i unseen = _mm_and_si128(_mm_unpackhi_epi64(eight[3], eight[3]), _mm_set1_epi8(LOOKS_UP_ZERO));
+    const __m128i unseen =
+        _mm_and_si128(_mm_unpackhi_epi64(eight[3], eight[3]), _mm_set1_epi8((char)LOOKS_UP_ZERO));
     for (int k = 0; k < 4; k++, plane += 4 * stride) {
         const __m128i low = _mm_or_si128(_mm_and_si128(eight[k], nibble), unseen);
         const __m128i high = _mm_or_si128(_mm_and_si128(_mm_srli_epi16(eight[k], 4), nibble), unseen);

@@ -3,6 +3,8 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "aligned_memory.h"
+
 uint64_t *cost_row_buffer(match_size size) {
     /* Three words per pixel: room for 17 planes of bytes, whose lines are filled up. */
     const size_t padded_width = (size_t)(size.target_width + 2 * size.depth) + 128;
@@ -72,7 +74,7 @@ int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_
             kernels->sweep_rows(&state, y, size.height, cost + row, detours + row,
                                 backward ? aggregated + row : NULL);
         }
-        free(state.memory);
+        free_aligned(state.memory);
     }
     return 0;
 }
@@ -187,7 +189,7 @@ int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band
     free(m.row_sums);
     free(m.cost_buffer);
     free(m.selection.winner);
-    free(m.backward.memory);
-    free(m.forward.memory);
+    free_aligned(m.backward.memory);
+    free_aligned(m.forward.memory);
     return status;
 }

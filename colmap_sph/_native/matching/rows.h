@@ -33,7 +33,7 @@ typedef struct {
     size_t memory_size;
 } sweep_state;
 
-/* 0, or -1 without memory; ended by free(state->memory). */
+/* 0, or -1 without memory; ended by free_aligned(state->memory). */
 typedef int sweep_begin_fn(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
                            path_penalties penalties, int backward);
 /* The next `rows` rows, from y on. A forward sweep writes `detours`; a backward one, whose rows lie before the one
@@ -59,9 +59,10 @@ typedef void selection_row_fn(const uint8_t *sums, const int32_t *base, const ui
                               const uint64_t *target, const int32_t *columns, match_size size,
                               left_right_check check, selection_buffers *buffers, int32_t *offset);
 
-/* The second half of the vectorised selection: what is left of `buffers->winner`, fitted. */
-void check_winners_avx2(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
-                        left_right_check check, const selection_buffers *buffers, int32_t *offset);
+/* The second half of selection: what is left of `buffers->winner`, fitted. */
+typedef void check_winners_fn(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+                              left_right_check check, const selection_buffers *buffers, int32_t *offset);
+check_winners_fn check_winners_scalar, check_winners_avx2;
 
 /* ---- whole images from rows -------------------------------------------------------------------------------- */
 
@@ -72,10 +73,10 @@ typedef struct {
     selection_row_fn *selection_row;
 } row_kernels;
 
-cost_row_fn cost_row_scalar, cost_row_avx2, cost_row_avx512;
-sweep_begin_fn sweep_begin_scalar, sweep_begin_avx2, sweep_begin_avx512;
-sweep_rows_fn sweep_rows_scalar, sweep_rows_avx2, sweep_rows_avx512;
-selection_row_fn selection_row_scalar, selection_row_avx2, selection_row_avx512;
+cost_row_fn cost_row_scalar, cost_row_avx2, cost_row_avx512, cost_row_neon;
+sweep_begin_fn sweep_begin_scalar, sweep_begin_avx2, sweep_begin_avx512, sweep_begin_neon;
+sweep_rows_fn sweep_rows_scalar, sweep_rows_avx2, sweep_rows_avx512, sweep_rows_neon;
+selection_row_fn selection_row_scalar, selection_row_avx2, selection_row_avx512, selection_row_neon;
 
 int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const uint64_t *target,
                  const int32_t *base, match_size size, uint8_t *cost);

@@ -33,22 +33,21 @@ static void match_target_row(const uint8_t *sums, const int32_t *base, const uin
 }
 
 /* Whether one of the best matches of target pixel r lies within `max_difference` columns of x. */
-static int is_mutual(const uint8_t *sums, const int32_t *base, const uint64_t *reference, match_size size,
+static int is_mutual(const uint8_t *sums, const int32_t *base, const int32_t *winner, match_size size,
                      uint8_t best_sum, ptrdiff_t x, ptrdiff_t r, int32_t max_difference) {
     const ptrdiff_t first = x < max_difference ? 0 : x - max_difference;
     for (ptrdiff_t near = first; near < size.width && near - x <= max_difference; near++) {
         const ptrdiff_t i = r - near - base[near];
-        if (!(reference[near] & CENSUS_INVALID) && i >= 0 && i < size.depth &&
-            sums[near * size.depth + i] == best_sum) {
+        if (winner[near] >= 0 && i >= 0 && i < size.depth && sums[near * size.depth + i] == best_sum) {
             return 1;
         }
     }
     return 0;
 }
 
-static ptrdiff_t first_minimum(const uint8_t *sums, ptrdiff_t depth) {
-    ptrdiff_t best = 0;
-    for (ptrdiff_t i = 1; i < depth; i++) {
+static int32_t first_minimum(const uint8_t *sums, ptrdiff_t depth) {
+    int32_t best = 0;
+    for (int32_t i = 1; i < depth; i++) {
         if (sums[i] < sums[best]) {
             best = i;
         }
@@ -56,22 +55,32 @@ static ptrdiff_t first_minimum(const uint8_t *sums, ptrdiff_t depth) {
     return best;
 }
 
-void selection_row_scalar(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
-                          const uint64_t *target, const int32_t *columns, match_size size, left_right_check check,
-                          selection_buffers *buffers, int32_t *offset) {
-    match_target_row(sums, base, reference, size, buffers->best_sum);
-    merge_columns(columns, size, buffers->best_sum, buffers);
+void check_winners_scalar(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
+                          left_right_check check, const selection_buffers *buffers, int32_t *offset) {
+    const uint8_t *best_sum = buffers->best_sum + size.depth;
     for (ptrdiff_t x = 0; x < size.width; x++) {
         const uint8_t *own = sums + x * size.depth;
-        const ptrdiff_t best = first_minimum(own, size.depth), r = x + base[x] + best;
+        const ptrdiff_t best = buffers->winner[x], r = x + base[x] + best;
         /* At the end of the range the true minimum may lie beyond it. */
-        const int found = !(reference[x] & CENSUS_INVALID) && best > 0 && best < size.depth - 1 && r >= 0 &&
-                          r < size.target_width && !(target[r] & CENSUS_INVALID) &&
-                          (own[best] - buffers->best_sum[r] <= check.max_excess ||
-                           is_mutual(sums, base, reference, size, buffers->best_sum[r], x, buffers->rival[r],
+        const int found = best > 0 && best < size.depth - 1 && r >= 0 && r < size.target_width &&
+                          !(target[r] & CENSUS_INVALID) &&
+                          (own[best] - best_sum[r] <= check.max_excess ||
+                           is_mutual(sums, base, buffers->winner, size, best_sum[r], x, buffers->rival[r],
                                      check.max_difference));
         offset[x] =
             found ? (int32_t)(base[x] + best) * 256 + subpixel_offset(own[best - 1], own[best], own[best + 1])
                   : OFFSET_INVALID;
     }
+}
+
+void selection_row_scalar(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
+                          const uint64_t *target, const int32_t *columns, match_size size, left_right_check check,
+                          selection_buffers *buffers, int32_t *offset) {
+    for (ptrdiff_t x = 0; x < size.width; x++) {
+        buffers->winner[x] = reference[x] & CENSUS_INVALID ? -1 : first_minimum(sums + x * size.depth, size.depth);
+    }
+    uint8_t *best_sum = buffers->best_sum + size.depth;
+    match_target_row(sums, base, reference, size, best_sum);
+    merge_columns(columns, size, best_sum, buffers);
+    check_winners_scalar(sums, base, target, size, check, buffers, offset);
 }

@@ -1,6 +1,13 @@
 /* Selection of a row in two passes. The first one over the sums finds each pixel's winner and the target pixels'
- * least sums; the second one checks and fits the winners (check_winners_avx2.c, for AVX-512, too). */
+ * least sums; the second one checks and fits the winners (check_winners_avx2.c, for AVX-512, too; NEON, which has
+ * no loads from many places, shares the scalar one). */
+#ifdef __aarch64__
+#include <arm_neon.h>
+#define check_winners check_winners_scalar
+#else
 #include <immintrin.h>
+#define check_winners check_winners_avx2
+#endif
 
 #include <string.h>
 
@@ -9,7 +16,35 @@
 
 /* The first of a pixel's least sums; and all of them against the least so far of the target pixels they point at.
  * Without branches: where the minimum lies is hard to predict. */
-#ifdef __AVX512F__
+#ifdef __aarch64__
+/* A bit for each of so many bytes, at most 64, where they are the least. */
+ALWAYS_INLINE uint64_t find_least(const uint8_t *sums, uint8x16_t least, const int vectors) {
+    const uint8x16_t flags = vreinterpretq_u8_u64(vdupq_n_u64(0x8040201008040201));
+    uint8x16_t bits[4];
+    for (int k = 0; k < 4; k++) {
+        bits[k] = k < vectors ? vandq_u8(vceqq_u8(vld1q_u8(sums + 16 * k), least), flags) : vdupq_n_u8(0);
+    }
+    const uint8x16_t four = vpaddq_u8(vpaddq_u8(bits[0], bits[1]), vpaddq_u8(bits[2], bits[3]));
+    return vgetq_lane_u64(vreinterpretq_u64_u8(vpaddq_u8(four, four)), 0);
+}
+
+ALWAYS_INLINE int32_t first_minimum(const uint8_t *sums, ptrdiff_t depth, uint8_t *best_sum) {
+    uint8x16_t minimum = vdupq_n_u8(UINT8_MAX);
+    for (ptrdiff_t i = 0; i < depth; i += 16) {
+        const uint8x16_t sum = vld1q_u8(sums + i);
+        vst1q_u8(best_sum + i, vminq_u8(sum, vld1q_u8(best_sum + i)));
+        minimum = vminq_u8(minimum, sum);
+    }
+    const uint8x16_t least = vdupq_n_u8(vminvq_u8(minimum));
+    const int32_t step = depth % 64 ? 32 : 64;
+    int32_t first = 0;
+    for (int32_t i = (int32_t)depth - step; i >= 0; i -= step) {
+        const uint64_t equal = find_least(sums + i, least, step / 16);
+        first = equal ? i + __builtin_ctzll(equal) : first;
+    }
+    return first;
+}
+#elif defined(__AVX512F__)
 ALWAYS_INLINE int32_t first_minimum(const uint8_t *sums, ptrdiff_t depth, uint8_t *best_sum) {
     __m512i minimum = _mm512_set1_epi8(-1);
     for (ptrdiff_t i = 0; i < depth; i += 64) {
@@ -108,5 +143,5 @@ void VERSION_OF(selection_row)(const uint8_t *sums, const int32_t *base, const u
         first_pass(sums, base, reference, size, buffers, size.depth);
     }
     merge_columns(columns, size, buffers->best_sum + size.depth, buffers);
-    check_winners_avx2(sums, base, target, size, check, buffers, offset);
+    check_winners(sums, base, target, size, check, buffers, offset);
 }

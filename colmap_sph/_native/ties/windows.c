@@ -1,6 +1,7 @@
 /* Windows of the two images of a pair, and the least squares between them; see ties.h. */
 #include <math.h>
 
+#include "ties/sines.h"
 #include "ties/ties.h"
 
 enum { LANES = 8 };
@@ -14,7 +15,10 @@ typedef struct {
     float sine, cosine;
 } direction;
 
-static direction direction_of(double angle) { return (direction){(float)sin(angle), (float)cos(angle)}; }
+static direction direction_of(double angle) {
+    const sine_pair sines = sines_of(angle);
+    return (direction){(float)sines.sine, (float)sines.cosine};
+}
 
 ALWAYS_INLINE direction turned(direction d, float angle) {
     const float square = angle * angle;
@@ -65,8 +69,8 @@ void place_windows(const double *places, const double *slopes, rectified_camera 
         for (ptrdiff_t y = 0; y < height; y++) {
             const double j = (double)(y - height / 2);
             const double across = (places[2 * p + 1] + j + camera.row_origin) / camera.row_scale;
-            const double down = camera.spherical ? sin(across) : across;
-            const double ahead = camera.spherical ? cos(across) : 1;
+            const sine_pair sines = sines_of(camera.spherical ? across : 0);
+            const double down = camera.spherical ? sines.sine : across, ahead = sines.cosine;
             const double column = places[2 * p] + slopes[2 * p + 1] * j + camera.column_origin;
             window_row row = {column / camera.column_scale, slopes[2 * p] / camera.column_scale, {0}, {0}};
             for (int k = 0; k < 3; k++) {
