@@ -138,7 +138,7 @@ shares = st.sampled_from([0.0, 0.3, 1.0])
 
 def test_scalar_kernels_are_always_there():
     assert BACKENDS[-1] == "scalar"
-    assert set(BACKENDS) <= {"avx512", "avx2", "scalar"}
+    assert set(BACKENDS) <= {"avx512", "avx2", "neon", "scalar"}
 
 
 # ---- census ------------------------------------------------------------------------------------------------
