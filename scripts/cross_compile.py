@@ -76,8 +76,10 @@ class Build:
 # ---- building ----------------------------------------------------------------------------------------------
 
 
-def run(command: Sequence[str | Path], environment: Mapping[str, str] | None = None) -> str:
-    """What a command prints; raises `CheckError` with its last lines where it fails."""
+def run(
+    command: Sequence[str | Path], environment: Mapping[str, str] | None = None, *, with_errors: bool = False
+) -> str:
+    """What a command prints, also as errors; raises `CheckError` with its last lines where it fails."""
     done = subprocess.run(
         [str(word) for word in command],
         cwd=_REPOSITORY,
@@ -90,7 +92,7 @@ def run(command: Sequence[str | Path], environment: Mapping[str, str] | None = N
     if done.returncode:
         said = "\n".join((done.stdout + done.stderr).splitlines()[-30:])
         raise CheckError(f"{Path(command[0]).name} {command[1]} ended with {done.returncode}:\n{said}")
-    return done.stdout
+    return done.stdout + done.stderr if with_errors else done.stdout
 
 
 def definitions(build: Build) -> dict[str, str]:
@@ -192,7 +194,7 @@ def check_kernels(build: Build) -> str:
 
 
 def run_program(build: Build) -> str:
-    """What the target's program prints: hashes of the results of all kernels."""
+    """What the target's program prints: hashes of the results of all kernels, and the versions that it ran."""
     environment = {}
     before: list[str] = []
     if build.target.emulator == "qemu":
@@ -206,25 +208,34 @@ def run_program(build: Build) -> str:
             "WINEDEBUG": "-all",
             "WINEDLLOVERRIDES": "mscoree,mshtml=",
         }
-    return run([*before, build.program], environment)
+    return run([*before, build.program], environment, with_errors=True)
 
 
-def compare(hashes: str, others: dict[str, str], name: str) -> str:
-    """How many results are those of the targets before; raises `CheckError` where one is not."""
-    lines = hashes.splitlines()
+def compare(said: str, others: dict[str, list[str]], target: Target) -> str:
+    """How many results are those of the targets before; raises `CheckError` where one is not.
+
+    It does, too, where the program took its processor for a lesser one.
+    """
+    versions = re.findall(r"^kernels: (\w+)", said, re.MULTILINE)
+    has_avx2 = " avx2 " in Path("/proc/cpuinfo").read_text()
+    needed = "neon" if "neon" in target.kernels else "avx2" if has_avx2 else "scalar"
+    if needed not in versions:
+        raise CheckError(f"the program ran {', '.join(versions)} alone, where the processor has {needed}")
+    results = [line for line in said.splitlines() if not line.startswith("kernels: ")]
     known = ", ".join(others)
     for other, expected in others.items():
-        different = [line for line in lines if line not in expected.splitlines()]
-        if different or len(lines) != len(expected.splitlines()):
+        if results != expected:
+            different = [line for line in results if line not in expected]
             raise CheckError(f"results differ from those on {other}: {'; '.join(different[:5])}")
-    others[name] = hashes
-    return f"{len(lines)} results of kernels" + (f", the same as on {known}" if known else "")
+    others[target.name] = results
+    same = f", the same as on {known}" if known else ""
+    return f"{len(results)} results of kernels, the same by {', '.join(versions)}{same}"
 
 
 # ---- all of it ---------------------------------------------------------------------------------------------
 
 
-def check_target(build: Build, hashes: dict[str, str]) -> tuple[list[str], list[str]]:
+def check_target(build: Build, hashes: dict[str, list[str]]) -> tuple[list[str], list[str]]:
     """Build and check a target: sentences of what is right, and what was not checked for want of programs."""
     right, missing = [], []
     build.folder.mkdir(parents=True, exist_ok=True)
@@ -237,7 +248,7 @@ def check_target(build: Build, hashes: dict[str, str]) -> tuple[list[str], list[
         lambda: check_kernels(build),
     ]
     if build.target.emulator:
-        checks.append(lambda: compare(run_program(build), hashes, build.target.name))
+        checks.append(lambda: compare(run_program(build), hashes, build.target))
     for check in checks:
         try:
             right.append(check())
@@ -254,7 +265,7 @@ def main() -> int:
     parser.add_argument("--target", nargs="+", choices=names, default=names, help="default: all")
     arguments = parser.parse_args()
     failed = unchecked = False
-    hashes: dict[str, str] = {}
+    hashes: dict[str, list[str]] = {}
     for target in (target for target in TARGETS if target.name in arguments.target):
         print(f"{target.name}:", flush=True)
         try:

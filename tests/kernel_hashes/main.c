@@ -33,7 +33,7 @@ static uint64_t random_word(void) {
 
 /* From `least` to `most`. */
 static int32_t between(int32_t least, int32_t most) {
-    return least + (int32_t)(random_word() % ((uint64_t)((int64_t)most - least) + 1));
+    return (int32_t)(least + (int64_t)(random_word() % ((uint64_t)((int64_t)most - least) + 1)));
 }
 
 /* Once in so many times; never of a calm input. */
