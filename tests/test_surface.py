@@ -4,6 +4,7 @@ import json
 import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import oracle
 import pytest
@@ -336,11 +337,28 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
     assert (tmp_path / "dsm.tif").read_text() == "earlier"
 
 
+def test_small_pictures_show_the_surface(products, workspace, tmp_path):
+    arrays, _, _ = products
+    made(workspace, tmp_path)
+    height, width = arrays["dsm"].shape[1:]
+    surface, orthophoto = (cv2.imread(str(tmp_path / f"preview_{name}.png")) for name in ("surface", "orthophoto"))
+    assert surface.shape == orthophoto.shape == (height, width, 3)
+    known = arrays["dsm"][0] > -9999
+    assert (surface[~known] == 255).all()
+    roof = surface[known & (arrays["dsm"][0] > ROOF / 2)].mean(axis=0)
+    ground = surface[known & (arrays["dsm"][0] < ROOF / 2)].mean(axis=0)
+    assert roof[2] > ground[2] + 50  # yellow above dark blue
+    coloured = arrays["orthophoto"][3] > 0
+    np.testing.assert_array_equal(orthophoto[coloured], np.moveaxis(arrays["orthophoto"][2::-1], 0, 2)[coloured])
+    assert (orthophoto[~coloured] == 255).all()
+
+
 def test_the_command_says_what_it_made(workspace, tmp_path, capsys):
     arguments = ["surface", str(workspace.root), "--output", str(tmp_path), "--cell", "0.5", "--no-orthophoto"]
     assert cli.main(arguments) == 0
     printed = capsys.readouterr()
-    assert [Path(line).name for line in printed.out.splitlines()] == ["dsm.tif", "hillshade.tif", "surface.json"]
+    names = ["dsm.tif", "hillshade.tif", "preview_surface.png", "surface.json"]
+    assert [Path(line).name for line in printed.out.splitlines()] == names
     assert "cells of 0.5" in printed.err
     assert json.loads((tmp_path / "surface.json").read_text())["cell"] == 0.5
     assert cli.main(["surface", str(tmp_path / "nowhere")]) == 2
