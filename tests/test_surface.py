@@ -106,6 +106,12 @@ def test_the_highest_surface_is_that_of_a_search_cell_by_cell():
             assert found.deviation[row, column] == pytest.approx(np.std(first, ddof=1), abs=1e-5)
 
 
+def test_no_view_sees_no_surface():
+    surface = highest_surface(np.empty((0, 4, 5), np.float32), 0.15, 3)
+    assert np.isnan(surface.height).all()
+    assert not surface.count.any()
+
+
 def test_the_surface_is_that_of_the_solids(products):
     arrays, transform, summary = products
     height, deviation, count = arrays["dsm"]
