@@ -17,11 +17,12 @@ from colmap_sph import synthetic as syn
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.surface.heights import highest_surface, hillshade
+from colmap_sph.stereo.surface.heights import Surface, highest_surface, hillshade
 
 rasterio = pytest.importorskip("rasterio")
 
@@ -267,17 +268,43 @@ def test_a_facade_is_seen_from_outside(workspace, tmp_path):
         made(workspace, tmp_path, plane=("-4,-3,90", "4,-3,90", "-4,-3,94"))
 
 
-def test_holes_stay_or_are_filled_from_their_rims(tmp_path):
-    holed = surveyed_workspace(tmp_path / "dense")
-    # No image has a depth on some of the ground.
+def with_hole(root: Path, x: float, *, below: float) -> Workspace:
+    """No image has a depth within 1.5 of (x, 0), as far as it is below a height."""
+    holed = surveyed_workspace(root)
     for path in sorted((holed.stereo_dir / "depth_maps").iterdir()):
         camera = surveyed.cameras()[int(path.name[:2])]
         depth = read_depth_map(path)
         rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]]
         rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.K).T
         points = (rays * depth[..., None] - camera.t) @ camera.R
-        depth[np.hypot(points[..., 0] - 7, points[..., 1]) < 1.5] = 0
+        depth[(np.hypot(points[..., 0] - x, points[..., 1]) < 1.5) & (points[..., 2] < below)] = 0
         write_depth_map(path, depth)
+    return holed
+
+
+def test_a_hole_beside_a_building_is_ground(tmp_path):
+    holed = with_hole(tmp_path / "dense", BOX[1, 0] + 1, below=ROOF - 0.1)
+    arrays, transform, _ = made(holed, tmp_path / "filled", fill=15)
+    height, _, count = arrays["dsm"]
+    is_filled = (
+        (count == 0)
+        & (height > -9999)
+        & (np.hypot(*(places(arrays, transform)[k] - (5, 0)[k] for k in (0, 1))) < 2)
+    )
+    assert is_filled.sum() > 100
+    assert (height[is_filled] < 0.05 * ROOF).mean() > 0.97
+
+
+def test_a_hole_in_a_roof_is_roof():
+    height = np.zeros((30, 30), np.float32)
+    height[5:25, 5:25] = 9
+    height[12:16, 12:16] = np.nan
+    holed = Surface(height, np.zeros_like(height), np.full(height.shape, 3, np.uint16))
+    assert (filled(holed, 10, 1.0, 0.1).height[12:16, 12:16] == 9).all()
+
+
+def test_holes_stay_or_are_filled_from_their_rims(tmp_path):
+    holed = with_hole(tmp_path / "dense", 7.0, below=1.0)
     open_arrays, transform, _ = made(holed, tmp_path / "open")
     x, y = places(open_arrays, transform)
     hole = np.hypot(x - 7, y) < 1.2

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
+from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.products.surface.placing import Placement
 from colmap_sph.products.surface.seen import Box, Part, SeenView, read_part, read_picture
@@ -21,7 +21,6 @@ from colmap_sph.stereo.surface.visibility import sight_of
 
 # Heights of one surface, as views see it, differ by no more than this many pixels on it.
 _TOLERANCE = 3.0
-_UNFILLED = np.float32(-1e30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +90,7 @@ class Drawing:
             tile.row - margin, tile.column - margin, tile.height + 2 * margin, tile.width + 2 * margin
         )
         views = list(self.sightings.in_tile(tile, margin))
-        surface = filled(self._surface(window, views), self.options.fill)
+        surface = filled(self._surface(window, views), self.options.fill, window.cell, self._tolerance)
         shade = hillshade(surface.height, self.placement.raster.cell)
         mosaic = self._mosaic(window, views, surface)
         inner = (slice(margin, margin + tile.height), slice(margin, margin + tile.width))
@@ -150,15 +149,3 @@ def _heights(part: Part, window: Raster) -> NDArray[np.float64]:
     column = np.arange(part.view.width)
     row = np.arange(part.view.height)[:, None]
     return np.asarray((along[0] * column + along[1] * row + along[2]) * part.depth + shift[2])
-
-
-def filled(surface: Surface, reach: int) -> Surface:
-    """Fill holes from their rims, inversely to the distance, up to `reach` cells from a measured one."""
-    is_known = np.isfinite(surface.height)
-    if not reach or is_known.all() or not is_known.any():
-        return surface
-    from rasterio.fill import fillnodata  # of the extra
-
-    height = fillnodata(np.where(is_known, surface.height, _UNFILLED), mask=is_known, max_search_distance=reach)
-    is_filled = (distance_transform_edt(~is_known) <= reach) & (height > _UNFILLED)
-    return Surface(np.where(is_filled, height, np.float32(np.nan)), surface.deviation, surface.count)
