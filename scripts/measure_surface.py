@@ -10,6 +10,7 @@ also compared with a picture that the demo's renderer takes of the same village 
 
 import argparse
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -100,7 +101,8 @@ def seen_from_above(cells: Cells) -> Array:
     focal = _STRAIGHT_ABOVE / cells.cell
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     camera = Camera(K, R, t, width, height)
-    return exact_picture(surfaces, camera, light=light).astype(np.float64)
+    rays = math.ceil(2 * cells.cell / options.nadir_gsd)
+    return exact_picture(surfaces, camera, supersample=rays, light=light).astype(np.float64)
 
 
 def report_colours(cells: Cells, colours: Array, has_colour: NDArray[np.bool_]) -> None:

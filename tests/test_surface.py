@@ -22,6 +22,7 @@ from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.surface.coarser import coarser_colours, coarser_surface
 from colmap_sph.stereo.surface.heights import Surface, highest_surface, hillshade
 
 rasterio = pytest.importorskip("rasterio")
@@ -150,6 +151,59 @@ def test_the_shade_is_that_of_a_sun_in_the_north_west():
     # The slope's normal is (-1, 1, 1) / √3 in x, y (north) and z, the sun's direction (-1, 1, √2) / 2.
     assert towards[10, 10] == pytest.approx(1 + 254 * (2 + np.sqrt(2)) / (2 * np.sqrt(3)), abs=1)
     assert away[10, 10] == 1
+
+
+def test_coarse_cells_take_the_middle_height_and_the_mean_colour(tmp_path):
+    """Of noisy maps and of speckled pictures, as large as nine fine cells."""
+    noisy = surveyed_workspace(tmp_path / "dense", noise=0.2)
+    rng = np.random.default_rng(1)
+    for path in sorted(noisy.images_dir.iterdir()):
+        picture = cv2.imread(str(path))
+        speckles = rng.integers(-30, 31, picture.shape[:2])[..., None]
+        cv2.imwrite(str(path), np.clip(picture + speckles, 0, 255).astype(np.uint8))
+    spread = {}
+    for factor in (1, 3):
+        arrays, transform, summary = made(noisy, tmp_path / "out", cell=factor * GSD, balance=False)
+        height, deviation, count = arrays["dsm"]
+        assert summary.cell == factor * GSD
+        level = (signed_distance(*places(arrays, transform)) > 2 * GSD) & (count >= 9)
+        assert np.abs(np.median(height[level])) < 0.2 * GSD
+        assert 0.1 * GSD < np.median(deviation[level]) < 0.25 * GSD
+        assert (arrays["orthophoto_images"][0][level] > 0).all()
+        spread[factor] = (height[level].std(), arrays["orthophoto"][1][level].std())
+    assert spread[3][0] < 0.7 * spread[1][0]
+    assert spread[3][1] < 0.5 * spread[1][1]
+
+
+def test_a_coarse_cell_at_an_edge_is_of_one_surface():
+    rng = np.random.default_rng(2)
+    height = rng.choice([0.0, 9.0, np.nan], (12, 20)).astype(np.float32)
+    deviation, count = (
+        rng.random(height.shape).astype(np.float32),
+        rng.integers(1, 9, height.shape).astype(np.uint16),
+    )
+    colours = rng.integers(0, 256, (*height.shape, 3)).astype(np.uint8)
+    source = rng.integers(0, 4, height.shape).astype(np.uint16)
+    coarse, chosen = coarser_surface(Surface(height, deviation, count), 4)
+    mean, numbers = coarser_colours(colours, source, 4, chosen)
+    for row, column in np.ndindex(3, 5):
+        part = np.s_[4 * row : 4 * row + 4, 4 * column : 4 * column + 4]
+        known = np.sort(height[part][np.isfinite(height[part])])
+        if len(known) < 8:
+            assert np.isnan(coarse.height[row, column])
+            assert coarse.count[row, column] == 0
+        else:
+            assert coarse.height[row, column] == known[(len(known) - 1) // 2]
+            taken = (deviation[part] == coarse.deviation[row, column]) & (
+                height[part] == coarse.height[row, column]
+            )
+            assert count[part][taken].tolist() == [coarse.count[row, column]]
+        shown = source[part] > 0
+        if shown.sum() < 8:
+            assert numbers[row, column] == 0
+        else:
+            np.testing.assert_allclose(mean[row, column], colours[part][shown].mean(axis=0), atol=0.501)
+            assert numbers[row, column] in source[part][shown]
 
 
 # ---- the orthophoto ----------------------------------------------------------------------------------------

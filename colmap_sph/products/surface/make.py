@@ -151,7 +151,8 @@ def _prepared(
 ) -> tuple[Drawing, list[Tile]]:
     options = request.options
     sightings = Sightings(seen, placement.raster)
-    side, spare = choose_side(placement.raster, sightings, seen, margin_of(options), request.memory)
+    margin = margin_of(options, placement.factor)
+    side, spare = choose_side(placement.raster, sightings, seen, margin, placement.factor, request.memory)
     pictures = None
     if options.orthophoto:
         indices = [each.index for each in seen]
