@@ -2,6 +2,7 @@
 
 import json
 import sys
+import tracemalloc
 from pathlib import Path
 
 import cv2
@@ -28,6 +29,8 @@ from colmap_sph.stereo.surface.heights import Surface, highest_surface, hillshad
 rasterio = pytest.importorskip("rasterio")
 
 PLENTY = 4 << 30
+# What the libraries themselves take.
+PROGRAM = 350_000_000
 
 
 def made(
@@ -267,6 +270,20 @@ def test_tiles_do_not_show(workspace, products, tmp_path):
     assert (np.abs(whole["hillshade"] - tiles["hillshade"].astype(int)) <= 1).mean() > 0.9999
     assert (whole["orthophoto_images"] == tiles["orthophoto_images"]).mean() > 0.999
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("factor", [1, 3])
+def test_tiles_are_planned_by_what_they_take(workspace, tmp_path, factor):
+    """Arrays in use at any time, and the program itself, are within the memory that is given."""
+    with pytest.raises(OptionError, match=r"would do") as refused:
+        made(workspace, tmp_path, memory=1 << 20, cell=factor * GSD)
+    least = int(str(refused.value).split("MiB would do")[0].split()[-1]) << 20
+    tracemalloc.start()
+    try:
+        made(workspace, tmp_path, memory=least, cell=factor * GSD)
+        assert tracemalloc.get_traced_memory()[1] < least - PROGRAM
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_model_on_its_side_is_seen_from_above(tmp_path, products):

@@ -1,7 +1,7 @@
 """A surface and its colours in fine cells → in coarser ones, of several fine ones each.
 
-A coarse cell that took what lies at its very middle would show the grain of a meadow as noise. So it takes the middle
-one of the heights in it, which is of one surface also at an edge, and the mean of the colours.
+A coarse cell that took what lies at its very middle would show the grain of a meadow as noise. So it takes the
+middle one of the heights in it, which is of one surface also at an edge, and the mean of the colours.
 """
 
 from typing import TypeVar
