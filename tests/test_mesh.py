@@ -119,7 +119,9 @@ def test_a_small_picture_shows_a_mesh_from_the_south_and_above(tmp_path):
     axes *= np.linalg.det(axes)
     mesh = Triangles((points @ axes).astype(np.float32), colours, np.zeros((1, 3), np.int32))
     write_preview(tmp_path / "small.png", mesh, axes)
-    picture = cv2.imread(str(tmp_path / "small.png"))[..., ::-1]
+    found = cv2.imread(str(tmp_path / "small.png"))
+    assert found is not None
+    picture = found[..., ::-1]
     height, width = picture.shape[:2]
     assert height < width <= 101
     assert (picture[2 : height // 4, 5:40] == (255, 0, 0)).all()

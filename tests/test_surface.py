@@ -55,6 +55,13 @@ def made(
     return arrays, transform, summary
 
 
+def read_picture(path: Path) -> np.ndarray:
+    """(h, w, 3) blue, green and red."""
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return np.asarray(picture)
+
+
 def places(arrays, transform):
     """x and y (h, w) of the cells' centres."""
     rows, columns = np.mgrid[: arrays["dsm"].shape[1], : arrays["dsm"].shape[2]] + 0.5
@@ -161,7 +168,7 @@ def test_coarse_cells_take_the_middle_height_and_the_mean_colour(tmp_path):
     noisy = surveyed_workspace(tmp_path / "dense", noise=0.2)
     rng = np.random.default_rng(1)
     for path in sorted(noisy.images_dir.iterdir()):
-        picture = cv2.imread(str(path))
+        picture = read_picture(path)
         speckles = rng.integers(-30, 31, picture.shape[:2])[..., None]
         cv2.imwrite(str(path), np.clip(picture + speckles, 0, 255).astype(np.uint8))
     spread = {}
@@ -445,7 +452,7 @@ def test_small_pictures_show_the_surface(products, workspace, tmp_path):
     arrays, _, _ = products
     made(workspace, tmp_path)
     height, width = arrays["dsm"].shape[1:]
-    surface, orthophoto = (cv2.imread(str(tmp_path / f"preview_{name}.png")) for name in ("surface", "orthophoto"))
+    surface, orthophoto = (read_picture(tmp_path / f"preview_{name}.png") for name in ("surface", "orthophoto"))
     assert surface.shape == orthophoto.shape == (height, width, 3)
     known = arrays["dsm"][0] > -9999
     assert (surface[~known] == 255).all()
