@@ -18,6 +18,7 @@ from colmap_sph import synthetic as syn
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.surface.drawing import margin_of
 from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
@@ -379,6 +380,22 @@ def test_a_hole_in_a_roof_is_roof():
     height[12:16, 12:16] = np.nan
     holed = Surface(height, np.zeros_like(height), np.full(height.shape, 3, np.uint16))
     assert (filled(holed, 10, 1.0, 0.1).height[12:16, 12:16] == 9).all()
+
+
+def test_a_tiles_margin_is_enough_to_fill_its_holes():
+    rng = np.random.default_rng(4)
+    height = np.zeros((150, 160), np.float32)
+    for value in [*rng.choice([0.5, 4.0, 9.0], 60), *[np.nan] * 60]:
+        row, column, size = rng.integers(0, 150), rng.integers(0, 160), rng.integers(3, 14)
+        height[row : row + size, column : column + size] = value
+    whole = Surface(height, np.zeros_like(height), np.where(np.isfinite(height), 3, 0).astype(np.uint16))
+    margin = margin_of(SurfaceOptions(fill=5, orthophoto=False), 1)
+    part = np.s_[40 - margin : 100 + margin, 50 - margin : 110 + margin]
+    tile = Surface(whole.height[part], whole.deviation[part], whole.count[part])
+    expected = filled(whole, 5, 0.2, 0.1).height[40:100, 50:110]
+    assert (np.isnan(height[40:100, 50:110]) & np.isfinite(expected)).sum() > 200
+    inner = filled(tile, 5, 0.2, 0.1).height[margin:-margin, margin:-margin]
+    np.testing.assert_array_equal(inner, expected)
 
 
 def test_holes_stay_or_are_filled_from_their_rims(tmp_path):

@@ -145,13 +145,16 @@ class Drawing:
 
 def margin_of(options: SurfaceOptions, factor: int) -> int:
     """Cells around a tile that its own depend on, where each has `factor` × `factor` fine ones."""
-    return max(-(-4 * SEAM_RADIUS // factor) if options.orthophoto else 1, options.fill + 1)
+    # What is filled depends on rims, and which of these count on others, as far away again.
+    return max(-(-4 * SEAM_RADIUS // factor) if options.orthophoto else 1, 2 * options.fill + 2)
 
 
 def _with_filled(fine: Surface, surface: Surface, factor: int) -> Surface:
     """The fine surface, with what was filled in of the coarse one."""
     is_filled = np.isfinite(surface.height) & (surface.count == 0)
-    added = np.kron(np.where(is_filled, surface.height, np.float32(np.nan)), np.ones((factor, factor), np.float32))
+    if not is_filled.any():
+        return fine
+    added = np.where(is_filled, surface.height, np.float32(np.nan)).repeat(factor, axis=0).repeat(factor, axis=1)
     return Surface(np.where(np.isfinite(fine.height), fine.height, added), fine.deviation, fine.count)
 
 

@@ -22,7 +22,7 @@ def filled(surface: Surface, reach: int, cell: float, tolerance: float) -> Surfa
     ----------
     surface : Surface
     reach : int
-        Cells are filled up to so many from a measured one; 0: none.
+        Cells are filled up to so many from a rim that counts; 0: none.
     cell : float
         Side of a cell, in units of the heights.
     tolerance : float
