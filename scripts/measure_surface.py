@@ -1,14 +1,16 @@
 """Measure a surface model and an orthophoto against exact depth maps, and against LiDAR.
 
-    python scripts/measure_surface.py SURFACE MODEL DEPTH [--depth-scale 0.005] [--lidar CLOUD]
+    python scripts/measure_surface.py SURFACE MODEL DEPTH [--depth-scale 0.005] [--lidar CLOUD] [--demo]
 
 SURFACE is what `colmap_sph surface` has made in the model's own frame, MODEL its sparse model, DEPTH a folder with
 exact depth at pixel centres. The truth of a cell is the highest exact point in its middle half each way, from all
-images together: it has nothing from our own maps.
+images together: it has nothing from our own maps. With --demo, for the block of `colmap_sph demo`, colours are
+also compared with a picture that the demo's renderer takes of the same village from straight above.
 """
 
 import argparse
 import json
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +23,15 @@ from colmap_sph.evaluation.depth_files import read_exact_depth
 from colmap_sph.evaluation.geometry_io import PointCloud
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import View
+from colmap_sph.synthetic import BlockOptions, Camera, demo_cameras, look_at
+from colmap_sph.synthetic.block import ground_corners
+from colmap_sph.synthetic.light import Light, ShadowMap
+from colmap_sph.synthetic.render import exact_picture
+from colmap_sph.synthetic.village import build_village
+
+# From where the demo's village is looked at, metres: rays are parallel to the millimetre.
+_STRAIGHT_ABOVE = 1e6
+_RELIEF = 22.0
 
 Array = NDArray[np.float64]
 
@@ -77,6 +88,33 @@ def report_heights(name: str, off: Array, cell: float) -> None:
           f"mean absolute {mean:.4f}")  # fmt: skip
 
 
+def seen_from_above(cells: Cells) -> Array:
+    """(h, w, 3) exact colours of the demo's village at each cell."""
+    options = BlockOptions()
+    surfaces = build_village(options.nadir_gsd, options.buildings, options.trees, options.seed).surfaces
+    sun = Light().sun
+    corners = ground_corners(demo_cameras(options), _RELIEF)
+    light = Light(sun, shadows=ShadowMap.cast(surfaces, sun, corners, options.nadir_gsd))
+    height, width = cells.shape
+    x, y = cells.left + width * cells.cell / 2, cells.top - height * cells.cell / 2
+    R, t = look_at((x, y, _STRAIGHT_ABOVE), (x, y, 0), up=(0, 1, 0))
+    focal = _STRAIGHT_ABOVE / cells.cell
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    camera = Camera(K, R, t, width, height)
+    rays = math.ceil(2 * cells.cell / options.nadir_gsd)
+    return exact_picture(surfaces, camera, supersample=rays, light=light).astype(np.float64)
+
+
+def report_colours(cells: Cells, colours: Array, has_colour: NDArray[np.bool_]) -> None:
+    """Print how far an orthophoto's (h, w, 3) colours are off those of the demo's village."""
+    exact = seen_from_above(cells)
+    off = np.abs(colours - exact).mean(axis=2)[has_colour]
+    # What one cell's shift does to the exact picture itself, for comparison.
+    shifted = np.abs(exact[:, 1:] - exact[:, :-1]).mean(axis=2)[has_colour[:, 1:]]
+    print(f"colours: off by {np.median(off):.1f} of 255 (median), within 20 {(off <= 20).mean():.4f}; "
+          f"a shift by one cell {np.median(shifted):.1f}, {(shifted <= 20).mean():.4f}")  # fmt: skip
+
+
 def main() -> None:
     """Read, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -85,6 +123,7 @@ def main() -> None:
     parser.add_argument("depth", type=Path)
     parser.add_argument("--depth-scale", type=float)
     parser.add_argument("--lidar", type=Path)
+    parser.add_argument("--demo", action="store_true")
     given = parser.parse_args()
     with rasterio.open(given.surface / "dsm.tif") as file:
         height, _, _ = file.read().astype(np.float64)
@@ -125,6 +164,10 @@ def main() -> None:
         f"orthophoto: {coloured.sum():,} cells, from an image that sees their surface {right[coloured].mean():.4f}"
     )
     print(f"of cells seen by three images {by_three.sum() / (known & (seeing >= 3)).sum():.4f} have a height")
+    if given.demo:
+        with rasterio.open(given.surface / "orthophoto.tif") as file:
+            *colours, alpha = file.read()
+        report_colours(cells, np.dstack(colours).astype(np.float64), alpha > 0)
     if given.lidar is not None:
         cloud = read_geometry(given.lidar)
         points = cloud.points if isinstance(cloud, PointCloud) else cloud.vertices

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -21,6 +22,7 @@ from colmap_sph.products.mesh import tsdf
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.options import MeshOptions
+from colmap_sph.products.mesh.preview import write_preview
 from colmap_sph.products.mesh.triangles import Triangles, read_ply, write_ply
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
@@ -104,6 +106,29 @@ def test_a_glb_file_is_read_upright_by_others(tmp_path):
     view = document["bufferViews"][accessor["bufferView"]]
     colours = np.frombuffer(data, np.uint8, view["byteLength"], 28 + length + view["byteOffset"]).reshape(-1, 4)
     assert np.array_equal(colours[:, :3], mesh.colours)
+
+
+def test_a_small_picture_shows_a_mesh_from_the_south_and_above(tmp_path):
+    """A level square, red in the north, green in the south, and a blue mast whose foot is in the middle."""
+    x, y = (each.ravel() for each in np.mgrid[-1:1:200j, -1:1:200j])
+    mast = np.column_stack([np.zeros(300), np.zeros(300), np.linspace(0, 0.5, 300)])
+    points = np.concatenate([np.column_stack([x, y, np.zeros(len(x))]), mast]).astype(np.float32)
+    colours = np.where((points[:, 1] > 0)[:, None], (255, 0, 0), (0, 255, 0)).astype(np.uint8)
+    colours[len(x) :] = (0, 0, 255)
+    axes = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    axes *= np.linalg.det(axes)
+    mesh = Triangles((points @ axes).astype(np.float32), colours, np.zeros((1, 3), np.int32))
+    write_preview(tmp_path / "small.png", mesh, axes)
+    found = cv2.imread(str(tmp_path / "small.png"))
+    assert found is not None
+    picture = found[..., ::-1]
+    height, width = picture.shape[:2]
+    assert height < width <= 101
+    assert (picture[2 : height // 4, 5:40] == (255, 0, 0)).all()
+    assert (picture[-height // 4 : -2, 5:40] == (0, 255, 0)).all()
+    blue = np.flatnonzero((picture == (0, 0, 255)).all(axis=2).any(axis=1))
+    assert blue.max() <= height // 2 + 1
+    assert blue.min() < 0.3 * height
 
 
 def test_a_ply_file_keeps_map_coordinates(tmp_path):
@@ -237,6 +262,6 @@ def test_the_command_says_what_it_made(cloudy, tmp_path, capsys, monkeypatch):
     arguments = ["mesh", str(cloudy.root), "--output", str(tmp_path), "--method", "poisson", "--voxel", "0.8"]
     assert cli.main([*arguments, "--trim", "0", "--formats", "ply"]) == 0
     printed = capsys.readouterr()
-    assert printed.out.splitlines() == [str(tmp_path / "mesh.ply")]
+    assert printed.out.splitlines() == [str(tmp_path / name) for name in ("mesh.ply", "preview_mesh.png")]
     assert "triangles" in printed.err
     assert cli.main([*arguments, "--simplify", "3"]) == 2

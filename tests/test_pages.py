@@ -11,6 +11,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from conftest import FinishedRun
@@ -447,6 +448,29 @@ def test_the_command_repeats_the_run(tmp_path: Path) -> None:
     assert command.project == project
     assert command.options == options
     assert shlex.split(command_of(project, RunOptions()))[-2] == "--output"
+
+
+def test_products_are_listed(tmp_path: Path) -> None:
+    workspace = ground_workspace(tmp_path / "dense", NAMES)
+    assert "Products" not in made(workspace).text("h2")
+    names = ["surface/dsm.tif", "mesh/a & b.ply", "export/depth_exr/x.exr"]
+    for name in names:
+        (workspace.root / name).parent.mkdir(parents=True)
+        (workspace.root / name).write_bytes(bytes(1500))
+    (workspace.export_dir / "out.laz").symlink_to("/etc/hostname")
+    picture = np.full((40, 60, 3), 200, np.uint8)
+    cv2.imwrite(str(workspace.surface_dir / "preview_orthophoto.png"), picture)
+    cv2.imwrite(str(workspace.surface_dir / "preview_large.png"), np.zeros((10, 5000, 3), np.uint8))
+    (workspace.mesh_dir / "preview_mesh.png").write_bytes(b"no picture")
+    os.mkfifo(workspace.mesh_dir / "preview_pipe.png")
+    page = made(workspace)
+    links = [each["href"] for each in page.all("a") if (each.get("href") or "").startswith("../")]
+    assert links == ["../surface/dsm.tif", "../mesh/a%20%26%20b.ply", "../export/depth_exr"]
+    assert "1.5 kB" in page.text("li")
+    assert "1 file, 1.5 kB" in page.text("li")
+    shown = [each for each in page.all("img") if each["alt"] == "orthophoto"]
+    assert [(each["width"], each["height"]) for each in shown] == [("60", "40")]
+    assert not {"large", "mesh", "pipe"} & {each["alt"] for each in page.all("img")}
 
 
 def test_view_opens_the_page(

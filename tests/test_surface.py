@@ -2,8 +2,10 @@
 
 import json
 import sys
+import tracemalloc
 from pathlib import Path
 
+import cv2
 import numpy as np
 import oracle
 import pytest
@@ -16,15 +18,20 @@ from colmap_sph import synthetic as syn
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.surface.drawing import margin_of
+from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.surface.heights import highest_surface, hillshade
+from colmap_sph.stereo.surface.coarser import coarser_colours, coarser_surface
+from colmap_sph.stereo.surface.heights import Surface, highest_surface, hillshade
 
 rasterio = pytest.importorskip("rasterio")
 
 PLENTY = 4 << 30
+# What the libraries themselves take.
+PROGRAM = 350_000_000
 
 
 def made(
@@ -47,6 +54,13 @@ def made(
                 arrays[path.stem] = file.read()
                 transform = file.transform
     return arrays, transform, summary
+
+
+def read_picture(path: Path) -> np.ndarray:
+    """(h, w, 3) blue, green and red."""
+    picture = cv2.imread(str(path))
+    assert picture is not None
+    return np.asarray(picture)
 
 
 def places(arrays, transform):
@@ -105,6 +119,12 @@ def test_the_highest_surface_is_that_of_a_search_cell_by_cell():
             assert found.deviation[row, column] == pytest.approx(np.std(first, ddof=1), abs=1e-5)
 
 
+def test_no_view_sees_no_surface():
+    surface = highest_surface(np.empty((0, 4, 5), np.float32), 0.15, 3)
+    assert np.isnan(surface.height).all()
+    assert not surface.count.any()
+
+
 def test_the_surface_is_that_of_the_solids(products):
     arrays, transform, summary = products
     height, deviation, count = arrays["dsm"]
@@ -142,6 +162,59 @@ def test_the_shade_is_that_of_a_sun_in_the_north_west():
     # The slope's normal is (-1, 1, 1) / √3 in x, y (north) and z, the sun's direction (-1, 1, √2) / 2.
     assert towards[10, 10] == pytest.approx(1 + 254 * (2 + np.sqrt(2)) / (2 * np.sqrt(3)), abs=1)
     assert away[10, 10] == 1
+
+
+def test_coarse_cells_take_the_middle_height_and_the_mean_colour(tmp_path):
+    """Of noisy maps and of speckled pictures, as large as nine fine cells."""
+    noisy = surveyed_workspace(tmp_path / "dense", noise=0.2)
+    rng = np.random.default_rng(1)
+    for path in sorted(noisy.images_dir.iterdir()):
+        picture = read_picture(path)
+        speckles = rng.integers(-30, 31, picture.shape[:2])[..., None]
+        cv2.imwrite(str(path), np.clip(picture + speckles, 0, 255).astype(np.uint8))
+    spread = {}
+    for factor in (1, 3):
+        arrays, transform, summary = made(noisy, tmp_path / "out", cell=factor * GSD, balance=False)
+        height, deviation, count = arrays["dsm"]
+        assert summary.cell == factor * GSD
+        level = (signed_distance(*places(arrays, transform)) > 2 * GSD) & (count >= 9)
+        assert np.abs(np.median(height[level])) < 0.2 * GSD
+        assert 0.1 * GSD < np.median(deviation[level]) < 0.25 * GSD
+        assert (arrays["orthophoto_images"][0][level] > 0).all()
+        spread[factor] = (height[level].std(), arrays["orthophoto"][1][level].std())
+    assert spread[3][0] < 0.7 * spread[1][0]
+    assert spread[3][1] < 0.5 * spread[1][1]
+
+
+def test_a_coarse_cell_at_an_edge_is_of_one_surface():
+    rng = np.random.default_rng(2)
+    height = rng.choice([0.0, 9.0, np.nan], (12, 20)).astype(np.float32)
+    deviation, count = (
+        rng.random(height.shape).astype(np.float32),
+        rng.integers(1, 9, height.shape).astype(np.uint16),
+    )
+    colours = rng.integers(0, 256, (*height.shape, 3)).astype(np.uint8)
+    source = rng.integers(0, 4, height.shape).astype(np.uint16)
+    coarse, chosen = coarser_surface(Surface(height, deviation, count), 4)
+    mean, numbers = coarser_colours(colours, source, 4, chosen)
+    for row, column in np.ndindex(3, 5):
+        part = np.s_[4 * row : 4 * row + 4, 4 * column : 4 * column + 4]
+        known = np.sort(height[part][np.isfinite(height[part])])
+        if len(known) < 8:
+            assert np.isnan(coarse.height[row, column])
+            assert coarse.count[row, column] == 0
+        else:
+            assert coarse.height[row, column] == known[(len(known) - 1) // 2]
+            taken = (deviation[part] == coarse.deviation[row, column]) & (
+                height[part] == coarse.height[row, column]
+            )
+            assert count[part][taken].tolist() == [coarse.count[row, column]]
+        shown = source[part] > 0
+        if shown.sum() < 8:
+            assert numbers[row, column] == 0
+        else:
+            np.testing.assert_allclose(mean[row, column], colours[part][shown].mean(axis=0), atol=0.501)
+            assert numbers[row, column] in source[part][shown]
 
 
 # ---- the orthophoto ----------------------------------------------------------------------------------------
@@ -207,6 +280,20 @@ def test_tiles_do_not_show(workspace, products, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
+@pytest.mark.parametrize("factor", [1, 3])
+def test_tiles_are_planned_by_what_they_take(workspace, tmp_path, factor):
+    """Arrays in use at any time, and the program itself, are within the memory that is given."""
+    with pytest.raises(OptionError, match=r"would do") as refused:
+        made(workspace, tmp_path, memory=1 << 20, cell=factor * GSD)
+    least = int(str(refused.value).split("MiB would do")[0].split()[-1]) << 20
+    tracemalloc.start()
+    try:
+        made(workspace, tmp_path, memory=least, cell=factor * GSD)
+        assert tracemalloc.get_traced_memory()[1] < least - PROGRAM
+    finally:
+        tracemalloc.stop()
+
+
 def test_a_model_on_its_side_is_seen_from_above(tmp_path, products):
     """As structure from motion leaves it: up is wherever."""
     turn, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
@@ -260,17 +347,59 @@ def test_a_facade_is_seen_from_outside(workspace, tmp_path):
         made(workspace, tmp_path, plane=("-4,-3,90", "4,-3,90", "-4,-3,94"))
 
 
-def test_holes_stay_or_are_filled_from_their_rims(tmp_path):
-    holed = surveyed_workspace(tmp_path / "dense")
-    # No image has a depth on some of the ground.
+def with_hole(root: Path, x: float, *, below: float) -> Workspace:
+    """No image has a depth within 1.5 of (x, 0), as far as it is below a height."""
+    holed = surveyed_workspace(root)
     for path in sorted((holed.stereo_dir / "depth_maps").iterdir()):
         camera = surveyed.cameras()[int(path.name[:2])]
         depth = read_depth_map(path)
         rows, columns = np.mgrid[: depth.shape[0], : depth.shape[1]]
         rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(camera.K).T
         points = (rays * depth[..., None] - camera.t) @ camera.R
-        depth[np.hypot(points[..., 0] - 7, points[..., 1]) < 1.5] = 0
+        depth[(np.hypot(points[..., 0] - x, points[..., 1]) < 1.5) & (points[..., 2] < below)] = 0
         write_depth_map(path, depth)
+    return holed
+
+
+def test_a_hole_beside_a_building_is_ground(tmp_path):
+    holed = with_hole(tmp_path / "dense", BOX[1, 0] + 1, below=ROOF - 0.1)
+    arrays, transform, _ = made(holed, tmp_path / "filled", fill=15)
+    height, _, count = arrays["dsm"]
+    is_filled = (
+        (count == 0)
+        & (height > -9999)
+        & (np.hypot(*(places(arrays, transform)[k] - (5, 0)[k] for k in (0, 1))) < 2)
+    )
+    assert is_filled.sum() > 100
+    assert (height[is_filled] < 0.05 * ROOF).mean() > 0.97
+
+
+def test_a_hole_in_a_roof_is_roof():
+    height = np.zeros((30, 30), np.float32)
+    height[5:25, 5:25] = 9
+    height[12:16, 12:16] = np.nan
+    holed = Surface(height, np.zeros_like(height), np.full(height.shape, 3, np.uint16))
+    assert (filled(holed, 10, 1.0, 0.1).height[12:16, 12:16] == 9).all()
+
+
+def test_a_tiles_margin_is_enough_to_fill_its_holes():
+    rng = np.random.default_rng(4)
+    height = np.zeros((150, 160), np.float32)
+    for value in [*rng.choice([0.5, 4.0, 9.0], 60), *[np.nan] * 60]:
+        row, column, size = rng.integers(0, 150), rng.integers(0, 160), rng.integers(3, 14)
+        height[row : row + size, column : column + size] = value
+    whole = Surface(height, np.zeros_like(height), np.where(np.isfinite(height), 3, 0).astype(np.uint16))
+    margin = margin_of(SurfaceOptions(fill=5, orthophoto=False), 1)
+    part = np.s_[40 - margin : 100 + margin, 50 - margin : 110 + margin]
+    tile = Surface(whole.height[part], whole.deviation[part], whole.count[part])
+    expected = filled(whole, 5, 0.2, 0.1).height[40:100, 50:110]
+    assert (np.isnan(height[40:100, 50:110]) & np.isfinite(expected)).sum() > 200
+    inner = filled(tile, 5, 0.2, 0.1).height[margin:-margin, margin:-margin]
+    np.testing.assert_array_equal(inner, expected)
+
+
+def test_holes_stay_or_are_filled_from_their_rims(tmp_path):
+    holed = with_hole(tmp_path / "dense", 7.0, below=1.0)
     open_arrays, transform, _ = made(holed, tmp_path / "open")
     x, y = places(open_arrays, transform)
     hole = np.hypot(x - 7, y) < 1.2
@@ -336,11 +465,28 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
     assert (tmp_path / "dsm.tif").read_text() == "earlier"
 
 
+def test_small_pictures_show_the_surface(products, workspace, tmp_path):
+    arrays, _, _ = products
+    made(workspace, tmp_path)
+    height, width = arrays["dsm"].shape[1:]
+    surface, orthophoto = (read_picture(tmp_path / f"preview_{name}.png") for name in ("surface", "orthophoto"))
+    assert surface.shape == orthophoto.shape == (height, width, 3)
+    known = arrays["dsm"][0] > -9999
+    assert (surface[~known] == 255).all()
+    roof = surface[known & (arrays["dsm"][0] > ROOF / 2)].mean(axis=0)
+    ground = surface[known & (arrays["dsm"][0] < ROOF / 2)].mean(axis=0)
+    assert roof[2] > ground[2] + 50  # yellow above dark blue
+    coloured = arrays["orthophoto"][3] > 0
+    np.testing.assert_array_equal(orthophoto[coloured], np.moveaxis(arrays["orthophoto"][2::-1], 0, 2)[coloured])
+    assert (orthophoto[~coloured] == 255).all()
+
+
 def test_the_command_says_what_it_made(workspace, tmp_path, capsys):
     arguments = ["surface", str(workspace.root), "--output", str(tmp_path), "--cell", "0.5", "--no-orthophoto"]
     assert cli.main(arguments) == 0
     printed = capsys.readouterr()
-    assert [Path(line).name for line in printed.out.splitlines()] == ["dsm.tif", "hillshade.tif", "surface.json"]
+    names = ["dsm.tif", "hillshade.tif", "preview_surface.png", "surface.json"]
+    assert [Path(line).name for line in printed.out.splitlines()] == names
     assert "cells of 0.5" in printed.err
     assert json.loads((tmp_path / "surface.json").read_text())["cell"] == 0.5
     assert cli.main(["surface", str(tmp_path / "nowhere")]) == 2

@@ -103,16 +103,30 @@ def test_a_batch_of_all_kinds(tmp_path: Path, stub: Path) -> None:
     assert "==== 4 projects, 2 failed" in done.stdout
     rows = [line.split("\t") for line in (root / "colmap_sph_batch.tsv").read_text().splitlines()]
     found = {row[0].removeprefix(f"{root}/"): row[1:] for row in rows[1:]}
-    numbers = ["2", "1234", "75.0%", "12"]
+    numbers = ["2", "1234", "75.0%", "12", ""]
     assert found == {
         "one/sparse/0": ["done", *numbers, ""],
         "one/sparse/1": ["incomplete", *numbers, "c.jpg: it is missing"],
-        "two/deep/sparse/0": ["FAILED (2)", "", "", "", "", "The model is damaged; mend it."],
-        f"{HOSTILE}/sparse/0": ["FAILED (4)", "", "", "", "", f"No pair of {HOSTILE} overlaps."],
+        "two/deep/sparse/0": ["FAILED (2)", "", "", "", "", "", "The model is damaged; mend it."],
+        f"{HOSTILE}/sparse/0": ["FAILED (4)", "", "", "", "", "", f"No pair of {HOSTILE} overlaps."],
     }
     page = (root / "colmap_sph_batch.html").read_text()
     assert "<script" not in page and page.count("<tr") == 5
     assert '<a href="./one/dense-1/colmap_sph/report.json">' in page
+
+
+def test_a_batch_lists_products(tmp_path: Path, stub: Path) -> None:
+    root = tmp_path / "survey"
+    add_model(root, "one/sparse/0", 0)
+    for name in ("one/dense/surface/dsm.tif", "one/dense/export/cloud.laz"):
+        (root / name).parent.mkdir(parents=True)
+        (root / name).touch()
+    (root / "one/dense/mesh").mkdir()
+    assert called(WORKFLOWS / "batch.sh", root).returncode == 0
+    row = (root / "colmap_sph_batch.tsv").read_text().splitlines()[1].split("\t")
+    assert row[6] == "surface export"
+    page = (root / "colmap_sph_batch.html").read_text()
+    assert '<a href="./one/dense/surface">surface</a> <a href="./one/dense/export">export</a>' in page
 
 
 def test_a_batch_of_nothing(tmp_path: Path, stub: Path) -> None:
@@ -157,7 +171,7 @@ def test_batch_and_summary_of_real_projects(
     header, good, bad = (line.split("\t") for line in (root / "colmap_sph_batch.tsv").read_text().splitlines())
     report = json.loads((root / "p/dense/colmap_sph/report.json").read_text())
     assert good[1:4] == ["done", "3", str(report["points"])]
-    assert bad[1] == "FAILED (2)" and "points3D.bin" in bad[6]
+    assert bad[1] == "FAILED (2)" and "points3D.bin" in bad[-1]
     (root / "models.txt").write_text(f"{root}/p/sparse/0\n{root}/p/sparse/1\n")
     done = called(sys.executable, WORKFLOWS / "batch_summary.py", "models.txt", "--output", "list", cwd=root)
     assert done.returncode == 1, done.stderr
@@ -209,12 +223,12 @@ def test_snakemake_with_models_of_all_kinds(tmp_path: Path, stub: Path) -> None:
         )
     }
     assert sorted(stub.read_text().splitlines()) == sorted(calls)
-    numbers = ["2", "1234", "75.0%", "12"]
+    numbers = ["2", "1234", "75.0%", "12", ""]
     expected = {
         "one/sparse/0": ["done", *numbers, ""],
         "one/sparse/1": ["incomplete", *numbers, "c.jpg: it is missing"],
-        f"{deep}/sparse/0": ["FAILED (2)", "", "", "", "", "The model is damaged; mend it."],
-        f"{HOSTILE} {{x}}/sparse/0": ["FAILED (4)", "", "", "", "", f"No pair of {HOSTILE} overlaps."],
+        f"{deep}/sparse/0": ["FAILED (2)", "", "", "", "", "", "The model is damaged; mend it."],
+        f"{HOSTILE} {{x}}/sparse/0": ["FAILED (4)", "", "", "", "", "", f"No pair of {HOSTILE} overlaps."],
     }
     assert table_of(root) == expected
     assert '<a href="./one/dense-1/colmap_sph/report.json">' in (root / "colmap_sph_batch.html").read_text()

@@ -17,7 +17,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
 
-COLUMNS = ("project", "result", "images", "points", "coverage", "seconds", "what is wrong")
+COLUMNS = ("project", "result", "images", "points", "coverage", "seconds", "products", "what is wrong")
+# Folders of a dense workspace that other commands fill.
+PRODUCTS = ("surface", "mesh", "export")
 DONE = {"0": "done", "5": "incomplete"}
 
 
@@ -36,7 +38,7 @@ class Project:
         code, message = (self.code, self.message) if self.code else self._found(report)
         result = DONE.get(code, f"FAILED ({code})" if code else "not run")
         if code not in DONE or report is None:
-            return (self.model, result, "", "", "", "", message)
+            return (self.model, result, "", "", "", "", "", message)
         coverage = report.get("coverage", {})
         missing = {**report.get("skipped_images", {}), **report.get("incomplete", {})}
         return (
@@ -46,6 +48,7 @@ class Project:
             str(report.get("points", "")),
             f"{sum(coverage.values()) / max(len(coverage), 1):.1%}",
             f"{sum(report.get('seconds', {}).values()):.0f}",
+            " ".join(folder.name for folder in self.products()),
             "; ".join(f"{name}: {reason}" for name, reason in missing.items()),
         )
 
@@ -53,6 +56,11 @@ class Project:
         """The report to look at."""
         page = self.dense / "colmap_sph" / "report.html"
         return page if page.is_file() else page.with_suffix(".json")
+
+    def products(self) -> list[Path]:
+        """The folders of products that have something in them."""
+        folders = [self.dense / name for name in PRODUCTS]
+        return [folder for folder in folders if folder.is_dir() and any(folder.iterdir())]
 
     def _report(self) -> dict | None:
         try:
@@ -121,15 +129,22 @@ def as_page(projects: list[Project], rows: list[tuple[str, ...]], folder: Path) 
     lines = []
     for project, (model, result, *others) in zip(projects, rows, strict=True):
         name = html.escape(visible(model))
-        link = project.link()
-        if link.is_file():
-            place = quote(os.fsencode(os.path.relpath(link, folder)))
-            name = f'<a href="./{html.escape(place)}">{name}</a>'
+        if project.link().is_file():
+            name = _linked(project.link(), name, folder)
         style = {"done": "done", "incomplete": "incomplete"}.get(result, "failed")
-        cells = "".join(f"<td>{html.escape(visible(cell))}</td>" for cell in (result, *others))
+        texts = dict(zip(COLUMNS[1:], (html.escape(visible(cell)) for cell in (result, *others)), strict=True))
+        if texts["products"]:
+            texts["products"] = " ".join(_linked(each, each.name, folder) for each in project.products())
+        cells = "".join(f"<td>{text}</td>" for text in texts.values())
         lines.append(f'<tr class="{style}"><td>{name}</td>{cells}</tr>')
     head = "".join(f"<th>{name}</th>" for name in COLUMNS)
     return _PAGE.replace("HEAD", head).replace("ROWS", "\n".join(lines))
+
+
+def _linked(target: Path, text: str, folder: Path) -> str:
+    """A link from a page in a folder."""
+    place = quote(os.fsencode(os.path.relpath(target, folder)))
+    return f'<a href="./{html.escape(place)}">{text}</a>'
 
 
 _PAGE = """<!doctype html>

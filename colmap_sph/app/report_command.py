@@ -136,9 +136,9 @@ def _bring_up_to_date(workspace: Workspace, terminal: Terminal) -> None:
 
 
 def _is_old(workspace: Workspace) -> bool:
-    """Whether report, cloud or maps were written after the page, as far as times of files tell."""
+    """Whether report, cloud, maps or products were written after the page, as far as times of files tell."""
     maps = workspace.depth_map_path("any", "geometric").parent
-    shown = (workspace.report_path, workspace.fused_path, workspace.tiles_dir, maps)
+    shown = (workspace.report_path, workspace.fused_path, workspace.tiles_dir, maps, *workspace.product_dirs)
     made = workspace.page_path.stat().st_mtime_ns
     return any(path.stat().st_mtime_ns > made for path in shown if path.exists())
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from colmap_sph.pages.block_map import Frame, Ground
 from colmap_sph.pages.image_facts import ImageFacts
 from colmap_sph.pages.pair_facts import PairFacts
+from colmap_sph.pages.products import ProductFile, ProductPicture
 from colmap_sph.pages.run_facts import RunFacts
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
@@ -58,6 +59,8 @@ class Content:
     ground : Ground
     missing : str
         What is missing of a finished run.
+    products : list of ProductFile
+    product_pictures : list of ProductPicture
     """
 
     workspace: Workspace
@@ -69,3 +72,5 @@ class Content:
     frame: Frame
     ground: Ground
     missing: str
+    products: list[ProductFile]
+    product_pictures: list[ProductPicture]

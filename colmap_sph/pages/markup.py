@@ -36,6 +36,8 @@ def render(content: Content) -> str:
         **image_values(content, run),
         **_pairs(content, run),
         **_run(run),
+        "products": content.products,
+        "product_pictures": content.product_pictures,
     }
     values["data"] |= {
         "names": [printable(image.name) for image in content.images],

@@ -20,6 +20,7 @@ from colmap_sph.pages.image_facts import (
 )
 from colmap_sph.pages.markup import render
 from colmap_sph.pages.pair_facts import PairFacts, pairs_of
+from colmap_sph.pages.products import products_of
 from colmap_sph.pages.reasons import Partner, Reason, find_reasons
 from colmap_sph.pages.run_facts import RunFacts, read_run_facts
 from colmap_sph.pages.samples import MapSamples, read_samples, samples_per_side
@@ -111,7 +112,16 @@ def gather(workspace: Workspace, progress: Progress) -> Content:
         images.append(block.look_at(view))
         progress.advance()
     return Content(
-        workspace, scene, facts, images, block.pairs, cloud, block.frame, block.ground, _missing(block, facts)
+        workspace,
+        scene,
+        facts,
+        images,
+        block.pairs,
+        cloud,
+        block.frame,
+        block.ground,
+        _missing(block, facts),
+        *products_of(workspace),
     )
 
 

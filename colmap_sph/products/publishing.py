@@ -7,8 +7,12 @@ from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_sph.errors import OutputError, reason_of
-from colmap_sph.project.files import make_dir, sync_file, sync_folder
+from colmap_sph.project.files import atomic_file, make_dir, sync_file, sync_folder
 
 MARK = "made_by_colmap_sph.txt"
 """A file in each folder that an export made, and may replace."""
@@ -97,3 +101,10 @@ def check_no_folder(path: Path) -> None:
     """Raise `OutputError` where a folder is in the place of a file."""
     if path.is_dir():
         raise OutputError(f"{path} is a folder, and a file goes there; remove it or choose another --output.")
+
+
+def write_picture(path: Path, colours: NDArray[np.uint8]) -> None:
+    """Write (h, w, 3) red, green and blue as PNG; `OutputError` where it cannot be written."""
+    data = cv2.imencode(".png", colours[..., ::-1])[1].tobytes()
+    with atomic_file(path) as file:
+        file.write(data)

@@ -12,6 +12,11 @@ from colmap_sph.project.files import make_dir
 MapKind = Literal["photometric", "geometric"]
 Known = Literal["selection", "pairs", "photometric", "geometric", "page"]
 
+PREVIEW_PREFIX = "preview_"
+"""What small pictures of products, for the page, are called at first."""
+PREVIEW_SIDE = 640
+"""Longest side of these, pixels."""
+
 # Folders are made one inside the other, and a path has an end.
 _MAX_FOLDERS = 200
 # What a file system takes, less the longest ending: ``.photometric.json``.
@@ -116,6 +121,26 @@ class Workspace:
     def georeference_path(self) -> Path:
         """Where the model lies on the map, where that is known."""
         return self.state_dir / "georeference.json"
+
+    @property
+    def surface_dir(self) -> Path:
+        """Surface model and orthophoto, unless another place is given."""
+        return self.root / "surface"
+
+    @property
+    def mesh_dir(self) -> Path:
+        """The mesh, unless another place is given."""
+        return self.root / "mesh"
+
+    @property
+    def export_dir(self) -> Path:
+        """Files for other programs, unless another place is given."""
+        return self.root / "export"
+
+    @property
+    def product_dirs(self) -> tuple[Path, Path, Path]:
+        """All of these."""
+        return self.surface_dir, self.mesh_dir, self.export_dir
 
     @property
     def given_model_dir(self) -> Path:

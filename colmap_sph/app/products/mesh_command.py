@@ -42,7 +42,7 @@ def mesh_command(command: MeshCommand, terminal: Terminal) -> int:
     command.options.check()
     memory = budget(parse_memory(command.memory))
     workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
-    folder = command.output or workspace.root / "mesh"
+    folder = command.output or workspace.mesh_dir
     with Display(terminal) as display:
         request = MeshRequest(
             workspace, georeference, command.options, folder, memory, num_cores(), command.overwrite

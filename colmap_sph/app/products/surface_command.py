@@ -43,7 +43,7 @@ def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
     command.options.check()
     memory = budget(parse_memory(command.memory))
     workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
-    folder = command.output or workspace.root / "surface"
+    folder = command.output or workspace.surface_dir
     with Display(terminal) as display:
         request = SurfaceRequest(workspace, georeference, command.options, folder, memory, command.overwrite)
         paths, summary = make_surface(request, display.start, display.advance)

@@ -12,6 +12,7 @@ from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.options import MeshOptions
+from colmap_sph.products.mesh.preview import PREVIEW, write_preview
 from colmap_sph.products.mesh.triangles import Triangles, joined, read_ply, write_ply
 from colmap_sph.products.mesh.tsdf import Volume, open3d
 from colmap_sph.products.places import check_places
@@ -68,7 +69,7 @@ def make_mesh(
     options.check()
     if options.method == "tsdf":
         open3d()
-    names = [f"mesh.{each}" for each in options.formats]
+    names = [*(f"mesh.{each}" for each in options.formats), PREVIEW]
     check_places(request.workspace, request.folder, names, overwrite=request.overwrite)
     scene, seen = seen_views(request.workspace)
     gsd = float(np.median(np.concatenate([each.footprint for each in seen])))
@@ -130,6 +131,7 @@ def _simplified(mesh: Triangles, request: MeshRequest, scratch: Path) -> Triangl
 
 def _written(request: MeshRequest, mesh: Triangles, scene: Scene, seen: list[SeenView]) -> list[Path]:
     is_on_map = bool(request.georeference.crs) or not request.georeference.is_identity or bool(scene.origin.any())
+    axes = _axes(request.georeference, scene, seen, is_on_map=is_on_map)
     paths = []
     for each in dict.fromkeys(request.options.formats):
         path = request.folder / f"mesh.{each}"
@@ -139,9 +141,10 @@ def _written(request: MeshRequest, mesh: Triangles, scene: Scene, seen: list[See
                 places = request.georeference.to_map(mesh.points.astype(np.float64) + scene.origin)
             write_ply(path, mesh, places)
         else:
-            write_glb(path, mesh, _axes(request.georeference, scene, seen, is_on_map=is_on_map))
+            write_glb(path, mesh, axes)
         paths.append(path)
-    return paths
+    write_preview(request.folder / PREVIEW, mesh, axes)
+    return [*paths, request.folder / PREVIEW]
 
 
 def _axes(

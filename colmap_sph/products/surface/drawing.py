@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
+from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.products.surface.placing import Placement
 from colmap_sph.products.surface.seen import Box, Part, SeenView, read_part, read_picture
 from colmap_sph.products.surface.tiles import Sightings, Tile
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.surface.coarser import coarser_colours, coarser_surface
 from colmap_sph.stereo.surface.heights import Surface, highest_surface, hillshade
 from colmap_sph.stereo.surface.mosaic import SEAM_RADIUS, Mosaic
 from colmap_sph.stereo.surface.patches import draw_heights
@@ -21,7 +22,6 @@ from colmap_sph.stereo.surface.visibility import sight_of
 
 # Heights of one surface, as views see it, differ by no more than this many pixels on it.
 _TOLERANCE = 3.0
-_UNFILLED = np.float32(-1e30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,20 +86,25 @@ class Drawing:
 
     def draw(self, tile: Tile) -> Drawn:
         """Draw a tile."""
-        margin = margin_of(self.options)
+        factor = self.placement.factor
+        margin = margin_of(self.options, factor)
         window = self.placement.raster.window(
             tile.row - margin, tile.column - margin, tile.height + 2 * margin, tile.width + 2 * margin
         )
         views = list(self.sightings.in_tile(tile, margin))
-        surface = filled(self._surface(window, views), self.options.fill)
-        shade = hillshade(surface.height, self.placement.raster.cell)
-        mosaic = self._mosaic(window, views, surface)
+        fine_window = window.finer(factor)
+        fine = self._surface(fine_window, views)
+        surface, chosen = coarser_surface(fine, factor)
+        surface = filled(surface, self.options.fill, window.cell, self._tolerance)
+        shade = hillshade(surface.height, window.cell)
+        mosaic = self._mosaic(fine_window, views, _with_filled(fine, surface, factor))
+        colours, source = coarser_colours(mosaic.colours, mosaic.source, factor, chosen)
         inner = (slice(margin, margin + tile.height), slice(margin, margin + tile.width))
         return Drawn(
             Surface(surface.height[inner], surface.deviation[inner], surface.count[inner]),
             shade[inner],
-            mosaic.colours[inner],
-            mosaic.source[inner],
+            colours[inner],
+            source[inner],
         )
 
     @property
@@ -128,7 +133,7 @@ class Drawing:
         mosaic = Mosaic(surface.height, is_filled, self._tolerance)
         if self.pictures is None or not np.isfinite(surface.height).any():
             return mosaic
-        tolerance = 2 * self._tolerance / self.placement.raster.scale
+        tolerance = 2 * self._tolerance / window.scale
         for index, box in views:
             seen = self.seen[index]
             part = read_part(self.workspace, seen.view, box)
@@ -138,9 +143,19 @@ class Drawing:
         return mosaic
 
 
-def margin_of(options: SurfaceOptions) -> int:
-    """Cells around a tile that its own depend on."""
-    return max(4 * SEAM_RADIUS if options.orthophoto else 1, options.fill + 1)
+def margin_of(options: SurfaceOptions, factor: int) -> int:
+    """Cells around a tile that its own depend on, where each has `factor` × `factor` fine ones."""
+    # What is filled depends on rims, and which of these count on others, as far away again.
+    return max(-(-4 * SEAM_RADIUS // factor) if options.orthophoto else 1, 2 * options.fill + 2)
+
+
+def _with_filled(fine: Surface, surface: Surface, factor: int) -> Surface:
+    """The fine surface, with what was filled in of the coarse one."""
+    is_filled = np.isfinite(surface.height) & (surface.count == 0)
+    if not is_filled.any():
+        return fine
+    added = np.where(is_filled, surface.height, np.float32(np.nan)).repeat(factor, axis=0).repeat(factor, axis=1)
+    return Surface(np.where(np.isfinite(fine.height), fine.height, added), fine.deviation, fine.count)
 
 
 def _heights(part: Part, window: Raster) -> NDArray[np.float64]:
@@ -150,15 +165,3 @@ def _heights(part: Part, window: Raster) -> NDArray[np.float64]:
     column = np.arange(part.view.width)
     row = np.arange(part.view.height)[:, None]
     return np.asarray((along[0] * column + along[1] * row + along[2]) * part.depth + shift[2])
-
-
-def filled(surface: Surface, reach: int) -> Surface:
-    """Fill holes from their rims, inversely to the distance, up to `reach` cells from a measured one."""
-    is_known = np.isfinite(surface.height)
-    if not reach or is_known.all() or not is_known.any():
-        return surface
-    from rasterio.fill import fillnodata  # of the extra
-
-    height = fillnodata(np.where(is_known, surface.height, _UNFILLED), mask=is_known, max_search_distance=reach)
-    is_filled = (distance_transform_edt(~is_known) <= reach) & (height > _UNFILLED)
-    return Surface(np.where(is_filled, height, np.float32(np.nan)), surface.deviation, surface.count)

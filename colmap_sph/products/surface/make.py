@@ -18,6 +18,7 @@ from colmap_sph.products.surface.drawing import Drawing, Drawn, Pictures, margin
 from colmap_sph.products.surface.geotiff import NO_HEIGHT, Layer, LayerFiles, gdal
 from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.products.surface.placing import Placement, place
+from colmap_sph.products.surface.previews import PREVIEWS, write_previews
 from colmap_sph.products.surface.seen import SeenView, seen_views
 from colmap_sph.products.surface.tiles import Sightings, Tile, choose_side, tiles_of
 from colmap_sph.project.files import atomic_file, free_space, make_dir, scratch_folder, sync_file
@@ -116,7 +117,7 @@ def make_surface(request: SurfaceRequest, start: Start, advance: Advance) -> tup
     layers = {
         key: each for key, each in _LAYERS.items() if request.options.orthophoto or key not in _OF_ORTHOPHOTO
     }
-    names = [*(layer.name for layer in layers.values()), _SUMMARY]
+    names = [*(layer.name for layer in layers.values()), _SUMMARY, *PREVIEWS]
     check_places(request.workspace, request.folder, names, overwrite=request.overwrite)
     scene, seen = seen_views(request.workspace)
     placement = place(scene, seen, request.georeference, request.options)
@@ -136,6 +137,7 @@ def make_surface(request: SurfaceRequest, start: Start, advance: Advance) -> tup
                     "No cell of the raster is seen by any depth map; choose larger cells or a plane nearby."
                 )
             made = files.finish()
+            made += write_previews(made)
         summary = _summary(scene, placement, counts)
         paths = _publish(made, request.folder)
     path = request.folder / _SUMMARY
@@ -149,7 +151,8 @@ def _prepared(
 ) -> tuple[Drawing, list[Tile]]:
     options = request.options
     sightings = Sightings(seen, placement.raster)
-    side, spare = choose_side(placement.raster, sightings, seen, margin_of(options), request.memory)
+    margin = margin_of(options, placement.factor)
+    side, spare = choose_side(placement.raster, sightings, seen, margin, placement.factor, request.memory)
     pictures = None
     if options.orthophoto:
         indices = [each.index for each in seen]

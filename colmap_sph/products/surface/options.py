@@ -32,8 +32,8 @@ class SurfaceOptions:
     min_images: int = 3
     """So many images must agree on a height, or all that see the cell where these are fewer."""
     fill: int = 0
-    """Fill holes from their rims, inversely to the distance, as far as so many cells from a measured one. Filled
-    cells have a count of 0. 0: holes stay."""
+    """Fill holes from their lower rims, inversely to the distance, as far as so many cells from these. What is
+    filled has a count of 0. 0: holes stay."""
     orthophoto: bool = True
     """Make the orthophoto, too."""
     balance: bool = True

@@ -24,6 +24,8 @@ _BEYOND = 0.25
 _MOST_ON_A_SIDE = 200_000
 _MOST_CELLS = 20_000_000_000
 _SLAB = 0.1
+# Of a cell each way: with more, nothing changes.
+_MOST_PARTS = 8
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,8 @@ class Placement:
         What a pixel covers, the median over all maps, in units of the raster.
     slab : (float, float)
         Heights that count.
+    factor : int
+        A cell is drawn in so many parts each way, about as large as a pixel.
     model_to_places : (3, 4) float64 ndarray
         From coordinates of the model as it is in its files to places of the raster and heights.
     """
@@ -48,6 +52,7 @@ class Placement:
     crs: str
     gsd: float
     slab: tuple[float, float]
+    factor: int
     model_to_places: NDArray[np.float64]
 
 
@@ -87,7 +92,8 @@ def place(
             "No depth map sees anything of the plane; check the corners of --plane, and its depth."
         )
     shift = offset - linear @ scene.origin
-    return Placement(raster, crs, gsd, slab, np.column_stack([linear, shift]))
+    factor = int(np.clip(round(cell / gsd), 1, _MOST_PARTS))
+    return Placement(raster, crs, gsd, slab, factor, np.column_stack([linear, shift]))
 
 
 def _axes(

@@ -10,10 +10,10 @@ from colmap_sph.errors import OptionError
 from colmap_sph.products.surface.seen import Box, SeenView
 from colmap_sph.stereo.surface.raster import Raster
 
-# Cells along a tile's side, the more the fewer views are read again.
+# Fine cells along a tile's side, the more the fewer views are read again.
 _SIDES = (2048, 1536, 1024, 768, 512, 256)
-# Bytes: of a cell for each view that sees it, and besides; of a pixel of a view while its maps and image are read;
-# of the program itself.
+# Bytes: of a fine cell for each view that sees it, and besides; of a pixel of a view while its maps and image are
+# read; of the program itself.
 _CELL_VIEW = 4.5
 _CELL = 170.0
 _PIXEL = 48.0
@@ -80,9 +80,11 @@ def tiles_of(raster: Raster, side: int) -> list[Tile]:
 
 
 def choose_side(
-    raster: Raster, sightings: Sightings, seen: Sequence[SeenView], margin: int, memory: int
+    raster: Raster, sightings: Sightings, seen: Sequence[SeenView], margin: int, factor: int, memory: int
 ) -> tuple[int, int]:
     """Largest side of tiles that fits into the memory, and the bytes left for images that are kept.
+
+    A cell is drawn as `factor` × `factor` fine ones.
 
     Raises
     ------
@@ -93,10 +95,12 @@ def choose_side(
     file_pixels = max(each.view.file_size[0] * each.view.file_size[1] for each in seen)
     fixed = _PROGRAM + 20.0 * largest + 14.0 * file_pixels
     needed = 0.0
-    for side in _SIDES:
+    for fine_side in _SIDES:
+        side = fine_side // factor
         most = max(
             (tile.height + 2 * margin)
             * (tile.width + 2 * margin)
+            * factor**2
             * (_CELL + _CELL_VIEW * _views_in(sightings, seen, tile, margin))
             for tile in tiles_of(raster, side)
         )

@@ -1,5 +1,6 @@
 """Heights of cells as several views see them → the surface that these agree on."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,7 +58,7 @@ def highest_surface(heights: NDArray[np.float32], tolerance: float, min_views: i
     (5.0, 3)
     """
     shape = heights.shape[1:]
-    stack = heights.reshape(len(heights), -1)
+    stack = heights.reshape(len(heights), math.prod(shape))  # of no view, too
     height = np.full(stack.shape[1], np.nan, np.float32)
     deviation = np.full(stack.shape[1], np.nan, np.float32)
     count = np.zeros(stack.shape[1], np.uint16)

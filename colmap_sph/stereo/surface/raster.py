@@ -58,6 +58,10 @@ class Raster:
             height=height,
         )
 
+    def finer(self, factor: int) -> "Raster":
+        """The same extent with `factor` × `factor` cells for each one."""
+        return replace(self, cell=self.cell / factor, width=self.width * factor, height=self.height * factor)
+
     @property
     def cells_from_scene(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """(3, 3) matrix and (3,) shift from points of the scene to column, row and height."""
