@@ -283,6 +283,21 @@ def arguments(function):
             "min_score": 0.5,
             "out equations": np.zeros((12, H, W), f32),
         },
+        "source_pixels": {
+            "ray_rows": np.ones((3, H), f32),
+            "ray_columns": np.ones((3, W), f32),
+            "weights": np.ones(W, f32),
+            "source_width": 30,
+            "source_height": 20,
+            "out columns": np.zeros((H, W), f32),
+            "out rows": np.zeros((H, W), f32),
+            "out inside": np.zeros((H, W), u8),
+        },
+        "sharpen": {
+            "image": np.zeros((H, W), f32),
+            "sharpening": 0.6,
+            "out padded": np.zeros((H + 6, W + 8), np.int16),
+        },
         "planes_of_maps": {
             "normals": np.ones((H, W, 3), f32),
             "depth": np.ones((H, W), f32),
@@ -330,6 +345,13 @@ def offsets_arguments():
             "as_it_is": 70,
             "gap": 32,
             "out target_base": ints(),
+        },
+        "join_targets": {
+            "warped": np.zeros((H, W), np.uint64),
+            "warped_columns": ints(),
+            "source": np.zeros((H, 50), np.uint64),
+            "out census": np.zeros((H, W + 55), np.uint64),
+            "out columns": np.zeros((H, W + 55), np.int32),
         },
         "bases_about": {"out offset": ints(), "depth": 32, "first": -40, "last": 40},
         "mark_steps": {"offset": ints(), "max_step": 700, "out marks": np.zeros((H, W), np.uint8)},
@@ -442,6 +464,8 @@ FUNCTIONS = [
     "planes_of_maps",
     "maps_of_planes",
     "refine_planes",
+    "source_pixels",
+    "sharpen",
     *offsets_arguments(),
     *ties_arguments(),
 ]
@@ -476,6 +500,7 @@ FREE = {
             ("fit_surfaces", "disparity"),
         )
     },
+    ("join_targets", "source"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -795,8 +820,9 @@ def test_bounds_of_search_windows_are_kept():
     for value in (0, 31, -32, 1056):
         with pytest.raises(ValueError, match="multiple of 32"):
             call("search_windows", {**values, "depth": value})
-    with pytest.raises(ValueError, match="max_step"):
-        call("upsample_offsets", {**arguments("upsample_offsets"), "max_step": -1})
+    for step in (-1, 2**20 + 1):
+        with pytest.raises(ValueError, match="max_step"):
+            call("upsample_offsets", {**arguments("upsample_offsets"), "max_step": step})
 
 
 def test_windows_about_numbers_out_of_this_world():
