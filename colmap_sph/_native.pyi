@@ -433,7 +433,7 @@ def fit_planes(
 def add_patch_equations(
     backend: str,
     image: NDArray[np.uint8],
-    sources: tuple[NDArray[np.uint8], ...],
+    sources: tuple[NDArray[np.uint16], ...],
     sources_from_reference: NDArray[np.floating[Any]],
     planes: NDArray[np.float32],
     first_row: int,
@@ -443,11 +443,12 @@ def add_patch_equations(
     equations: NDArray[np.float32],
     /,
 ) -> None:
-    """Add the normal equations of matching planes of every `row_step`-th row in each of the sources.
+    """Add the normal equations of matching planes of every `row_step`-th row in each of the sources, where every
+    pixel (the lower byte) has the one below it beside it.
 
     backend : str
     image : (H, W) uint8
-    sources : tuple of SOURCES images, uint8
+    sources : tuple of SOURCES images, uint16
     sources_from_reference : (SOURCES, 3, 4) float64
     planes : (3, ROWS, W) float32
     first_row : int

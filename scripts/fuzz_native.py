@@ -405,7 +405,7 @@ def add_patch_equations(rng: Random) -> Arguments:
     rows = int(rng.integers(0, (h - first + step - 1) // step + 1))
     image = filled(rng, (h, w), np.uint8)
     count = int(rng.integers(1, 5))
-    sources = tuple(filled(rng, size(rng), np.uint8) for _ in range(count))
+    sources = tuple(filled(rng, size(rng), np.uint16) for _ in range(count))
     matrices = np.zeros((count, 3, 4))
     for matrix in matrices:
         # Half of them look at the same place, so that windows do meet.

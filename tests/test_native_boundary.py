@@ -274,7 +274,7 @@ def arguments(function):
         "add_patch_equations": {
             "backend": "scalar",
             "image": np.zeros((H, W), u8),
-            "sources": (np.zeros((9, 20), u8), np.zeros((8, 7), u8)),
+            "sources": (np.zeros((9, 20), np.uint16), np.zeros((8, 7), np.uint16)),
             "sources_from_reference": np.stack([matrix, matrix]),
             "planes": np.ones((3, H, W), f32),
             "first_row": 0,
@@ -921,7 +921,7 @@ def test_window_radius_out_of_bounds_is_refused(radius):
 @pytest.mark.parametrize("count", [0, 33])
 def test_number_of_sources_out_of_bounds_is_refused(count):
     values = arguments("add_patch_equations")
-    values["sources"] = (np.zeros((9, 20), np.uint8),) * count
+    values["sources"] = (np.zeros((9, 20), np.uint16),) * count
     values["sources_from_reference"] = np.zeros((count, 3, 4))
     with pytest.raises(ValueError, match=r"sources must lie in 1\.\.32"):
         call("add_patch_equations", values)
@@ -929,14 +929,14 @@ def test_number_of_sources_out_of_bounds_is_refused(count):
 
 def test_as_many_sources_as_are_allowed_are_accepted():
     values = arguments("add_patch_equations")
-    values["sources"] = tuple(np.zeros((9 + k, 20), np.uint8) for k in range(32))
+    values["sources"] = tuple(np.zeros((9 + k, 20), np.uint16) for k in range(32))
     values["sources_from_reference"] = np.zeros((32, 3, 4))
     call("add_patch_equations", values)
 
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_every_source_is_checked(place):
-    right = np.zeros((9, 20), np.uint8)
+    right = np.zeros((9, 20), np.uint16)
     values = arguments("add_patch_equations")
     memory = np.zeros(values["out equations"].nbytes, np.uint8)
     for wrong, error, message in [
@@ -944,9 +944,9 @@ def test_every_source_is_checked(place):
         (None, TypeError, "contiguous"),
         (right[:, ::2], TypeError, "contiguous"),
         (right[None], ValueError, "dimensions"),
-        (np.zeros((0, 65536), np.uint8), ValueError, "65535"),
+        (np.zeros((0, 65536), np.uint16), ValueError, "65535"),
         (np.broadcast_to(right, (2, 9, 20))[0].T, TypeError, "contiguous"),
-        (memory[-12:].reshape(3, 4), ValueError, "overlaps"),
+        (memory[-24:].view(np.uint16).reshape(3, 4), ValueError, "overlaps"),
     ]:
         sources = list(values["sources"])
         sources[place] = wrong
@@ -955,7 +955,7 @@ def test_every_source_is_checked(place):
             call("add_patch_equations", {**values, "sources": tuple(sources), "out equations": equations})
 
 
-@pytest.mark.parametrize("sources", [None, np.zeros((2, 9, 20), np.uint8), [np.zeros((9, 20), np.uint8)] * 2])
+@pytest.mark.parametrize("sources", [None, np.zeros((2, 9, 20), np.uint16), [np.zeros((9, 20), np.uint16)] * 2])
 def test_sources_must_be_a_tuple(sources):
     with pytest.raises(TypeError, match="tuple"):
         call("add_patch_equations", {**arguments("add_patch_equations"), "sources": sources})
