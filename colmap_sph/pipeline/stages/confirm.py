@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.memory import MemoryGate
 
 # Processor seconds per megapixel of the image: per partner, and per partner's image that is matched in.
-_CONFIRM_SECONDS = 0.03
-_REFINE_SECONDS = 0.065
+_CONFIRM_SECONDS = 0.015
+_REFINE_SECONDS = 0.055
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
 _CONFIRM_BYTES = 40.0
 _REFINE_BYTES = 55.0
