@@ -1,5 +1,6 @@
 """The program's entry: the command line, once it is loaded, which takes a second or so."""
 
+import gc
 import os
 import signal
 import sys
@@ -54,9 +55,11 @@ def _command() -> int:
     if is_handed_over(sys.argv[1:]):
         with suppress(InputError):  # said below
             hand_over(sys.argv[1:])
+    gc.disable()  # what is loaded stays: nothing to be found
     _load_colmap()
     from colmap_sph.app import cli
 
+    gc.enable()
     try:
         code = cli.main()
     except SystemExit as stop:  # the parser, after help or a mistake

@@ -436,7 +436,7 @@ def fit_planes(
 def add_patch_equations(
     backend: str,
     image: NDArray[np.uint8],
-    sources: tuple[NDArray[np.uint8], ...],
+    sources: tuple[NDArray[np.uint16], ...],
     sources_from_reference: NDArray[np.floating[Any]],
     planes: NDArray[np.float32],
     first_row: int,
@@ -446,11 +446,12 @@ def add_patch_equations(
     equations: NDArray[np.float32],
     /,
 ) -> None:
-    """Add the normal equations of matching planes of every `row_step`-th row in each of the sources.
+    """Add the normal equations of matching planes of every `row_step`-th row in each of the sources, where every
+    pixel (the lower byte) has the one below it beside it.
 
     backend : str
     image : (H, W) uint8
-    sources : tuple of SOURCES images, uint8
+    sources : tuple of SOURCES images, uint16
     sources_from_reference : (SOURCES, 3, 4) float64
     planes : (3, ROWS, W) float32
     first_row : int
@@ -864,6 +865,23 @@ def target_bases(
     target_base : (H, W) int32, written
     """
 
+def join_targets(
+    warped: NDArray[np.uint64],
+    warped_columns: NDArray[np.int32],
+    source: NDArray[np.uint64],
+    census: NDArray[np.uint64],
+    columns: NDArray[np.int32],
+    /,
+) -> None:
+    """Census of a warped image, a gap without content and the source as it is side by side; and their columns.
+
+    warped : (H, W) uint64
+    warped_columns : (H, W) int32
+    source : (H, SOURCE_W) uint64
+    census : (H, TARGET_W) uint64, written
+    columns : (H, TARGET_W) int32, written
+    """
+
 def bases_about(
     offset: NDArray[np.int32],
     depth: int,
@@ -946,4 +964,40 @@ def decode_disparity(
     least : float
     step : float
     disparity : (H, W) float32, written
+    """
+
+def source_pixels(
+    ray_rows: NDArray[np.float32],
+    ray_columns: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    source_width: int,
+    source_height: int,
+    columns: NDArray[np.float32],
+    rows: NDArray[np.float32],
+    inside: NDArray[np.uint8],
+    /,
+) -> None:
+    """Where rectified pixels, of rays ray_rows * weights + ray_columns, lie in an image, and 255 inside of it.
+
+    ray_rows : (3, H) float32
+    ray_columns : (3, W) float32
+    weights : (W) float32
+    source_width : int
+    source_height : int
+    columns : (H, W) float32, written
+    rows : (H, W) float32, written
+    inside : (H, W) uint8, written
+    """
+
+def sharpen(
+    image: NDArray[np.float32],
+    sharpening: float,
+    padded: NDArray[np.int16],
+    /,
+) -> None:
+    """An image plus so many times what it differs by from its mean nearby, in 1/64 grey value, with a border.
+
+    image : (H, W) float32
+    sharpening : float
+    padded : (H + 6, W + 8) int16, written
     """

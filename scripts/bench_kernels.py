@@ -317,7 +317,8 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
 
     inverse = scene.disparity / focal
     planes = np.stack([inverse, *np.gradient(inverse)[::-1]]).astype(np.float32)
-    sources = (scene.right,) * SOURCES
+    pairs = scene.right[:-1] + np.uint16(256) * scene.right[1:]  # pixels, and in upper bytes those below them
+    sources = (pairs.astype(np.uint16),) * SOURCES
     transfers = np.stack([beside] * SOURCES)
     equations = np.empty((12, *shape), np.float32)
 

@@ -211,6 +211,14 @@ def target_bases(rng: Random) -> Arguments:
     return [*inputs, margin(rng), margin(rng), margin(rng), np.zeros(shape, np.int32)]
 
 
+def join_targets(rng: Random) -> Arguments:
+    h, w = size(rng)
+    source = int(rng.integers(0, 70))
+    joined = (h, w + source + int(rng.integers(0, 40)))
+    inputs = [filled(rng, *each) for each in (((h, w), np.uint64), ((h, w), np.int32), ((h, source), np.uint64))]
+    return [*inputs, np.zeros(joined, np.uint64), np.zeros(joined, np.int32)]
+
+
 def bases_about(rng: Random) -> Arguments:
     return [filled(rng, size(rng), np.int32), 32, *sorted(rng.integers(-99, 99, 2).tolist())]
 
@@ -397,7 +405,7 @@ def add_patch_equations(rng: Random) -> Arguments:
     rows = int(rng.integers(0, (h - first + step - 1) // step + 1))
     image = filled(rng, (h, w), np.uint8)
     count = int(rng.integers(1, 5))
-    sources = tuple(filled(rng, size(rng), np.uint8) for _ in range(count))
+    sources = tuple(filled(rng, size(rng), np.uint16) for _ in range(count))
     matrices = np.zeros((count, 3, 4))
     for matrix in matrices:
         # Half of them look at the same place, so that windows do meet.
@@ -406,6 +414,18 @@ def add_patch_equations(rng: Random) -> Arguments:
     planes = filled(rng, (3, rows, w), np.float32)
     equations = np.zeros((12, rows, w), np.float32)
     return [backend(rng), image, sources, matrices, planes, first, step, number(rng), number(rng) / 10, equations]
+
+
+def source_pixels(rng: Random) -> Arguments:
+    h, w = size(rng)
+    tables = [filled(rng, shape, np.float32) for shape in ((3, h), (3, w), (w,))]
+    places = [np.zeros((h, w), kind) for kind in (np.float32, np.float32, np.uint8)]
+    return [*tables, int(rng.integers(0, 100)), int(rng.integers(0, 100)), *places]
+
+
+def sharpen(rng: Random) -> Arguments:
+    h, w = size(rng)
+    return [filled(rng, (h, w), np.float32), number(rng), np.zeros((h + 6, w + 8), np.int16)]
 
 
 def planes_of_maps(rng: Random) -> Arguments:
@@ -482,8 +502,11 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         remove_small_segments,
         count_fractions,
         unwarp_torn,
+        source_pixels,
+        sharpen,
         first_offsets,
         target_bases,
+        join_targets,
         bases_about,
         mark_steps,
         count_slopes,

@@ -274,7 +274,7 @@ def arguments(function):
         "add_patch_equations": {
             "backend": "scalar",
             "image": np.zeros((H, W), u8),
-            "sources": (np.zeros((9, 20), u8), np.zeros((8, 7), u8)),
+            "sources": (np.zeros((9, 20), np.uint16), np.zeros((8, 7), np.uint16)),
             "sources_from_reference": np.stack([matrix, matrix]),
             "planes": np.ones((3, H, W), f32),
             "first_row": 0,
@@ -282,6 +282,21 @@ def arguments(function):
             "contrast": 20.0,
             "min_score": 0.5,
             "out equations": np.zeros((12, H, W), f32),
+        },
+        "source_pixels": {
+            "ray_rows": np.ones((3, H), f32),
+            "ray_columns": np.ones((3, W), f32),
+            "weights": np.ones(W, f32),
+            "source_width": 30,
+            "source_height": 20,
+            "out columns": np.zeros((H, W), f32),
+            "out rows": np.zeros((H, W), f32),
+            "out inside": np.zeros((H, W), u8),
+        },
+        "sharpen": {
+            "image": np.zeros((H, W), f32),
+            "sharpening": 0.6,
+            "out padded": np.zeros((H + 6, W + 8), np.int16),
         },
         "planes_of_maps": {
             "normals": np.ones((H, W, 3), f32),
@@ -330,6 +345,13 @@ def offsets_arguments():
             "as_it_is": 70,
             "gap": 32,
             "out target_base": ints(),
+        },
+        "join_targets": {
+            "warped": np.zeros((H, W), np.uint64),
+            "warped_columns": ints(),
+            "source": np.zeros((H, 50), np.uint64),
+            "out census": np.zeros((H, W + 55), np.uint64),
+            "out columns": np.zeros((H, W + 55), np.int32),
         },
         "bases_about": {"out offset": ints(), "depth": 32, "first": -40, "last": 40},
         "mark_steps": {"offset": ints(), "max_step": 700, "out marks": np.zeros((H, W), np.uint8)},
@@ -442,6 +464,8 @@ FUNCTIONS = [
     "planes_of_maps",
     "maps_of_planes",
     "refine_planes",
+    "source_pixels",
+    "sharpen",
     *offsets_arguments(),
     *ties_arguments(),
 ]
@@ -476,6 +500,7 @@ FREE = {
             ("fit_surfaces", "disparity"),
         )
     },
+    ("join_targets", "source"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -795,8 +820,9 @@ def test_bounds_of_search_windows_are_kept():
     for value in (0, 31, -32, 1056):
         with pytest.raises(ValueError, match="multiple of 32"):
             call("search_windows", {**values, "depth": value})
-    with pytest.raises(ValueError, match="max_step"):
-        call("upsample_offsets", {**arguments("upsample_offsets"), "max_step": -1})
+    for step in (-1, 2**20 + 1):
+        with pytest.raises(ValueError, match="max_step"):
+            call("upsample_offsets", {**arguments("upsample_offsets"), "max_step": step})
 
 
 def test_windows_about_numbers_out_of_this_world():
@@ -895,7 +921,7 @@ def test_window_radius_out_of_bounds_is_refused(radius):
 @pytest.mark.parametrize("count", [0, 33])
 def test_number_of_sources_out_of_bounds_is_refused(count):
     values = arguments("add_patch_equations")
-    values["sources"] = (np.zeros((9, 20), np.uint8),) * count
+    values["sources"] = (np.zeros((9, 20), np.uint16),) * count
     values["sources_from_reference"] = np.zeros((count, 3, 4))
     with pytest.raises(ValueError, match=r"sources must lie in 1\.\.32"):
         call("add_patch_equations", values)
@@ -903,14 +929,14 @@ def test_number_of_sources_out_of_bounds_is_refused(count):
 
 def test_as_many_sources_as_are_allowed_are_accepted():
     values = arguments("add_patch_equations")
-    values["sources"] = tuple(np.zeros((9 + k, 20), np.uint8) for k in range(32))
+    values["sources"] = tuple(np.zeros((9 + k, 20), np.uint16) for k in range(32))
     values["sources_from_reference"] = np.zeros((32, 3, 4))
     call("add_patch_equations", values)
 
 
 @pytest.mark.parametrize("place", [0, 1])
 def test_every_source_is_checked(place):
-    right = np.zeros((9, 20), np.uint8)
+    right = np.zeros((9, 20), np.uint16)
     values = arguments("add_patch_equations")
     memory = np.zeros(values["out equations"].nbytes, np.uint8)
     for wrong, error, message in [
@@ -918,9 +944,9 @@ def test_every_source_is_checked(place):
         (None, TypeError, "contiguous"),
         (right[:, ::2], TypeError, "contiguous"),
         (right[None], ValueError, "dimensions"),
-        (np.zeros((0, 65536), np.uint8), ValueError, "65535"),
+        (np.zeros((0, 65536), np.uint16), ValueError, "65535"),
         (np.broadcast_to(right, (2, 9, 20))[0].T, TypeError, "contiguous"),
-        (memory[-12:].reshape(3, 4), ValueError, "overlaps"),
+        (memory[-24:].view(np.uint16).reshape(3, 4), ValueError, "overlaps"),
     ]:
         sources = list(values["sources"])
         sources[place] = wrong
@@ -929,7 +955,7 @@ def test_every_source_is_checked(place):
             call("add_patch_equations", {**values, "sources": tuple(sources), "out equations": equations})
 
 
-@pytest.mark.parametrize("sources", [None, np.zeros((2, 9, 20), np.uint8), [np.zeros((9, 20), np.uint8)] * 2])
+@pytest.mark.parametrize("sources", [None, np.zeros((2, 9, 20), np.uint16), [np.zeros((9, 20), np.uint16)] * 2])
 def test_sources_must_be_a_tuple(sources):
     with pytest.raises(TypeError, match="tuple"):
         call("add_patch_equations", {**arguments("add_patch_equations"), "sources": sources})

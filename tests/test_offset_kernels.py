@@ -126,6 +126,21 @@ def test_bases_are_those_of_each_pixel(shape, seed, margin, gap):
 
 
 @property_test
+@given(shape=sizes, source=st.integers(0, 40), gap=st.integers(0, 9), seed=seeds)
+def test_targets_lie_side_by_side(shape, source, gap, seed):
+    rng = np.random.default_rng(seed)
+    warped, own = (rng.integers(0, 2**63, (shape[0], width), dtype=np.uint64) for width in (shape[1], source))
+    columns = rng.integers(-1, 50, shape).astype(np.int32)
+    census = np.empty((shape[0], shape[1] + gap + source), np.uint64)
+    joined = np.empty(census.shape, np.int32)
+    _native.join_targets(warped, columns, own, census, joined)
+    nothing = np.full((shape[0], gap), 1 << 63, np.uint64)
+    np.testing.assert_array_equal(census, np.hstack([warped, nothing, own]))
+    own_columns = np.tile(np.arange(source), (shape[0], 1))
+    np.testing.assert_array_equal(joined, np.hstack([columns, np.full((shape[0], gap), -1), own_columns]))
+
+
+@property_test
 @given(shape=sizes, seed=seeds, depth=st.sampled_from([32, 64, 1024]))
 def test_windows_lie_about_offsets(shape, seed, depth):
     offset = offsets_of("slopes", shape, seed)

@@ -44,8 +44,13 @@ def equations_of_all(backend, image, partners, planes, options=OPTIONS):
     return equations
 
 
+def paired(image):
+    """Every pixel with the one below it in the upper byte."""
+    return image[:-1] + 256 * image[1:].astype(np.uint16)
+
+
 def add_equations(backend, image, partners, planes, options, equations):
-    sources = tuple(source for source, _ in partners)
+    sources = tuple(paired(source) for source, _ in partners)
     matrices = np.stack([matrix for _, matrix in partners])
     _native.add_patch_equations(
         backend, image, sources, matrices, planes, 0, 1, options.contrast, options.min_score, equations
@@ -62,7 +67,7 @@ def test_equations_of_some_rows_are_those_of_all(backend, first, step):
     found = np.zeros(expected.shape, np.float32)
     some = np.ascontiguousarray(planes[:, rows])
     limits = OPTIONS.contrast, OPTIONS.min_score
-    _native.add_patch_equations(backend, image, (image,), AFFINE[None], some, first, step, *limits, found)
+    _native.add_patch_equations(backend, image, (paired(image),), AFFINE[None], some, first, step, *limits, found)
     assert np.array_equal(found, expected)
     assert np.any(found) or first >= 39
 

@@ -154,7 +154,9 @@ int check_size(const char *name, int axis, ptrdiff_t size, ptrdiff_t expected);
 /* All functions of a group, NULL ends them. */
 extern native_function *const matching_functions[],
     *const depth_functions[], *const fusion_functions[], *const surface_functions[],
-                                                             *const ties_functions[], *const offsets_functions[];
+                                                             *const ties_functions[],
+                                                                 *const offsets_functions[],
+                                                                     *const images_functions[];
 
 /* (name, ((argument, role, type, ((symbol or None, number), ...)), ...)); NULL with an error set. */
 PyObject *signature_of(const native_function *function);

@@ -3,7 +3,8 @@
 #include "boundary.h"
 
 static native_function *const *const groups[] = {matching_functions, depth_functions, fusion_functions,
-                                                 surface_functions,  ties_functions,  offsets_functions};
+                                                 surface_functions,  ties_functions,  offsets_functions,
+                                                 images_functions};
 
 enum { GROUPS = sizeof groups / sizeof *groups };
 

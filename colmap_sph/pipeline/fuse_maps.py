@@ -18,7 +18,7 @@ from colmap_sph.pipeline.stages.fusion_partners import PartnersInFusion
 from colmap_sph.pipeline.stages.fusion_parts import index_in_model
 from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.pipeline.stages.view_maps import MapSources, views_beside
-from colmap_sph.pipeline.workers import one_opencv_thread
+from colmap_sph.pipeline.workers import room_for_workers
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.cloud_output import CloudOutput
 from colmap_sph.project.map_files import has_depth, map_size
@@ -73,7 +73,7 @@ def fuse_maps(
     report = RunReport()
     given = read_scene(workspace.sparse_dir)
     mapped = _with_maps(workspace, given, _listed(workspace, given), options.fusion.input)
-    with claimed(workspace), one_opencv_thread():
+    with claimed(workspace), room_for_workers():
         scene = _at_map_sizes(given, mapped, options.undistortion.max_image_size)
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         check_fusion(context)

@@ -22,6 +22,8 @@ from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.project.colmap_library import COLMAP_VERSION
 
 _ROOT = Path(__file__).parents[1]
+# Where statements hold other ones: walking through their expressions as well would take ten times as long.
+_BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
 
 
 @cache
@@ -70,35 +72,32 @@ def reached_modules(module: str) -> list[str]:
 
 
 def _imported_by(module: str) -> Iterator[str]:
-    return filter(_is_ours, _names_imported(_source_of(module).read_bytes()))
+    return (name for name in _ours_imported(_source_of(module).read_bytes()) if _source_of(name).is_file())
 
 
 @cache
-def _names_imported(source: bytes) -> tuple[str, ...]:
-    """Full names of all that a module's code imports, of ``from a import b`` both ``a`` and ``a.b``."""
+def _ours_imported(source: bytes) -> tuple[str, ...]:
+    """Full names of what a module's code imports of this package, of ``from a import b`` also ``a.b``."""
     names: list[str] = []
-    for node in _running(ast.parse(source)):
-        if isinstance(node, ast.Import):
-            names += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            names += [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
-    return tuple(names)
+    for statement in _running(ast.parse(source)):
+        if isinstance(statement, ast.Import):
+            names += [alias.name for alias in statement.names]
+        elif isinstance(statement, ast.ImportFrom) and statement.module:
+            names += [statement.module, *(f"{statement.module}.{alias.name}" for alias in statement.names)]
+    return tuple(name for name in names if name.partition(".")[0] == _ROOT.name)
 
 
-def _running(node: ast.AST) -> Iterator[ast.AST]:
-    """All nodes below one but those in ``if TYPE_CHECKING:``."""
-    for child in ast.iter_child_nodes(node):
-        if isinstance(child, ast.If) and isinstance(child.test, ast.Name) and child.test.id == "TYPE_CHECKING":
-            children: list[ast.AST] = [*child.orelse]
-        else:
-            children = [child]
-        for each in children:
-            yield each
-            yield from _running(each)
-
-
-def _is_ours(module: str) -> bool:
-    return module.partition(".")[0] == _ROOT.name and _source_of(module).is_file()
+def _running(module: ast.Module) -> Iterator[ast.AST]:
+    """All statements of a module, at any depth, but those in ``if TYPE_CHECKING:``."""
+    waiting: list[ast.AST] = [module]
+    while waiting:
+        node = waiting.pop()
+        yield node
+        is_for_types = (
+            isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+        )
+        for field in ("orelse",) if is_for_types else _BLOCKS:
+            waiting += getattr(node, field, ())
 
 
 def _source_of(module: str) -> Path:

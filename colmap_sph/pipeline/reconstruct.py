@@ -30,7 +30,7 @@ from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
-from colmap_sph.pipeline.workers import one_opencv_thread
+from colmap_sph.pipeline.workers import room_for_workers
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.undistortion import UndistortionOptions
@@ -217,7 +217,7 @@ def reconstruct(
     report = report or RunReport()
     report.until = until
     options = options if limit is None else widest(options, limit)
-    with one_opencv_thread():
+    with room_for_workers():
         context, selection = start(
             workspace,
             options,

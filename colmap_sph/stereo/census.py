@@ -4,7 +4,6 @@ Census (Zabih and Woodfill 1994, 9 × 7 here) tells what a window shows whatever
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,14 +15,10 @@ from colmap_sph.stereo.resampling import half_size
 
 CENSUS_INVALID = np.uint64(1 << 63)
 """Census of a pixel without image content."""
-_BORDER = (3, 3, 4, 4)  # top, bottom, left, right
-# Census compares 1/64 grey values, see CENSUS_MARGIN in `matching.h`: on weak texture, whole ones are too coarse.
-_STEPS = 64
+_BORDER = (3, 4)  # rows at the top and at the bottom, columns at either side
 # Unsharp masking, which gives back some of what lenses and resampling took away: so much of the difference from
 # the binomial mean of 3 x 3 pixels is added.
 _SHARPENING = 0.6
-_BINOMIAL = np.outer((1, 2, 1), (1, 2, 1)) / 16
-_UNSHARP = _STEPS * ((1 + _SHARPENING) * np.outer((0, 1, 0), (0, 1, 0)) - _SHARPENING * _BINOMIAL)
 _CONTENT = np.uint8(255)  # where an image has content, in masks; a level's pixel has where half of its four have
 _HALF_CONTENT = 128
 
@@ -44,7 +39,9 @@ def pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
         valid = images[-1].valid
         height, width = valid.shape
         if height % 2 or width % 2:
-            valid = _with_border(valid, (0, height % 2, 0, width % 2), cv2.BORDER_CONSTANT)
+            valid = np.asarray(
+                cv2.copyMakeBorder(valid, 0, height % 2, 0, width % 2, cv2.BORDER_CONSTANT, value=0)
+            )
         coarse_valid = cv2.resize(valid, pixels.shape[::-1], interpolation=cv2.INTER_AREA)
         images.append(RectifiedImage(pixels, np.where(coarse_valid >= _HALF_CONTENT, _CONTENT, np.uint8(0))))
     return images
@@ -52,14 +49,9 @@ def pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
 
 def census(image: RectifiedImage) -> NDArray[np.uint64]:
     """(H, W) uint64: a bit for each neighbour, set where it is darker, and `CENSUS_INVALID` without content."""
-    # Sharpened with its border, which a warped image has inside.
-    padded = _with_border(image.image, _BORDER, cv2.BORDER_REPLICATE)
-    padded = cv2.filter2D(padded, cv2.CV_32F, _UNSHARP, borderType=cv2.BORDER_REPLICATE).astype(np.int16)
+    height, width = image.image.shape
+    padded = np.empty((height + 2 * _BORDER[0], width + 2 * _BORDER[1]), dtype=np.int16)
+    _native.sharpen(np.ascontiguousarray(image.image), _SHARPENING, padded)
     words = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), words)
     return words
-
-
-def _with_border(image: NDArray[Any], border: tuple[int, int, int, int], kind: int) -> NDArray[Any]:
-    """The image with rows and columns added at its top, bottom, left and right."""
-    return np.asarray(cv2.copyMakeBorder(image, *border, kind, value=0))

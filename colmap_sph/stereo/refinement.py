@@ -32,8 +32,8 @@ _MATCH_SIGMA = 0.2
 _EQUATIONS = 12
 _SOURCES = 32
 
-# A partner's image, and where the pixels of the view lie in it.
-_Partner = tuple[NDArray[np.uint8], NDArray[np.float64]]
+# A partner's image, each pixel with the one below it, and where the pixels of the view lie in it.
+_Partner = tuple[NDArray[np.uint16], NDArray[np.float64]]
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def refine_maps(
         The parameters; where there was none, there is none.
     """
     options = replace(options, depth_freedom=options.depth_freedom * _trust(residual * float(view.K[0, 0])))
-    partners = [(source_image, pixel_transfer(view, source)) for source, source_image in sources]
+    partners = [(_paired(source_image), pixel_transfer(view, source)) for source, source_image in sources]
     if options.rounds:
         partners = _most_telling(view, image, estimate, normals, depth, partners, options)
     K = np.ascontiguousarray(view.K)
@@ -141,6 +141,14 @@ def refine_maps(
             _native.refine_planes(equations, sigma, slope_sigma, planes)
             _native.maps_of_planes(planes, K, first, normals, depth)
     return normals, depth
+
+
+def _paired(image: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """(H - 1, W) uint16: each pixel of an (H, W) image, and in the upper byte the one below it."""
+    pairs = np.empty((max(image.shape[0] - 1, 0), *image.shape[1:], 2), np.uint8)
+    pairs[..., 0] = image[:-1]
+    pairs[..., 1] = image[1:]
+    return pairs.view("<u2")[..., 0].astype(np.uint16, copy=False)
 
 
 def _trust(residual: float) -> float:

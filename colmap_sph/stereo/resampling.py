@@ -6,13 +6,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph import _native
 from colmap_sph.scene import View
 from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, pixel_from_rectified_ray
 
 # Images are resampled in bands of this many rows, which bounds the memory for their maps.
 _BAND_ROWS = 128
-# Rays of length about 1 whose depth is less lie beside the camera.
-_LEAST_DEPTH = 1e-6
 
 
 def resample(
@@ -50,7 +49,7 @@ def resample(
     tables = ray_tables(view, pair, side)
     for first in range(0, pair.height, _BAND_ROWS):
         band = slice(first, first + _BAND_ROWS)
-        columns, rows, inside = pixel_maps(view, *tables.rays(band))
+        columns, rows, inside = tables.source_pixels(view, band)
         if mask is not None:
             inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
         valid[band] = inside
@@ -78,12 +77,24 @@ class RayTables:
     columns: NDArray[np.float32]
     weights: NDArray[np.float32]
 
-    def rays(self, rows: slice, columns: slice = slice(None)) -> tuple[NDArray[np.float32], ...]:
-        """Homogeneous source pixels x, y and z of some rectified ones; on the sphere their rays have length 1."""
-        return tuple(
-            np.multiply.outer(row[rows], self.weights[columns]) + column[columns]
-            for row, column in zip(self.rows, self.columns, strict=True)
+    def source_pixels(
+        self, view: View, rows: slice, columns: slice = slice(None)
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+        """Source columns and rows (pixel centres at whole numbers) of some rectified pixels; 255 where inside."""
+        ray_rows = np.ascontiguousarray(self.rows[:, rows])
+        ray_columns = np.ascontiguousarray(self.columns[:, columns])
+        weights = np.ascontiguousarray(self.weights[columns])
+        shape = (ray_rows.shape[1], len(weights))
+        places = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+        inside = np.empty(shape, dtype=np.uint8)
+        _native.source_pixels(
+            ray_rows, ray_columns, weights, view.width, view.height, places[0], places[1], inside
         )
+        return *places, inside
+
+    def depths(self, rows: slice, columns: slice) -> NDArray[np.float32]:
+        """Depths, in the view, of some rectified pixels' rays, which have length 1 on the sphere."""
+        return np.asarray(np.multiply.outer(self.rows[2][rows], self.weights[columns]) + self.columns[2][columns])
 
 
 def ray_tables(view: View, pair: RectifiedPair, side: Side) -> RayTables:
@@ -101,18 +112,3 @@ def ray_tables(view: View, pair: RectifiedPair, side: Side) -> RayTables:
         row_table = np.outer(A[:, 1], across) + A[:, 2:3]
     tables = row_table, np.outer(A[:, 0], column_table), column_weight
     return RayTables(*(table.astype(np.float32) for table in tables))
-
-
-def pixel_maps(
-    view: View, x: NDArray[np.float32], y: NDArray[np.float32], z: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Source columns and rows (pixel centres at whole numbers) of rectified pixels, in place; the valid mask."""
-    in_front = z > _LEAST_DEPTH
-    np.divide(1, z, out=z, where=in_front)
-    x *= z
-    y *= z
-    inside = in_front & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
-    # COLMAP counts from the pixel's corner, cv2.remap from its centre.
-    x -= 0.5
-    y -= 0.5
-    return x, y, inside.astype(np.uint8) * 255

@@ -207,9 +207,8 @@ static void run_fit_offsets(const kernel_table *k, image_size size) {
 
 static void run_mean_offsets(const kernel_table *k, image_size size) {
     FILL(int32_t, offset, PIXELS, offset_of(x))
-    MAKE(int32_t, sums, 2 * size.width);
     MAKE(int32_t, mean, PIXELS);
-    EACH_TIME k->mean_offsets(offset, size.height, size.width, 3, 768, sums, mean);
+    EACH_TIME k->mean_offsets(offset, size.height, size.width, 3, 768, mean);
     HASH(mean, PIXELS);
 }
 
@@ -291,12 +290,13 @@ static void run_fit_planes(const kernel_table *k, image_size size) {
 static void run_add_patch_equations(const kernel_table *k, image_size size) {
     FILL(uint8_t, grey, PIXELS, 7 * i + between(0, 60))
     FILL(uint8_t, source, PIXELS, 7 * i + between(0, 60))
+    FILL(uint16_t, pairs, PIXELS - size.width, source[i] | source[i + size.width] << 8)
     FILL(float, planes, 3 * PIXELS, i < PIXELS ? (seldom(8) ? 0 : 1 / depth_of(x)) : real_between(-1e-4f, 1e-4f))
     FILL(float, equations, PATCH_EQUATIONS *PIXELS, 0)
     const grey_image reference = {grey, size.height, size.width};
     const patch_source sources[2] = {
-        {{source, size.height, size.width}, {1, 0.01, 0.1, -0.01, 1, 0.2, 0, 0, 1}, {15, 2, 0.1}},
-        {{source, size.height, size.width}, {1, 0, 0, 0, 1, 0, 0, 0, 1}, {-9, -2, 0}}};
+        {{pairs, size.height - 1, size.width}, {1, 0.01, 0.1, -0.01, 1, 0.2, 0, 0, 1}, {15, 2, 0.1}},
+        {{pairs, size.height - 1, size.width}, {1, 0, 0, 0, 1, 0, 0, 0, 1}, {-9, -2, 0}}};
     const patch_rows rows = {0, 1, size.height};
     const patch_options options = {20, -1};
     EACH_TIME k->add_patch_equations(&reference, sources, 2, planes, rows, options, equations);

@@ -147,7 +147,7 @@ static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t c
  * in the source. */
 static inline int locate(const block_windows *windows, const patch_source *source, block_place *k) {
     const double *m = source->matrix, *t = source->translation, y = windows->row, half = 0.5 * (SIDE - 1);
-    const double last_u = (double)(source->image.width - 1), last_v = (double)(source->image.height - 2);
+    const double last_u = (double)(source->image.width - 1), last_v = (double)(source->image.height - 1);
     const int32_t width = (int32_t)source->image.width;
     double u[LANES], v[LANES];
     for (int l = 0; l < LANES; l++) {
@@ -163,7 +163,7 @@ static inline int locate(const block_windows *windows, const patch_source *sourc
         /* From COLMAP's coordinates to those of the array, where pixel 0 is at 0. */
         const double cu = pu - 0.5, cv = pv - 0.5;
         const double du = half * (fabs(ux) + fabs(uy)) + 0.01, dv = half * (fabs(vx) + fabs(vy)) + 0.01;
-        /* False for NaN. A row is kept free below: pixels are read four at a time, past the end of their row. */
+        /* False for NaN. */
         const int in = (windows->there[l] > 0) & (z > 1e-9) & (du < REACH - 1) & (dv < REACH - 1) & (cu >= du) &
                        (cv >= dv) & (cu + du < last_u) & (cv + dv < last_v);
         u[l] = in ? cu : 0;
@@ -189,12 +189,12 @@ static inline int locate(const block_windows *windows, const patch_source *sourc
     return any > 0;
 }
 
-/* The four bytes at each of the offsets. */
-static inline int_lanes load_words(const uint8_t *values, int_lanes offset) {
+/* The two pairs of pixels at each of the offsets: bytes of a pixel, the one below, those right of these two. */
+static inline int_lanes load_pairs(const uint16_t *values, int_lanes offset) {
 #ifdef __AVX512F__
-    return (int_lanes)_mm512_i32gather_epi32((__m512i)offset, values, 1);
+    return (int_lanes)_mm512_i32gather_epi32((__m512i)offset, values, 2);
 #elif defined(__AVX2__)
-    return (int_lanes)_mm256_i32gather_epi32((const int *)(const void *)values, (__m256i)offset, 1);
+    return (int_lanes)_mm256_i32gather_epi32((const int *)(const void *)values, (__m256i)offset, 2);
 #else
     int_lanes words;
     for (int l = 0; l < LANES; l++) {
@@ -209,14 +209,14 @@ static inline int_lanes load_words(const uint8_t *values, int_lanes offset) {
 /* A source, and where the taps of a block lie in it: those of a row through the middles of the windows, and how
  * far a row below is from there. */
 typedef struct {
-    const uint8_t *values, *below;
+    const uint16_t *values;
     int32_t width;
     lanes u[SIDE], v[SIDE];
     lanes uy, vy, uw, vw;
     int_lanes base;
 } block_taps;
 
-static inline void place_taps(const grey_image *source, const block_place *place, block_taps *taps) {
+static inline void place_taps(const paired_image *source, const block_place *place, block_taps *taps) {
     const lanes u = load(place->u), v = load(place->v), ux = load(place->ux), vx = load(place->vx);
     for (int i = 0; i < SIDE; i++) {
         const float dx = (float)i - 0.5f * (SIDE - 1);
@@ -224,7 +224,6 @@ static inline void place_taps(const grey_image *source, const block_place *place
         taps->v[i] = v + vx * dx;
     }
     taps->values = source->values;
-    taps->below = source->values + source->width;
     taps->width = (int32_t)source->width;
     taps->uy = load(place->uy);
     taps->vy = load(place->vy);
@@ -238,11 +237,10 @@ static inline lanes sample(const block_taps *k, lanes u, lanes v, lanes *slope) 
     const int_lanes x = __builtin_convertvector(u, int_lanes), y = __builtin_convertvector(v, int_lanes);
     const lanes fu = u - __builtin_convertvector(x, lanes), fv = v - __builtin_convertvector(y, lanes);
     const int_lanes offset = k->base + y * k->width + x;
-    const int_lanes upper = load_words(k->values, offset), lower = load_words(k->below, offset);
-    const int_lanes a = upper & 255, c = lower & 255;
+    const int_lanes four = load_pairs(k->values, offset), a = four & 255, c = four >> 8 & 255;
     /* Differences of integers are exact as well, and leave the units of floating-point numbers free. */
-    const lanes across = __builtin_convertvector((upper >> 8 & 255) - a, lanes),
-                across_below = __builtin_convertvector((lower >> 8 & 255) - c, lanes);
+    const lanes across = __builtin_convertvector((four >> 16 & 255) - a, lanes),
+                across_below = __builtin_convertvector((four >> 24 & 255) - c, lanes);
     const lanes above = __builtin_convertvector(a, lanes) + fu * across,
                 below = __builtin_convertvector(c, lanes) + fu * across_below;
     *slope = (across + fv * (across_below - across)) * k->uw + (below - above) * k->vw;
@@ -291,7 +289,7 @@ static inline void accumulate_row(const block_taps *taps, const lanes *reference
 }
 
 /* All taps of a block in a source. */
-static inline void match_block(const block_windows *windows, const grey_image *source, const block_place *place,
+static inline void match_block(const block_windows *windows, const paired_image *source, const block_place *place,
                                block_sums *sums) {
     block_taps taps;
     place_taps(source, place, &taps);

@@ -52,6 +52,12 @@ typedef struct {
     ptrdiff_t height, width;
 } grey_image;
 
+/* Each pixel (the lower byte) with the one below it; a row less than the image has. */
+typedef struct {
+    const uint16_t *values;
+    ptrdiff_t height, width;
+} paired_image;
+
 typedef struct {
     float contrast;  /* grey values: pixels that differ by more from the middle of a window hardly count */
     float min_score; /* windows that correlate less do not count */
@@ -64,7 +70,7 @@ enum { PATCH_EQUATIONS = 12 };
 /* An image to match in: a pixel (x, y, 1) of the reference with inverse depth w lies at
  * matrix (x, y, 1) + w translation. */
 typedef struct {
-    grey_image image;
+    paired_image image;
     double matrix[9], translation[3];
 } patch_source;
 

@@ -201,7 +201,7 @@ FUNCTION(fit_planes, FIT_PLANES, check_fit_planes,
 #define ADD_PATCH_EQUATIONS(X) \
     X(VALUE, backend, backend) \
     X(IN, uint8, image, H, W) \
-    X(IMAGES, uint8, sources, SOURCES) \
+    X(IMAGES, uint16, sources, SOURCES) \
     X(IN, float64, sources_from_reference, SOURCES, 3, 4) \
     X(IN, float32, planes, 3, ROWS, W) \
     X(VALUE, ptrdiff, first_row) \
@@ -241,15 +241,17 @@ static int run_add_patch_equations(void *arguments) {
     patch_source sources[MAX_PATCH_SOURCES];
     for (ptrdiff_t k = 0; k < a->size.SOURCES; k++) {
         sources[k].image =
-            (grey_image){a->sources->image[k].values, a->sources->image[k].height, a->sources->image[k].width};
+            (paired_image){a->sources->image[k].values, a->sources->image[k].height, a->sources->image[k].width};
         split_transfer(a->sources_from_reference + 12 * k, sources[k].matrix, sources[k].translation);
     }
     a->backend->add_patch_equations(&reference, sources, a->size.SOURCES, a->planes, rows, options, a->equations);
     return 0;
 }
 
-FUNCTION(add_patch_equations, ADD_PATCH_EQUATIONS, check_add_patch_equations,
-         "Add the normal equations of matching planes of every `row_step`-th row in each of the sources.");
+FUNCTION(
+    add_patch_equations, ADD_PATCH_EQUATIONS, check_add_patch_equations,
+    "Add the normal equations of matching planes of every `row_step`-th row in each of the sources, where every\n"
+    "pixel (the lower byte) has the one below it beside it.");
 
 #define PLANES_OF_MAPS(X) \
     X(IN, float32, normals, H, W, 3) \

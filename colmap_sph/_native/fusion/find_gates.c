@@ -7,7 +7,8 @@ void find_gates(const view_maps *reference, const view_maps *partner, const fusi
         const ptrdiff_t p = rows[k] * reference->width + columns[k];
         meeting met = {.gate = GATE_UNSEEN};
         if (reference->depth[p] > 0) {
-            met = meet(reference, partner, transfer, gates, rows[k], columns[k]);
+            const sighting seen = sight(transfer, columns[k], rows[k], reference->depth[p]);
+            met = meet(reference, partner, transfer, gates, p, seen);
         }
         gate[k] = (uint8_t)met.gate;
         distance[k] = met.gate == GATE_UNSEEN ? 0 : (float)sqrt(met.du * met.du + met.dv * met.dv);

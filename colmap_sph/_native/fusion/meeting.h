@@ -23,15 +23,23 @@ static inline float cosine_after(const double *m, direction from, direction to) 
     return (float)(x * to.x + y * to.y + z * to.z);
 }
 
+/* A pixel's place in the partner's image, from the corner of the first pixel, so that whole numbers are pixels,
+ * and its depth there. */
+typedef struct {
+    double u, v, depth;
+} sighting;
+
+static inline sighting sight(const fusion_transfer *transfer, double column, double row, double depth) {
+    const vector seen = transform(transfer->pixel_from_reference, transfer->translation, column, row, depth);
+    return (sighting){seen.x / seen.z + 0.5, seen.y / seen.z + 0.5, seen.z};
+}
+
+/* Of pixel p of the reference, which the partner sights. */
 static inline meeting meet(const view_maps *reference, const view_maps *partner, const fusion_transfer *transfer,
-                           fusion_gates gates, ptrdiff_t row, ptrdiff_t column) {
+                           fusion_gates gates, ptrdiff_t p, sighting seen) {
     meeting met = {.gate = GATE_UNSEEN};
-    const ptrdiff_t p = row * reference->width + column;
-    const vector seen = transform(transfer->pixel_from_reference, transfer->translation, (double)column,
-                                  (double)row, reference->depth[p]);
-    /* From the corner of the first pixel, so that whole numbers are pixels. */
-    const double u = seen.x / seen.z + 0.5, v = seen.y / seen.z + 0.5;
-    if (!(seen.z > 0 && u >= 0 && v >= 0 && u < (double)partner->width && v < (double)partner->height)) {
+    const double u = seen.u, v = seen.v;
+    if (!(seen.depth > 0 && u >= 0 && v >= 0 && u < (double)partner->width && v < (double)partner->height)) {
         return met;
     }
     met.x = (ptrdiff_t)u;
@@ -44,7 +52,7 @@ static inline meeting meet(const view_maps *reference, const view_maps *partner,
     met.gate = GATE_DEPTH;
     met.du = u - 0.5 - (double)met.x;
     met.dv = v - 0.5 - (double)met.y;
-    if (!(fabsf(met.depth - (float)seen.z) <= gates.max_depth_error * met.depth)) {
+    if (!(fabsf(met.depth - (float)seen.depth) <= gates.max_depth_error * met.depth)) {
         return met;
     }
     met.own = normal_at(reference, p);

@@ -1,6 +1,4 @@
 /* The matching kernels as Python's functions. */
-#include <stdlib.h>
-
 #include "boundary.h"
 
 _Static_assert(CENSUS_RADIUS_Y == 3 && CENSUS_RADIUS_X == 4, "H + 6, W + 8 below");
@@ -286,12 +284,7 @@ static int check_mean_offsets(const void *arguments) {
 
 static int run_mean_offsets(void *arguments) {
     const mean_offsets_arguments *a = arguments;
-    int32_t *sums = malloc((size_t)(2 * a->size.W + 1) * sizeof *sums);
-    if (!sums) {
-        return -1;
-    }
-    a->backend->mean_offsets(a->offset, a->size.H, a->size.W, a->radius, a->max_step, sums, a->mean);
-    free(sums);
+    a->backend->mean_offsets(a->offset, a->size.H, a->size.W, a->radius, a->max_step, a->mean);
     return 0;
 }
 
@@ -306,7 +299,8 @@ ARGUMENTS(upsample_offsets, UPSAMPLE_OFFSETS);
 
 static int check_upsample_offsets(const void *arguments) {
     const upsample_offsets_arguments *a = arguments;
-    return check_finer(&a->size) && check(a->max_step >= 0, "max_step must not be negative");
+    return check_finer(&a->size) &&
+           check(a->max_step >= 0 && a->max_step <= MAX_MEAN_STEP, "max_step must lie in 0..1048576");
 }
 
 static int run_upsample_offsets(void *arguments) {

@@ -25,9 +25,9 @@ enum {
     MAX_MEAN_STEP = 1 << 20
 };
 
-/* Census images come in 1/64 grey value (_CENSUS_STEPS in matching.py); a difference up to half a grey value,
- * which may be rounding, counts as none. */
-enum { CENSUS_MARGIN = 32 };
+/* Census images come in 1/64 grey value: on weak texture, whole ones are too coarse. A difference up to half a
+ * grey value, which may be rounding, counts as none. */
+enum { CENSUS_STEPS = 64, CENSUS_MARGIN = CENSUS_STEPS / 2 };
 
 /* Bit 63 of a census word marks a pixel without image content. */
 #define CENSUS_INVALID (UINT64_C(1) << 63)
@@ -102,9 +102,9 @@ void unwarp_offsets(const int32_t *offset, const int32_t *prediction, ptrdiff_t 
                     int32_t *unwarped);
 
 /* Every offset becomes the mean, rounded towards itself, of those within `radius` of it that differ from it by no
- * more than `max_step`. `sums` has room for two rows. */
+ * more than `max_step`. */
 typedef void mean_offsets_fn(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int radius, int max_step,
-                             int32_t *sums, int32_t *mean);
+                             int32_t *mean);
 
 /* A level and the next finer one, of twice as many rows and columns or one less. */
 typedef struct {

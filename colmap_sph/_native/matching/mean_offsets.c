@@ -7,33 +7,72 @@
 /* Sums of differences fit in 32 bits. */
 _Static_assert((2 * MAX_MEAN_RADIUS + 1) * (2 * MAX_MEAN_RADIUS + 1) * (int64_t)MAX_MEAN_STEP < INT32_MAX, "sums");
 
-/* To the sums and counts of a row's pixels, those of the pixels of another row that lie dx to the right. */
-static void add_row(const int32_t *own, const int32_t *other, ptrdiff_t width, ptrdiff_t dx, int32_t max_step,
-                    int32_t *sum, int32_t *count) {
-    const ptrdiff_t first = dx < 0 ? -dx : 0, end = dx > 0 ? width - dx : width;
-    for (ptrdiff_t x = first; x < end; x++) {
-        /* Unsigned, as the difference of extremes wraps round, to one of the other sign. */
-        const int32_t difference = (int32_t)((uint32_t)other[x + dx] - (uint32_t)own[x]);
-        const int32_t kept = -((difference <= max_step) & (difference >= -max_step) &
-                               ((difference < 0) == (other[x + dx] < own[x])));
-        sum[x] += difference & kept;
-        count[x] -= kept;
+typedef int32_t lanes __attribute__((vector_size(4 * LANES)));
+typedef uint32_t unsigned_lanes __attribute__((vector_size(4 * LANES)));
+
+static inline lanes load_lanes(const int32_t *p) {
+    lanes v;
+    memcpy(&v, p, sizeof v);
+    return v;
+}
+
+/* Rows of a window that lie in the image, from the middle. */
+typedef struct {
+    ptrdiff_t first, last;
+} row_range;
+
+/* Means of LANES pixels in a row, whose windows reach beyond neither side; `own` is the first of them. */
+static inline void mean_of_lanes(const int32_t *own, ptrdiff_t width, row_range rows, int radius, int32_t max_step,
+                                 int32_t *mean) {
+    const lanes middle = load_lanes(own);
+    lanes sum = {0}, count = {0};
+    for (ptrdiff_t dy = rows.first; dy <= rows.last; dy++) {
+        for (ptrdiff_t dx = -radius; dx <= radius; dx++) {
+            const lanes other = load_lanes(own + dy * width + dx);
+            /* Wraps round for extremes, to one of the other sign. */
+            const lanes difference = (lanes)((unsigned_lanes)other - (unsigned_lanes)middle);
+            const lanes kept =
+                (difference <= max_step) & (difference >= -max_step) & ((difference < 0) == (other < middle));
+            sum += difference & kept;
+            count -= kept;
+        }
+    }
+    for (int l = 0; l < LANES; l++) {
+        mean[l] = middle[l] + sum[l] / count[l];
     }
 }
 
-void VERSION_OF(mean_offsets)(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int radius, int max_step,
-                              int32_t *sums, int32_t *mean) {
-    int32_t *counts = sums + width;
-    for (ptrdiff_t y = 0; y < height; y++) {
-        const int32_t *own = offset + y * width;
-        memset(sums, 0, (size_t)(2 * width) * sizeof *sums);
-        for (ptrdiff_t dy = -radius; dy <= radius; dy++) {
-            for (ptrdiff_t dx = -radius; dx <= radius && y + dy >= 0 && y + dy < height; dx++) {
-                add_row(own, own + dy * width, width, dx, max_step, sums, counts);
+static inline int32_t mean_at(const int32_t *row, ptrdiff_t width, row_range rows, ptrdiff_t x, int radius,
+                              int32_t max_step) {
+    int32_t sum = 0, count = 0;
+    for (ptrdiff_t dy = rows.first; dy <= rows.last; dy++) {
+        for (ptrdiff_t dx = -radius; dx <= radius; dx++) {
+            if (x + dx >= 0 && x + dx < width) {
+                const int64_t difference = (int64_t)row[dy * width + x + dx] - row[x];
+                const int kept = difference <= max_step && difference >= -max_step;
+                sum += kept ? (int32_t)difference : 0;
+                count += kept;
             }
         }
+    }
+    return row[x] + sum / count;
+}
+
+void VERSION_OF(mean_offsets)(const int32_t *offset, ptrdiff_t height, ptrdiff_t width, int radius, int max_step,
+                              int32_t *mean) {
+    for (ptrdiff_t y = 0; y < height; y++) {
+        const int32_t *row = offset + y * width;
+        const row_range rows = {y < radius ? -y : -radius, height - 1 - y < radius ? height - 1 - y : radius};
+        const ptrdiff_t end = width - radius, last = end - LANES; /* of whole windows */
+        for (ptrdiff_t x = radius; last >= radius && x < end; x += LANES) {
+            /* The last block overlaps the one before it. */
+            const ptrdiff_t first = x < last ? x : last;
+            mean_of_lanes(row + first, width, rows, radius, max_step, mean + y * width + first);
+        }
         for (ptrdiff_t x = 0; x < width; x++) {
-            mean[y * width + x] = own[x] + sums[x] / counts[x];
+            if (last < radius || x < radius || x >= end) {
+                mean[y * width + x] = mean_at(row, width, rows, x, radius, max_step);
+            }
         }
     }
 }

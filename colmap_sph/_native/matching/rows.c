@@ -15,14 +15,13 @@ int selection_begin(selection_buffers *buffers, match_size size) {
     /* Three more, as vectorised versions read four at once. */
     const ptrdiff_t best_sums = size.target_width + 2 * size.depth + 3;
     const size_t words = (size_t)(size.width + size.target_width + size.source_width);
-    buffers->winner = malloc(words * sizeof(int32_t) + (size_t)(best_sums + size.source_width));
+    buffers->winner = malloc(words * sizeof(int32_t) + (size_t)best_sums);
     if (!buffers->winner) {
         return -1;
     }
     buffers->rival = buffers->winner + size.width;
-    buffers->place = buffers->rival + size.target_width;
-    buffers->best_sum = (uint8_t *)(buffers->place + size.source_width);
-    buffers->source_sum = buffers->best_sum + best_sums;
+    buffers->best = (uint32_t *)(buffers->rival + size.target_width);
+    buffers->best_sum = (uint8_t *)(buffers->best + size.source_width);
     return 0;
 }
 
@@ -30,23 +29,27 @@ void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, c
     /* Where a surface is stretched, its target pixels skip columns of the source: they stand for these, too. */
     enum { MAX_STRETCH = 4 };
     const int32_t source_width = (int32_t)size.source_width, target_width = (int32_t)size.target_width;
-    memset(buffers->source_sum, UINT8_MAX, (size_t)source_width);
+    uint32_t *best = buffers->best;
+    memset(best, UINT8_MAX, (size_t)source_width * sizeof *best);
     for (int32_t w = 0; w < target_width; w++) {
-        const int32_t first = columns[w] < 0 ? source_width : columns[w];
-        const int64_t step = w + 1 < target_width ? (int64_t)columns[w + 1] - first : 1;
-        const int64_t end = first + (step > 1 && step <= MAX_STRETCH ? step : 1);
-        for (int32_t c = first; c < end && c < source_width; c++) {
-            if (best_sum[w] < buffers->source_sum[c]) {
-                buffers->source_sum[c] = best_sum[w];
-                buffers->place[c] = w;
-            }
+        const int32_t first = columns[w];
+        if (first < 0 || first >= source_width) {
+            continue;
+        }
+        const uint32_t own = (uint32_t)best_sum[w] << 24 | (uint32_t)w;
+        best[first] = own < best[first] ? own : best[first];
+        const uint32_t step = w + 1 < target_width ? (uint32_t)columns[w + 1] - (uint32_t)first : 1;
+        for (uint32_t i = 1; i < step && step <= MAX_STRETCH && first + (int32_t)i < source_width; i++) {
+            uint32_t *skipped = best + first + i;
+            *skipped = own < *skipped ? own : *skipped;
         }
     }
     for (int32_t w = 0; w < target_width; w++) {
         const int32_t c = columns[w];
-        const int shown = c >= 0 && c < source_width && buffers->source_sum[c] < UINT8_MAX;
-        buffers->rival[w] = shown ? buffers->place[c] : w;
-        best_sum[w] = shown ? buffers->source_sum[c] : best_sum[w];
+        const uint32_t there = c >= 0 && c < source_width ? best[c] : UINT32_MAX;
+        const int shown = there >> 24 < UINT8_MAX;
+        buffers->rival[w] = shown ? (int32_t)(there & 0xffffff) : w;
+        best_sum[w] = shown ? (uint8_t)(there >> 24) : best_sum[w];
     }
 }
 

@@ -44,11 +44,10 @@ typedef void sweep_rows_fn(sweep_state *state, ptrdiff_t y, ptrdiff_t rows, cons
 /* ---- selection --------------------------------------------------------------------------------------------- */
 
 typedef struct {
-    int32_t *winner;     /* of every pixel its best slot; -1 without content */
-    int32_t *rival;      /* of every target pixel the one whose sum it is checked against, */
-    uint8_t *best_sum;   /* and that sum; at first the least of its own, with `depth` more on both sides */
-    int32_t *place;      /* of every source column the target pixel with the least sum, */
-    uint8_t *source_sum; /* and that sum */
+    int32_t *winner;   /* of every pixel its best slot; -1 without content */
+    int32_t *rival;    /* of every target pixel the one whose sum it is checked against, */
+    uint8_t *best_sum; /* and that sum; at first the least of its own, with `depth` more on both sides */
+    uint32_t *best;    /* of every source column the least sum, and in 24 bits the target pixel that has it */
 } selection_buffers;
 
 /* 0, or -1 without memory; ended by free(buffers->winner). */

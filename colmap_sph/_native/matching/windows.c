@@ -13,24 +13,33 @@ static three_rows rows_around(const int32_t *offset, level_sizes size, ptrdiff_t
     return (three_rows){above, offset + y * size.width, offset + within(y + 1, size.height) * size.width};
 }
 
-ALWAYS_INLINE int64_t least_of(int64_t a, int64_t b, int64_t c) { return a < b ? (a < c ? a : c) : b < c ? b : c; }
+ALWAYS_INLINE int32_t least_of(int32_t a, int32_t b, int32_t c) { return a < b ? (a < c ? a : c) : b < c ? b : c; }
 
-ALWAYS_INLINE int64_t most_of(int64_t a, int64_t b, int64_t c) { return a > b ? (a > c ? a : c) : b > c ? b : c; }
+ALWAYS_INLINE int32_t most_of(int32_t a, int32_t b, int32_t c) { return a > b ? (a > c ? a : c) : b > c ? b : c; }
+
+/* Differences may wrap round, where they are too large to be used. */
+ALWAYS_INLINE int32_t minus(int32_t a, int32_t b) { return (int32_t)((uint32_t)a - (uint32_t)b); }
+
+ALWAYS_INLINE int32_t plus(int32_t a, int32_t b) { return (int32_t)((uint32_t)a + (uint32_t)b); }
+
+ALWAYS_INLINE int32_t three_times(int32_t a) { return (int32_t)(3 * (uint32_t)a); }
 
 /* Two pixels of a finer row, a quarter of a pixel from the middle towards the row beside it. */
 ALWAYS_INLINE void upsample_pixel(three_rows rows, const int32_t *beside, ptrdiff_t left, ptrdiff_t x,
-                                  ptrdiff_t right, int max_step, int32_t fine[2]) {
+                                  ptrdiff_t right, int32_t max_step, int32_t *restrict fine) {
     const int32_t *a = rows.above, *o = rows.own, *b = rows.below;
-    const int64_t least = least_of(least_of(a[left], a[x], a[right]), least_of(o[left], o[x], o[right]),
+    const int32_t least = least_of(least_of(a[left], a[x], a[right]), least_of(o[left], o[x], o[right]),
                                    least_of(b[left], b[x], b[right]));
-    const int64_t most = most_of(most_of(a[left], a[x], a[right]), most_of(o[left], o[x], o[right]),
+    const int32_t most = most_of(most_of(a[left], a[x], a[right]), most_of(o[left], o[x], o[right]),
                                  most_of(b[left], b[x], b[right]));
-    const int64_t middle = 9 * (int64_t)o[x] + 3 * (int64_t)beside[x] + 8;
-    const int64_t first = (middle + 3 * (int64_t)o[left] + beside[left]) >> 4;
-    const int64_t second = (middle + 3 * (int64_t)o[right] + beside[right]) >> 4;
-    const int interpolates = most - least <= max_step;
-    fine[0] = interpolates ? (int32_t)first : o[x];
-    fine[1] = interpolates ? (int32_t)second : o[x];
+    const int32_t span = minus(most, least); /* negative where it wraps round */
+    const int interpolates = span >= 0 && span <= max_step;
+    /* 1/16 of 9 times its own, 3 times those beside it and once the one across, less its own. */
+    const int32_t middle = plus(three_times(minus(beside[x], o[x])), 8);
+    const int32_t first = plus(three_times(minus(o[left], o[x])), minus(beside[left], o[x]));
+    const int32_t second = plus(three_times(minus(o[right], o[x])), minus(beside[right], o[x]));
+    fine[0] = interpolates ? plus(o[x], plus(middle, first) >> 4) : o[x];
+    fine[1] = interpolates ? plus(o[x], plus(middle, second) >> 4) : o[x];
 }
 
 void upsample_offsets(const int32_t *offset, level_sizes size, int max_step, int32_t *fine) {
@@ -62,7 +71,8 @@ ALWAYS_INLINE int32_t in_steps(float pixels) {
 
 /* Whole number of slots by which a pixel's window moves. */
 ALWAYS_INLINE int32_t shift_of(int32_t least, int32_t most, int32_t predicted, int32_t room, int32_t farthest) {
-    const int32_t near = predicted < -FARTHEST ? -FARTHEST : predicted > FARTHEST ? FARTHEST : predicted;
+    const int32_t bounded = predicted < -FARTHEST ? -FARTHEST : predicted;
+    const int32_t near = bounded > FARTHEST ? FARTHEST : bounded;
     const int32_t above = most - near - room, below = near - least - room;
     int32_t shift = (above > 0 ? above : 0) - (below > 0 ? below : 0);
     shift = above > 0 && below > 0 ? shift / 2 : shift;
@@ -70,19 +80,28 @@ ALWAYS_INLINE int32_t shift_of(int32_t least, int32_t most, int32_t predicted, i
     return (shift + 128) >> 8;
 }
 
-void search_windows(const int32_t *predicted, const float *least, const float *most, level_sizes size,
-                    search_limits limits, int32_t *base) {
+/* First residuals of a finer row's pixels, whose row above in the pyramid has `width`, and they twice as many. */
+static void search_row(const int32_t *restrict predicted, const float *restrict least, const float *restrict most,
+                       ptrdiff_t width, search_limits limits, int32_t *restrict base) {
     const int32_t room = 128 * limits.depth - 256 * limits.clearance, half = limits.depth / 2;
     const int32_t farthest = 128 * limits.depth - 256 * limits.own_clearance;
+    for (ptrdiff_t x = 0; x < width; x++) {
+        const int32_t low = in_steps(least[x]), high = in_steps(most[x]);
+        base[2 * x] = shift_of(low, high, predicted[2 * x], room, farthest) - half;
+        base[2 * x + 1] = shift_of(low, high, predicted[2 * x + 1], room, farthest) - half;
+    }
+}
+
+void search_windows(const int32_t *predicted, const float *least, const float *most, level_sizes size,
+                    search_limits limits, int32_t *base) {
     for (ptrdiff_t y = 0; y < size.fine_height; y++) {
-        const ptrdiff_t coarse = (y >> 1) * size.width, fine = y * size.fine_width;
-        for (ptrdiff_t x = 0; x < size.width; x++) {
-            const int32_t low = in_steps(least[coarse + x]), high = in_steps(most[coarse + x]);
-            const ptrdiff_t p = fine + 2 * x;
-            base[p] = shift_of(low, high, predicted[p], room, farthest) - half;
-            if (2 * x + 1 < size.fine_width) {
-                base[p + 1] = shift_of(low, high, predicted[p + 1], room, farthest) - half;
-            }
+        const ptrdiff_t coarse = (y >> 1) * size.width, fine = y * size.fine_width, pairs = size.fine_width / 2;
+        search_row(predicted + fine, least + coarse, most + coarse, pairs, limits, base + fine);
+        if (size.fine_width % 2) { /* the last pixel has none beside it */
+            const int32_t last[2] = {predicted[fine + 2 * pairs], 0};
+            int32_t bases[2];
+            search_row(last, least + coarse + pairs, most + coarse + pairs, 1, limits, bases);
+            base[fine + 2 * pairs] = bases[0];
         }
     }
 }

@@ -117,6 +117,33 @@ static int run_target_bases(void *arguments) {
 FUNCTION(target_bases, TARGET_BASES, check_target_bases,
          "First columns of the target to search, less the pixel's own; torn pixels search the source as it is.");
 
+#define JOIN_TARGETS(X) \
+    X(IN, uint64, warped, H, W) \
+    X(IN, int32, warped_columns, H, W) \
+    X(IN, uint64, source, H, SOURCE_W) \
+    X(OUT, uint64, census, H, TARGET_W) \
+    X(OUT, int32, columns, H, TARGET_W)
+ARGUMENTS(join_targets, JOIN_TARGETS);
+
+static int check_join_targets(const void *arguments) {
+    const join_targets_arguments *a = arguments;
+    return check(a->size.SOURCE_W <= 65535, "rows are limited to 65535 columns") &&
+           check(a->size.TARGET_W - a->size.SOURCE_W >= a->size.W, "both images must fit beside each other");
+}
+
+static int run_join_targets(void *arguments) {
+    const join_targets_arguments *a = arguments;
+    const ptrdiff_t gap = a->size.TARGET_W - a->size.SOURCE_W - a->size.W;
+    const target_parts parts = {a->warped, a->source, a->warped_columns, a->size.H,
+                                a->size.W, gap,       a->size.SOURCE_W};
+    join_targets(parts, a->census, a->columns);
+    return 0;
+}
+
+FUNCTION(
+    join_targets, JOIN_TARGETS, check_join_targets,
+    "Census of a warped image, a gap without content and the source as it is side by side; and their columns.");
+
 #define BASES_ABOUT(X) \
     X(OUT, int32, offset, H, W) \
     X(VALUE, int, depth) \
@@ -228,16 +255,10 @@ static int run_decode_disparity(void *arguments) {
 
 FUNCTION(decode_disparity, DECODE_DISPARITY, any, "Disparities of codes; NaN where there is none.");
 
-native_function *const offsets_functions[] = {&keep_between_function,
-                                              &remove_small_segments_function,
-                                              &count_fractions_function,
-                                              &unwarp_torn_function,
-                                              &first_offsets_function,
-                                              &target_bases_function,
-                                              &bases_about_function,
-                                              &mark_steps_function,
-                                              &count_slopes_function,
-                                              &disparity_range_function,
-                                              &code_disparity_function,
-                                              &decode_disparity_function,
-                                              NULL};
+native_function *const offsets_functions[] = {&keep_between_function,     &remove_small_segments_function,
+                                              &count_fractions_function,  &unwarp_torn_function,
+                                              &first_offsets_function,    &target_bases_function,
+                                              &join_targets_function,     &bases_about_function,
+                                              &mark_steps_function,       &count_slopes_function,
+                                              &disparity_range_function,  &code_disparity_function,
+                                              &decode_disparity_function, NULL};

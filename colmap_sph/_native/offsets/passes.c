@@ -51,6 +51,25 @@ void target_bases(search_bases bases, int margin, int as_it_is, int gap, int32_t
     }
 }
 
+void join_targets(target_parts parts, uint64_t *census, int32_t *columns) {
+    const ptrdiff_t warped = parts.warped_width, source = parts.source_width;
+    for (ptrdiff_t y = 0; y < parts.height; y++) {
+        memcpy(census, parts.warped + y * warped, (size_t)warped * sizeof *census);
+        memcpy(columns, parts.columns + y * warped, (size_t)warped * sizeof *columns);
+        census += warped;
+        columns += warped;
+        for (ptrdiff_t x = 0; x < parts.gap; x++) {
+            *census++ = CENSUS_INVALID;
+            *columns++ = -1;
+        }
+        memcpy(census, parts.source + y * source, (size_t)source * sizeof *census);
+        census += source;
+        for (int32_t x = 0; x < (int32_t)source; x++) {
+            *columns++ = x;
+        }
+    }
+}
+
 void bases_about(int32_t *offset, ptrdiff_t pixels, int depth, int32_t first, int32_t last) {
     for (ptrdiff_t p = 0; p < pixels; p++) {
         const int32_t base = (plus(offset[p], 128) >> 8) - depth / 2;

@@ -13,7 +13,7 @@ _FADING = 0.5
 # Rows and columns of noise, and how far it moves, pixels.
 _NOISE = (400, 500, 20)
 # Seconds of one processor to match it where estimates come true.
-_NOISE_SECONDS = 0.027
+_NOISE_SECONDS = 0.024
 
 
 class Pace:

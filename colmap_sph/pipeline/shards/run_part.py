@@ -30,7 +30,7 @@ from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.stages.vote import VoteStage
-from colmap_sph.pipeline.workers import for_all, one_opencv_thread
+from colmap_sph.pipeline.workers import for_all, room_for_workers
 from colmap_sph.project.claim import claimed, shared
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.workspace import Workspace
@@ -114,7 +114,7 @@ def run_part(
         return _prepare(project, options, workspace, progress, report, overwrite=overwrite, verify=verify)
     if not workspace.state_dir.is_dir():
         raise _unprepared(workspace)
-    with shared(workspace), one_opencv_thread():
+    with shared(workspace), room_for_workers():
         prepared = find_prepared(project, options, workspace, progress, report)
         if prepared is None:
             raise _unprepared(workspace)
@@ -158,7 +158,7 @@ def _prepare(
     verify: bool,
 ) -> PartReport:
     """Do all that comes before the first pair, in a workspace that this job holds alone."""
-    with claimed(workspace), one_opencv_thread():
+    with claimed(workspace), room_for_workers():
         prepared = prepare(
             project,
             options,

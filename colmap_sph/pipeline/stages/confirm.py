@@ -36,14 +36,15 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.memory import MemoryGate
 
 # Processor seconds per megapixel of the image: per partner, and per partner's image that is matched in.
-_CONFIRM_SECONDS = 0.03
-_REFINE_SECONDS = 0.065
+_CONFIRM_SECONDS = 0.015
+_REFINE_SECONDS = 0.055
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
 _CONFIRM_BYTES = 40.0
 _REFINE_BYTES = 55.0
-# Per pixel: of an image and of an estimate in the cache.
+# Per pixel: of an image and of an estimate in the cache; of a partner's image as refinement reads it.
 _IMAGE_BYTES = 1
 _ESTIMATE_BYTES = 9
+_PAIRED_BYTES = 2
 # Caches take what the costliest image leaves, with some room to spare.
 _ROOM = 1.2
 
@@ -235,7 +236,8 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         seconds = confirm_seconds(len(partners), self.context.options.normals, refinement)
         memory = _CONFIRM_BYTES * pixels
         if refinement.rounds:
-            memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + _IMAGE_BYTES * sum(map(self._pixels, partners))
+            of_partners = (_IMAGE_BYTES + _PAIRED_BYTES) * sum(map(self._pixels, partners))
+            memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + of_partners
         memory += bytes_to_reduce(*map(self.context.scene.view, [name, *partners]))
         maps = MAP_BYTES * self.context.scene.view(name).num_pixels
         return Cost(seconds * pixels / 1e6, memory + maps - MAP_BYTES * pixels, maps)

@@ -50,8 +50,8 @@ logger = logging.getLogger(__name__)
 _PRECISE_POSES = 0.35
 _TRIAL_SAMPLING = 0.4
 # Processor seconds per megapixel of both rectified images, and of a pair beside that.
-_SECONDS = 0.14
-_PAIR_SECONDS = 0.05
+_SECONDS = 0.1
+_PAIR_SECONDS = 0.02
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.scene import View
 from colmap_sph.stereo.rectified_pair import RectifiedPair, Side
-from colmap_sph.stereo.resampling import RayTables, pixel_maps, ray_tables
+from colmap_sph.stereo.resampling import RayTables, ray_tables
 
 # Rows that are read at a time, which bounds memory.
 _BAND_ROWS = 64
@@ -61,14 +61,15 @@ def resample_photograph(
             columns = _columns_of(view, table, band)
             if columns.start < columns.stop:
                 target = (rectified[band, columns], valid[band, columns], nearness[:, columns])
-                _read(image, view, table.rays(band, columns), mask, *target)
+                cosine = table.depths(band, columns)
+                _read(image, table.source_pixels(view, band, columns), cosine, mask, *target)
     return rectified, valid
 
 
 def _columns_of(view: View, tables: RayTables, band: slice) -> slice:
     """The columns of a band in which a view may have rays; none where it has none."""
     rows = slice(band.start, band.stop + _COARSE - 1, _COARSE)
-    *_, inside = pixel_maps(view, *tables.rays(rows, slice(None, None, _COARSE)))
+    *_, inside = tables.source_pixels(view, rows, slice(None, None, _COARSE))
     found = np.flatnonzero(inside.any(axis=0))
     if not len(found):
         return slice(0, 0)
@@ -77,17 +78,15 @@ def _columns_of(view: View, tables: RayTables, band: slice) -> slice:
 
 def _read(
     image: NDArray[np.float32],
-    view: View,
-    rays: tuple[NDArray[np.float32], ...],
+    source_pixels: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]],
+    cosine: NDArray[np.float32],
     mask: NDArray[np.uint8] | None,
     rectified: NDArray[np.float32],
     valid: NDArray[np.uint8],
     nearness: NDArray[np.float32],
 ) -> None:
     """Read the pixels whose rays are nearer to the view's axis than to those of the views before."""
-    x, y, z = rays
-    cosine = z.copy()
-    columns, rows, inside = pixel_maps(view, x, y, z)
+    columns, rows, inside = source_pixels
     owned = (inside > 0) & (cosine > nearness)
     if not owned.any():
         return

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
-from colmap_sph.stereo.census import CENSUS_INVALID, RectifiedImage, census
+from colmap_sph.stereo.census import RectifiedImage, census
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
 from colmap_sph.stereo.search.prediction import Prediction
@@ -123,8 +123,8 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     Target
     """
     height, right_width = right.image.shape
-    own_columns = np.broadcast_to(np.arange(right_width, dtype=np.int32), (height, right_width))
     if not prediction.warps:
+        own_columns = np.broadcast_to(np.arange(right_width, dtype=np.int32), (height, right_width))
         columns = np.ascontiguousarray(own_columns)
         return Target(census(right), columns, prediction.base, right_width, 0, prediction)
     warped, columns = _warped(right, prediction)
@@ -137,14 +137,12 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     gap = prediction.depth
     as_it_is = words.shape[1] + gap
     both = np.empty((height, as_it_is + right_width), dtype=np.uint64)
-    both[:, : words.shape[1]] = words
-    both[:, words.shape[1] : as_it_is] = CENSUS_INVALID
-    del words  # the widest arrays of a level, one at a time
-    both[:, as_it_is:] = census(right)
-    columns = np.concatenate([columns, np.full((height, gap), -1, dtype=np.int32), own_columns], axis=1)
+    both_columns = np.empty(both.shape, dtype=np.int32)
+    _native.join_targets(words, columns, census(right), both, both_columns)
+    del words, columns
     base = np.empty_like(prediction.base)
     _native.target_bases(prediction.base, prediction.torn_bytes, prediction.margin, as_it_is, gap, base)
-    return Target(both, columns, base, right_width, as_it_is, prediction)
+    return Target(both, both_columns, base, right_width, as_it_is, prediction)
 
 
 def _warped(right: RectifiedImage, prediction: Prediction) -> tuple[RectifiedImage, NDArray[np.int32]]:

@@ -1,0 +1,42 @@
+/* The kernels of rectified images as Python's functions. */
+#include "boundary.h"
+#include "images/images.h"
+
+#define SOURCE_PIXELS(X) \
+    X(IN, float32, ray_rows, 3, H) \
+    X(IN, float32, ray_columns, 3, W) \
+    X(IN, float32, weights, W) \
+    X(VALUE, int, source_width) \
+    X(VALUE, int, source_height) \
+    X(OUT, float32, columns, H, W) \
+    X(OUT, float32, rows, H, W) \
+    X(OUT, uint8, inside, H, W)
+ARGUMENTS(source_pixels, SOURCE_PIXELS);
+
+static int run_source_pixels(void *arguments) {
+    const source_pixels_arguments *a = arguments;
+    const ray_tables tables = {a->ray_rows, a->ray_columns, a->weights, a->size.H, a->size.W};
+    source_pixels(tables, (float)a->source_width, (float)a->source_height, a->columns, a->rows, a->inside);
+    return 0;
+}
+
+FUNCTION(
+    source_pixels, SOURCE_PIXELS, any,
+    "Where rectified pixels, of rays ray_rows * weights + ray_columns, lie in an image, and 255 inside of it.");
+
+#define SHARPEN(X) \
+    X(IN, float32, image, H, W) \
+    X(VALUE, float, sharpening) \
+    X(OUT, int16, padded, H + 6, W + 8)
+ARGUMENTS(sharpen, SHARPEN);
+
+static int run_sharpen(void *arguments) {
+    const sharpen_arguments *a = arguments;
+    return sharpen(a->image, a->size.H, a->size.W, a->sharpening, a->padded);
+}
+
+FUNCTION(
+    sharpen, SHARPEN, any,
+    "An image plus so many times what it differs by from its mean nearby, in 1/64 grey value, with a border.");
+
+native_function *const images_functions[] = {&source_pixels_function, &sharpen_function, NULL};

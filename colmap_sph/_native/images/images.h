@@ -1,0 +1,26 @@
+/* Kernels of rectified images: where their pixels lie in the image that they are sampled from, and what the census
+ * compares. One pass each, plain enough for compilers to work on many pixels at once, so that one version serves
+ * all processors. */
+#ifndef COLMAP_SPH_IMAGES_H
+#define COLMAP_SPH_IMAGES_H
+
+#include "common.h"
+
+/* The homogeneous source pixel of a rectified one, three floats: rows[k][row] * weights[column] +
+ * columns[k][column] (three arrays of so many rows and columns). */
+typedef struct {
+    const float *rows, *columns, *weights;
+    ptrdiff_t height, width;
+} ray_tables;
+
+/* Columns and rows in an image of so many pixels, whose centres have whole numbers; `inside` is 255 where they lie
+ * in it, else 0. */
+void source_pixels(ray_tables tables, float source_width, float source_height, float *columns, float *rows,
+                   uint8_t *inside);
+
+/* An image plus `sharpening` times its difference from the binomial mean of 3 x 3 pixels, in 1/CENSUS_STEPS grey
+ * value, cut to whole ones, with a border of CENSUS_RADIUS_{Y,X}: there, and beside it, the outermost pixels of
+ * the image go on. -1 without memory. */
+int sharpen(const float *image, ptrdiff_t height, ptrdiff_t width, float sharpening, int16_t *padded);
+
+#endif

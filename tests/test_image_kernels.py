@@ -1,0 +1,81 @@
+"""The kernels of rectified images, against slow readable ones."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from colmap_sph import _native
+
+property_test = settings(max_examples=40, deadline=None, derandomize=True)
+sizes = st.tuples(st.integers(0, 9), st.integers(0, 40))
+seeds = st.integers(0, 2**32 - 1)
+
+
+def source_pixels(rows, columns, weights, width, height):
+    shape = (rows.shape[1], len(weights))
+    found = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8)
+    _native.source_pixels(rows, columns, weights, width, height, *found)
+    return found
+
+
+@property_test
+@given(shape=sizes, seed=seeds)
+def test_source_pixels_are_those_of_their_rays(shape, seed):
+    """Homogeneous pixels with depths from behind the camera to far before it, in 32-bit arithmetic."""
+    rng = np.random.default_rng(seed)
+    rows, columns = (rng.uniform(-20, 40, (3, size)).astype(np.float32) for size in shape)
+    columns[2] = rng.choice([-30, 0, 1e-7, 1, 5], shape[1])
+    rows[2] = rng.choice([0, 1, 2], shape[0])
+    weights = rng.uniform(0, 1, shape[1]).astype(np.float32)
+    found_columns, found_rows, inside = source_pixels(rows, columns, weights, 30, 20)
+    x, y, z = (row[:, None] * weights + column for row, column in zip(rows, columns, strict=True))
+    before = z > np.float32(1e-6)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = (each * np.where(before, 1 / z, z) for each in (x, y))
+    np.testing.assert_array_equal(found_columns, u - np.float32(0.5))
+    np.testing.assert_array_equal(found_rows, v - np.float32(0.5))
+    np.testing.assert_array_equal(inside, 255 * (before & (u >= 0) & (u <= 30) & (v >= 0) & (v <= 20)))
+
+
+def test_a_pinhole_sees_itself():
+    """Rays through the centres of its own pixels come back to whole numbers."""
+    focal, middle = 50.0, (20.0, 15.0)
+    directions = (np.arange(40) + 0.5 - middle[0]) / focal, (np.arange(30) + 0.5 - middle[1]) / focal
+    rows = np.stack([np.full(30, middle[0]), focal * directions[1] + middle[1], np.ones(30)]).astype(np.float32)
+    columns = np.stack([focal * directions[0], np.zeros(40), np.zeros(40)]).astype(np.float32)
+    found_columns, found_rows, inside = source_pixels(rows, columns, np.ones(40, np.float32), 40, 30)
+    np.testing.assert_allclose(found_columns, np.tile(np.arange(40), (30, 1)), atol=1e-4)
+    np.testing.assert_allclose(found_rows, np.tile(np.arange(30)[:, None], (1, 40)), atol=1e-4)
+    assert (inside == 255).all()
+
+
+def sharpened(image, sharpening):
+    padded = np.full((image.shape[0] + 6, image.shape[1] + 8), 5, np.int16)
+    _native.sharpen(image, sharpening, padded)
+    return padded
+
+
+@property_test
+@given(shape=st.tuples(st.integers(1, 9), st.integers(1, 40)), seed=seeds)
+def test_sharpened_images_differ_from_their_mean_by_more(shape, seed):
+    """Half as much more; of whole grey values there is nothing to be cut off."""
+    image = np.random.default_rng(seed).integers(0, 256, shape)
+    wide = np.pad(image, ((4, 4), (5, 5)), mode="edge")
+    expected = np.empty((shape[0] + 6, shape[1] + 8), int)
+    for y, x in np.ndindex(expected.shape):
+        window = wide[y : y + 3, x : x + 3]
+        mean_times_16 = np.sum(np.outer((1, 2, 1), (1, 2, 1)) * window)
+        expected[y, x] = 64 * window[1, 1] + 2 * (16 * window[1, 1] - mean_times_16)
+    np.testing.assert_array_equal(sharpened(image.astype(np.float32), 0.5), expected)
+
+
+def test_an_even_slope_has_nothing_to_be_sharpened():
+    image = (3 * np.arange(30) + 2 * np.arange(20)[:, None]).astype(np.float32)
+    inside = sharpened(image, 0.6)[4:-4, 5:-5]
+    np.testing.assert_allclose(inside, 64 * image[1:-1, 1:-1], atol=1.01)
+
+
+@pytest.mark.parametrize(("value", "most"), [(np.inf, 32767), (-np.inf, -32768), (np.nan, -32768), (1e30, 32767)])
+def test_what_is_no_grey_value_has_an_end(value, most):
+    assert sharpened(np.full((1, 1), value, np.float32), 0.0)[3, 4] in (most, -32768)
