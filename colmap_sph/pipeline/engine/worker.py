@@ -1,13 +1,12 @@
 """What a worker process does: it makes groups of tasks, with one memory gate and one stage's caches at a time."""
 
-import ctypes
 import logging
 import socket
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,22 +16,20 @@ import cv2
 
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError
 from colmap_sph.pipeline.engine.group import Answer, Group, Outcome, Piece, RunSeen, folders_of
-from colmap_sph.pipeline.engine.lag import PATIENCE, look_again, made_with_patience
+from colmap_sph.pipeline.engine.lag import PATIENCE, made_with_patience
 from colmap_sph.pipeline.keys import program_digests
-from colmap_sph.pipeline.memory import MemoryGate, most_resident, resident
+from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import holding_caches
 from colmap_sph.pipeline.workers import is_memory_error
+from colmap_sph.platforms.files import look_again
+from colmap_sph.platforms.memory import keep_freed_memory, most_resident, resident
 from colmap_sph.project.files import read_small, writing_only_if
 from colmap_sph.project.state.background import vouching_in_background
 
 # Of a worker's limit: Dask gives it no more work at 80 %, and ends it at 95 %.
 _SAFE_SHARE = 0.7
 _TOKEN_BYTES = 1000
-# Of glibc's mallopt: its parameters' numbers, and the largest threshold that it comes to by itself.
-_TRIM_THRESHOLD = -1
-_MMAP_THRESHOLD = -3
-_MMAP_BYTES = 32 << 20
 
 
 class RunEndedError(OutputError):
@@ -94,7 +91,9 @@ class Workplace:
         self._users = 0
         self._looked_at: set[Path] = set()
         cv2.setNumThreads(1)  # the workers are the threads
-        _keep_freed_memory()
+        # Dask has its workers give freed memory back at once, and so get every large array anew from the system:
+        # matching took half as long again.
+        keep_freed_memory()
 
     def work(self, group: Group[Any], patience: float = PATIENCE) -> Answer:
         """Make a group; what of it is there already, as a worker that was lost has made it, is left alone.
@@ -182,18 +181,6 @@ class Workplace:
         with self._changed:
             if self._users == 0 and self._stage is not None and self._stage[0] == run.token:
                 self._leave()
-
-
-def _keep_freed_memory() -> None:
-    """Allocate as glibc does by default.
-
-    Dask has its workers give freed memory back at once, and so get every large array anew from the system, which
-    made matching take half as long again.
-    """
-    with suppress(OSError, AttributeError):  # another C library
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_TRIM_THRESHOLD, 2 * _MMAP_BYTES)
-        mallopt(_MMAP_THRESHOLD, _MMAP_BYTES)
 
 
 def budget_of(limit: int | None, machine: int, neighbours: int) -> int:
