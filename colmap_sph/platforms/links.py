@@ -61,10 +61,10 @@ def _link_folder(place: Path, target: Path) -> None:
     if sys.platform == "win32":
         import _winapi
 
-        with suppress(OSError):  # the file system has none
+        with suppress(OSError):  # the file system has none; then an empty folder is left there
             _winapi.CreateJunction(str(target), str(place))
             return
-    shutil.copytree(target, place, copy_function=_second_name)
+    shutil.copytree(target, place, copy_function=_second_name, dirs_exist_ok=True)
 
 
 def _second_name(source: str | Path, place: str | Path) -> None:

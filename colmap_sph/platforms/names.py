@@ -61,5 +61,6 @@ def longest_path() -> int | None:
     if sys.platform == "win32":
         import ctypes
 
-        return None if ctypes.WinDLL("ntdll").RtlAreLongPathsEnabled() & 0xFF else _LONGEST_PATH
+        ask = getattr(ctypes.WinDLL("ntdll"), "RtlAreLongPathsEnabled", None)  # since Windows 10
+        return None if ask is not None and ask() & 0xFF else _LONGEST_PATH
     return None
