@@ -10,6 +10,7 @@ from types import FrameType, TracebackType
 from colmap_sph.app.colmap.names import hand_over, is_handed_over
 from colmap_sph.app.standard_streams import prepare_process, silence
 from colmap_sph.errors import InputError, OutOfMemoryError, OutputError, printable, reason_of
+from colmap_sph.platforms.processes import held_back
 
 # What loaders and libraries say where the system refuses memory, threads or open files.
 _REFUSALS = (
@@ -80,12 +81,11 @@ def _load_colmap() -> None:
     is_ignored = signal.getsignal(signal.SIGTERM) is signal.SIG_IGN
     end = signal.SIG_IGN if is_ignored else _end_quietly
     signal.signal(signal.SIGTERM, end)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
-    try:
-        import colmap_sph.project.colmap_library  # noqa: F401
-    finally:
-        signal.signal(signal.SIGTERM, end)  # in the place of the library's
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
+    with held_back(signal.SIGTERM):
+        try:
+            import colmap_sph.project.colmap_library  # noqa: F401
+        finally:
+            signal.signal(signal.SIGTERM, end)  # in the place of the library's
 
 
 def _end_quietly(number: int, _: FrameType | None) -> None:

@@ -8,7 +8,7 @@ import psutil
 import pytest
 
 from colmap_sph.pipeline import memory, options
-from colmap_sph.pipeline.control_groups import free_memory, processors
+from colmap_sph.platforms.control_groups import free_memory, processors
 
 MIB = 1 << 20
 GIB = 1 << 30
@@ -240,7 +240,7 @@ def test_garbage_in_place_of_groups_and_mounts(content: bytes, machine: Machine)
 
 
 def test_the_budget_keeps_to_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("colmap_sph.pipeline.control_groups.free_memory", lambda: 100 * MIB)
+    monkeypatch.setattr("colmap_sph.platforms.control_groups.free_memory", lambda: 100 * MIB)
     used = memory.resident()
     assert memory.budget(0) - used == pytest.approx(70 * MIB, abs=20 * MIB)
 

@@ -1,6 +1,7 @@
 """The walls between the rooms of the package: which may import which."""
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -13,14 +14,15 @@ MAY_IMPORT = {
     "errors": set(),
     "scene": {"errors"},
     "_native": set(),
+    "platforms": set(),
     "stereo": {*GROUND, "_native"},
-    "project": GROUND,
-    "pages": {*GROUND, "stereo", "project"},
-    "pipeline": {*GROUND, "_native", "stereo", "project", "pages"},
-    "products": {*GROUND, "stereo", "project"},
-    "evaluation": {"errors"},
+    "project": {*GROUND, "platforms"},
+    "pages": {*GROUND, "platforms", "stereo", "project"},
+    "pipeline": {*GROUND, "platforms", "_native", "stereo", "project", "pages"},
+    "products": {*GROUND, "platforms", "stereo", "project"},
+    "evaluation": {"errors", "platforms"},
     "synthetic": {"errors"},
-    "app": {*GROUND, "stereo", "project", "pages", "pipeline", "products", "evaluation", "synthetic"},
+    "app": {*GROUND, "platforms", "stereo", "project", "pages", "pipeline", "products", "evaluation", "synthetic"},
 }
 # Loads the rooms when they are asked for, by name.
 FRONT_DOOR = {"__init__", "__main__"}
@@ -63,6 +65,109 @@ def test_every_room_has_its_walls() -> None:
 def test_only_the_project_knows_colmaps_library() -> None:
     """And `synthetic`, which writes models of its own, as a user's COLMAP would."""
     assert {room_of(path) for path in modules() if "pycolmap" in imported(path)} == {"project", "synthetic"}
+
+
+# Of modules that some systems have only, and that tell systems apart.
+SYSTEM_MODULES = {
+    *(
+        "_winapi",
+        "ctypes",
+        "fcntl",
+        "grp",
+        "msvcrt",
+        "multiprocessing",
+        "platform",
+        "psutil",
+        "pty",
+        "pwd",
+        "resource",
+    ),
+    *("select", "syslog", "termios", "tty", "winreg"),
+}
+# What Windows or macOS lack, or do in another way, of modules that all have.
+SYSTEM_NAMES = re.compile(
+    r"""os\.(
+        O_(?!RDONLY$|WRONLY$|RDWR$|APPEND$|CREAT$)\w+ | exec\w+ | fork\w* | spawn\w+ | wait\w* | W[A-Z]\w*
+        | kill\w* | get(e|res)?[ug]id | getpgid | setsid | nice | [fl]?chown | f?statvfs | mkfifo | mknod | uname
+        | name | sep | altsep | linesep | sched_\w+ | posix_\w+ | p(read|write)v? | sendfile | copy_file_range
+        | f?sync | fdatasync | symlink | link | readlink | replace | rename\w* | register_at_fork | cpu_count
+    )
+    | signal\.(SIG(?!INT$|TERM$|_IGN$|_DFL$)\w+ | pthread_\w+ | alarm | setitimer | siginterrupt | sigwait\w*)
+    | sys\.(platform | getwindowsversion)
+    | shutil\.(chown | move)
+    | cv2\.(imread | imwrite)""",
+    re.VERBOSE,
+)
+# Methods of paths: links are told from folders, and files replaced, in the ways of all systems.
+SYSTEM_METHODS = {
+    "symlink_to",
+    "hardlink_to",
+    "is_symlink",
+    "is_junction",
+    "readlink",
+    "rename",
+    "write_text",
+    "owner",
+}
+# That Linux has these names needs no other system: what is meant is a place in the files of a user, or a method.
+EXCEPTIONS = {
+    ("app/standard_streams.py", "select"),  # of a stream that does not block, which Windows has none of
+    ("pipeline/program.py", "platform"),  # Python's version
+    ("project/claim.py", "is_symlink"),  # of an entry of a folder
+    ("project/cloud_output.py", "shutil.move"),  # to a temporary name
+    ("project/cloud_output.py", "write_text"),  # COLMAP's
+}
+
+
+def test_only_one_room_knows_systems() -> None:
+    """All others are free of what some have only; what is left out here, they would find out by failing."""
+    found = set()
+    for path in modules():
+        if room_of(path) == "platforms":
+            continue
+        place = path.relative_to(PACKAGE).as_posix()
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        found |= {(place, name) for name in imported(path) & SYSTEM_MODULES}
+        found |= {(place, name) for name in map(system_name, ast.walk(tree)) if name}
+    assert found == EXCEPTIONS
+
+
+def system_name(node: ast.AST) -> str | None:
+    """What a part of a program asks of the system that not all systems have."""
+    match node:
+        case ast.Attribute(value=ast.Name(id=module), attr=name) if SYSTEM_NAMES.fullmatch(f"{module}.{name}"):
+            return f"{module}.{name}"
+        case ast.Attribute(attr=name) if name in SYSTEM_METHODS:
+            return name
+        # With two arguments, it is that of text; with names, of records.
+        case ast.Call(func=ast.Attribute(attr="replace"), args=[_], keywords=[]):
+            return "replace"
+        case ast.Call(func=ast.Name(id="open"), args=[_, ast.Constant(value=str(mode))], keywords=keywords):
+            return None if "b" in mode or "newline" in {each.arg for each in keywords} else "open"
+        case ast.Constant(value=str(text)) if re.match(r"/(proc|sys|dev|tmp|etc|var|run)\b", text):
+            return text
+    return None
+
+
+@pytest.mark.parametrize(
+    ("code", "name"),
+    [
+        ("os.sched_getaffinity(0)", "os.sched_getaffinity"),
+        ("os.open(path, os.O_RDONLY | os.O_NOFOLLOW)", "os.O_NOFOLLOW"),
+        ("os.open(path, os.O_RDONLY)", None),
+        ("signal.signal(signal.SIGHUP, f)", "signal.SIGHUP"),
+        ("signal.signal(signal.SIGTERM, signal.SIG_IGN)", None),
+        ("made.replace(target)", "replace"),
+        ("text.replace('a', 'b')", None),
+        ("replace(record, field=1)", None),
+        ("path.write_text('x')", "write_text"),
+        ("open('/proc/self/cgroup', 'rb')", "/proc/self/cgroup"),
+        ("open(path, 'w')", "open"),
+        ("sys.platform == 'win32'", "sys.platform"),
+    ],
+)
+def test_what_only_some_systems_have_is_found(code: str, name: str | None) -> None:
+    assert {found for found in map(system_name, ast.walk(ast.parse(code))) if found} == ({name} if name else set())
 
 
 @pytest.mark.parametrize("library", ["sqlite3", "pathlib", "pycolmap", "json", "os.path", "shutil"])

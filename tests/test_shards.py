@@ -17,7 +17,6 @@ import colmap_sph
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.engine.lag import look_again
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.shards import run_part as shards
@@ -26,6 +25,7 @@ from colmap_sph.pipeline.shards.run_part import PartReport, run_part
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.match import MatchStage, MatchTask
 from colmap_sph.pipeline.stages.vote import VoteStage
+from colmap_sph.platforms.files import look_again
 from colmap_sph.project.claim import claimed, shared
 from colmap_sph.project.polishing import PolishOptions
 from colmap_sph.project.project import Project

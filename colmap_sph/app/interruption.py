@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM end the program within two seconds, whatever it is at.
+"""Ctrl-C, SIGTERM and Windows' SIGBREAK end the program within two seconds, whatever it is at.
 
 Python tells the main thread of a signal only between two steps of Python code, and a worker cannot be stopped in
 the middle of a kernel. As all files appear only when they are complete, the process may be ended at any moment.
@@ -12,7 +12,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+from colmap_sph.platforms.processes import ENDING, exit_code_of
+
 # Seconds for the orderly end, in which workers may finish what they have begun, and for the last words.
 _GRACE = 1.2
 _LAST_WORDS = 0.3
@@ -33,12 +34,12 @@ class Interrupted(KeyboardInterrupt):
     @property
     def exit_code(self) -> int:
         """What a shell reports of a program that this signal ended."""
-        return 128 + self.signal_number
+        return exit_code_of(self.signal_number)
 
 
 @contextmanager
 def stop_on_signals(last_words: Callable[[Interrupted], None]) -> Iterator[None]:
-    """Raise `Interrupted` at SIGINT and SIGTERM; where that takes too long, end the process.
+    """Raise `Interrupted` at the signals `ENDING`; where that takes too long, end the process.
 
     Outside of the main thread, which alone receives signals, nothing is changed.
 
@@ -48,7 +49,7 @@ def stop_on_signals(last_words: Callable[[Interrupted], None]) -> Iterator[None]
         Called in a thread of its own before the process is ended: to say so, and to flush what is buffered.
     """
     # A shell without job control has background jobs ignore SIGINT, and nohup is meant to.
-    wanted = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    wanted = [number for number in ENDING if signal.getsignal(number) is not signal.SIG_IGN]
     if threading.current_thread() is not threading.main_thread() or not wanted:
         yield
         return

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from colmap_sph.errors import ColmapSphError, OutputError, printable, reason_of
+from colmap_sph.platforms.files import open_descriptor
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.workspace import Workspace
 
@@ -43,12 +44,12 @@ class _LogFile(logging.FileHandler):
 
     def _open(self) -> io.TextIOWrapper:
         """Open a file, but no link, and without waiting for the reader of a pipe."""
-        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK
-        descriptor = os.open(self.baseFilename, flags, 0o666)
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT
+        descriptor = open_descriptor(Path(self.baseFilename), flags, follow=False)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
             raise OSError(errno.EINVAL, "it is no ordinary file")
-        return open(descriptor, "a", encoding=self.encoding, errors=self.errors)  # noqa: PTH123
+        return open(descriptor, "a", encoding=self.encoding, errors=self.errors, newline="\n")  # noqa: PTH123
 
     def handleError(self, record: logging.LogRecord) -> None:
         """Instead of a traceback on the terminal."""

@@ -1,8 +1,6 @@
 """`colmap_sph report` and `colmap_sph view`: the page of a workspace, made again, or shown in the browser."""
 
-import os
 import signal
-import sys
 import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +13,10 @@ from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pages import write_page
 from colmap_sph.pages.whole_cloud import CloudServer
+from colmap_sph.platforms.surroundings import has_screen
 from colmap_sph.project.claim import check_links
 from colmap_sph.project.sparse_model import has_model
 from colmap_sph.project.workspace import Workspace
-
-# Without one of these, Linux has no window to show a page in; a browser for the terminal cannot draw it.
-_WINDOWS = ("DISPLAY", "WAYLAND_DISPLAY", "BROWSER")
 
 
 @dataclass(frozen=True)
@@ -76,8 +72,7 @@ def view_command(command: ViewCommand, terminal: Terminal) -> int:
 
 def _is_shown(address: str) -> bool:
     """Show an address in the browser, where there is one."""
-    has_windows = sys.platform == "darwin" or any(os.environ.get(name) for name in _WINDOWS)
-    return has_windows and webbrowser.open(address)
+    return has_screen() and webbrowser.open(address)
 
 
 def _serve_cloud(workspace: Workspace, port: int, terminal: Terminal) -> int:

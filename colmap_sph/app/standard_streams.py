@@ -5,11 +5,20 @@ This is loaded first, and imports next to nothing.
 
 import io
 import os
-import resource
 import select
 import sys
 from contextlib import suppress
 from typing import Any
+
+from colmap_sph.platforms.limits import (
+    address_space_limit,
+    data_limit,
+    open_files_limit,
+    raise_open_files_limit,
+)
+from colmap_sph.platforms.processes import become
+from colmap_sph.platforms.processors import usable_cores
+from colmap_sph.platforms.surroundings import is_console_of_windows
 
 # What the program needs to load, and for a few threads: files open at a time, and bytes for it and for each core,
 # for which linear algebra's libraries start threads of their own. Without it they crash.
@@ -29,13 +38,14 @@ def prepare_process() -> str | None:
     """
     _open_what_is_closed()
     _be_in_utf8()
-    raw = _Unfailing(2, "w", closefd=False)
-    buffer = io.BufferedWriter(raw)
-    encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
-    sys.stderr = io.TextIOWrapper(buffer, encoding, errors="backslashreplace", line_buffering=True)
+    if not is_console_of_windows(sys.stderr):
+        raw = _Unfailing(2, "w", closefd=False)
+        buffer = io.BufferedWriter(raw)
+        encoding = getattr(sys.stderr, "encoding", None) or "utf-8"
+        sys.stderr = io.TextIOWrapper(buffer, encoding, errors="backslashreplace", line_buffering=True)
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
-    _raise_limit_of_files()
+    raise_open_files_limit(_WANTED_OPEN_FILES)
     return _missing()
 
 
@@ -80,31 +90,22 @@ def _be_in_utf8() -> None:
     """Start anew where names of files are taken for another encoding than that of COLMAP's models."""
     if sys.getfilesystemencoding() != "utf-8" and os.environ.get("PYTHONUTF8") != "1":
         os.environ["PYTHONUTF8"] = "1"
-        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])
-
-
-def _raise_limit_of_files() -> None:
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _WANTED_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _WANTED_OPEN_FILES)
-    if soft != resource.RLIM_INFINITY and soft < wanted:
-        with suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
+        become(sys.executable, [sys.executable, *sys.orig_argv[1:]])
 
 
 def _missing() -> str | None:
     """A sentence about a limit of the process that is too low to load the program."""
-    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft != resource.RLIM_INFINITY and soft < _OPEN_FILES:
-        return f"Only {soft} files may be open at a time, and {_OPEN_FILES} are needed; allow more (ulimit -n)."
-    for kind, option, (base, each) in (
-        (resource.RLIMIT_AS, "-v", _ADDRESS_SPACE),
-        (resource.RLIMIT_DATA, "-d", _DATA),
+    files = open_files_limit()
+    if files is not None and files < _OPEN_FILES:
+        return f"Only {files} files may be open at a time, and {_OPEN_FILES} are needed; allow more (ulimit -n)."
+    for limit, option, (base, each) in (
+        (address_space_limit(), "-v", _ADDRESS_SPACE),
+        (data_limit(), "-d", _DATA),
     ):
-        soft, _ = resource.getrlimit(kind)
-        needed = base + each * len(os.sched_getaffinity(0))
-        if soft != resource.RLIM_INFINITY and soft < needed:
+        needed = 0 if limit is None else base + each * usable_cores()
+        if limit is not None and limit < needed:
             return (
-                f"The process may use only {soft >> 20} MiB of memory, and {needed >> 20} MiB are needed; "
+                f"The process may use only {limit >> 20} MiB of memory, and {needed >> 20} MiB are needed; "
                 f"allow more (ulimit {option})."
             )
     return None

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
 from dataclasses import dataclass
 from typing import Literal
 
 from colmap_sph.errors import OptionError
+from colmap_sph.platforms.processors import usable_cores
 
 _DEFAULT_TAU_GSD = (1.0, 2.0, 4.0)
 _DEFAULT_TAU_METRES = (0.05, 0.1, 0.2, 0.5)
@@ -70,7 +70,7 @@ class EvaluationOptions:
     @property
     def worker_count(self) -> int:
         """`threads` with its default filled in."""
-        return self.threads or len(os.sched_getaffinity(0))
+        return self.threads or usable_cores()
 
     def check(self) -> None:
         """Raise `OptionError` for the first option out of its bounds."""

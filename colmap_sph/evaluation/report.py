@@ -12,6 +12,7 @@ import numpy as np
 from colmap_sph.errors import NoResultError, OutputError, printable, reason_of
 from colmap_sph.evaluation.cloud_scores import CloudScores
 from colmap_sph.evaluation.depth_maps import DepthMapScores
+from colmap_sph.platforms.files import move_into_place, write_text
 
 
 def format_clouds(scores: Sequence[CloudScores], width: int | None = None) -> str:
@@ -98,8 +99,8 @@ def write_json(path: Path, content: object) -> None:
     """
     temporary = path.with_name(path.name + ".part")
     try:
-        temporary.write_text(json.dumps(content, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        temporary.replace(path)
+        write_text(temporary, json.dumps(content, indent=2, allow_nan=False) + "\n")
+        move_into_place(temporary, path)
     except OSError as error:
         raise OutputError(
             f"{path} cannot be written ({reason_of(error)}); check space and permissions."

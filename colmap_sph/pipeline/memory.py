@@ -1,16 +1,13 @@
 """The memory budget of a run: what is left of it, and a gate that work passes only with its share."""
 
 import re
-import resource
-import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-
-import psutil
+from contextlib import contextmanager
 
 from colmap_sph.errors import OptionError
-from colmap_sph.pipeline import control_groups
+from colmap_sph.platforms import control_groups
+from colmap_sph.platforms.memory import available, free_under_limits, resident
 
 _UNITS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 # Of the memory that is free when a run starts, what it takes by itself.
@@ -19,9 +16,8 @@ _SAFE_SHARE = 0.7
 _SLACK = 1.15
 # What a run tries to use of a machine whose memory others have taken: it swaps.
 _LEAST = 256 << 20
-# Taken for what is free, or in use, where the system does not say.
+# Taken for what is free where the system does not say.
 _UNKNOWN_FREE = 4 << 30
-_UNKNOWN_USED = 200 << 20
 
 
 def parse_memory(text: str) -> int:
@@ -59,36 +55,12 @@ def budget(wanted: int) -> int:
     return wanted or int(_SAFE_SHARE * _free()) + resident()
 
 
-def resident() -> int:
-    """Bytes of memory this process has in use."""
-    with suppress(OSError, psutil.Error):
-        return int(psutil.Process().memory_info().rss)
-    return _UNKNOWN_USED
-
-
-def most_resident() -> int:
-    """The most bytes of memory that this process had in use."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
-
-
 def _free() -> int:
     """Bytes free on the machine, in this process's control groups, and under its own limits."""
-    free = _UNKNOWN_FREE
-    with suppress(OSError, psutil.Error):
-        free = max(int(psutil.virtual_memory().available), _LEAST)
-    limits = (control_groups.free_memory(), *_free_under_limits())
+    machine = available()
+    free = _UNKNOWN_FREE if machine is None else max(machine, _LEAST)
+    limits = (control_groups.free_memory(), *free_under_limits())
     return max(min([free, *(limit for limit in limits if limit is not None)]), 0)
-
-
-def _free_under_limits() -> Iterator[int]:
-    """Bytes left under ``ulimit -v`` and ``ulimit -d``."""
-    with suppress(OSError, psutil.Error):
-        used = psutil.Process().memory_info()
-        for kind, amount in ((resource.RLIMIT_AS, used.vms), (resource.RLIMIT_DATA, used.data)):
-            limit, _ = resource.getrlimit(kind)
-            if limit != resource.RLIM_INFINITY:
-                yield limit - amount
 
 
 class MemoryGate:

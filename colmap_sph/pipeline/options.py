@@ -1,11 +1,11 @@
 """Options of all stages in one record: what the command line, the Python API and the pipeline share."""
 
-import os
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 
 from colmap_sph.errors import OptionError
-from colmap_sph.pipeline.control_groups import processors
 from colmap_sph.pipeline.memory import budget, parse_memory
+from colmap_sph.platforms.control_groups import processors
+from colmap_sph.platforms.processors import usable_cores
 from colmap_sph.project.polishing import PolishOptions
 from colmap_sph.project.region_file import AUTO, read_region
 from colmap_sph.project.undistortion import UndistortionOptions
@@ -22,7 +22,7 @@ from colmap_sph.stereo.vote import VoteOptions
 
 def num_cores() -> int:
     """Cores that this process may use, which can be fewer than the machine has: their time may be limited, too."""
-    cores = len(os.sched_getaffinity(0))
+    cores = usable_cores()
     return min(cores, processors() or cores)
 
 

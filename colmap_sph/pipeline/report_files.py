@@ -17,9 +17,9 @@ from colmap_sph.pages import write_page
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.pipeline.known.table import stamp_of_files
-from colmap_sph.pipeline.memory import most_resident
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import program_digest, versions
+from colmap_sph.platforms.memory import most_resident
 from colmap_sph.project.files import atomic_file, make_dir, remove
 from colmap_sph.project.project import Project
 from colmap_sph.project.region_file import AUTO

@@ -1,24 +1,20 @@
 """Worker threads: one function over many items, where the failure of one item costs that item alone."""
 
-import ctypes
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from typing import TypeVar
 
 import cv2
 
 from colmap_sph.errors import ColmapSphError, OptionError, OutOfMemoryError, OutputError
+from colmap_sph.platforms.memory import keep_freed_memory
 
 T = TypeVar("T")
 R = TypeVar("R")
 
 # Errors that no other item of a stage would be spared.
 _FATAL = (OptionError, OutputError)
-# Of glibc's mallopt: its parameters' numbers, and the largest threshold that it comes to by itself.
-_TRIM_THRESHOLD = -1
-_MMAP_THRESHOLD = -3
-_MMAP_BYTES = 32 << 20
 
 
 def for_all(
@@ -93,18 +89,6 @@ def room_for_workers() -> Iterator[None]:
         yield
     finally:
         cv2.setNumThreads(before)
-
-
-def keep_freed_memory() -> None:
-    """Have arrays of an image's size come from what others have left, not from the system's cleared pages.
-
-    By itself glibc does so only for sizes that it has seen, and gives back what lies at the end of its heaps. Dask
-    has its workers give all freed memory back at once, which made matching take half as long again.
-    """
-    with suppress(OSError, AttributeError):  # another C library
-        mallopt = ctypes.CDLL(None).mallopt
-        mallopt(_TRIM_THRESHOLD, 2 * _MMAP_BYTES)
-        mallopt(_MMAP_THRESHOLD, _MMAP_BYTES)
 
 
 def _submit(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Sequence[T]) -> dict[Future[R], T]:

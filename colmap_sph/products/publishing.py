@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import OutputError, reason_of
-from colmap_sph.project.files import atomic_file, make_dir, sync_file, sync_folder
+from colmap_sph.platforms.files import move_into_place, sync_file, sync_folder, write_text
+from colmap_sph.project.files import atomic_file, make_dir
 
 MARK = "made_by_colmap_sph.txt"
 """A file in each folder that an export made, and may replace."""
@@ -47,7 +48,7 @@ def published(path: Path) -> Iterator[Path]:
             check_no_folder(path)
             yield temporary
             sync_file(temporary)
-            temporary.replace(path)
+            move_into_place(temporary, path)
             sync_folder(path.parent)
     finally:
         with suppress(OSError):
@@ -84,10 +85,10 @@ def published_folder(path: Path) -> Iterator[Path]:
         with _told(path):
             made.mkdir()
             yield made
-            (made / MARK).write_text(f"Made by colmap_sph {version('colmap_sph')}, which replaces this folder.\n")
+            write_text(made / MARK, f"Made by colmap_sph {version('colmap_sph')}, which replaces this folder.\n")
             if path.exists():
                 shutil.rmtree(path)
-            made.replace(path)
+            move_into_place(made, path)
             sync_folder(path.parent)
 
 

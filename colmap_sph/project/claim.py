@@ -1,13 +1,14 @@
 """A workspace for one run, or for jobs that share it: no link leads out, and no other is at work there."""
 
-import fcntl
 import os
 import shutil
 from collections.abc import Collection, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from colmap_sph.errors import OutputError, reason_of
+from colmap_sph.platforms.files import is_junction, is_link
+from colmap_sph.platforms.locks import holding, remove_lock
 from colmap_sph.project.files import make_dir, remove, remove_temporary_files
 from colmap_sph.project.workspace import Workspace
 
@@ -27,13 +28,13 @@ def claimed(workspace: Workspace) -> Iterator[None]:
     folder = workspace.state_dir
     created = [path for path in (folder, *folder.parents) if not path.exists()]
     make_dir(folder)
-    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        _lock(descriptor, workspace)
-        remove_leftovers(workspace)
-        yield
+        with _held(workspace):
+            remove_leftovers(workspace)
+            yield
     finally:
-        os.close(descriptor)
+        if created:
+            remove_lock(folder)
         for path in created:
             with suppress(OSError):  # not empty
                 path.rmdir()
@@ -50,17 +51,8 @@ def shared(workspace: Workspace) -> Iterator[None]:
     OutputError
         A run holds the workspace for itself, or its folder ``colmap_sph`` is not there.
     """
-    try:
-        descriptor = os.open(workspace.state_dir, os.O_RDONLY)
-    except OSError as error:
-        raise OutputError(
-            f"{workspace.state_dir} cannot be used ({reason_of(error)}); check permissions."
-        ) from error
-    try:
-        _lock(descriptor, workspace, fcntl.LOCK_SH)
+    with _held(workspace, shared=True):
         yield
-    finally:
-        os.close(descriptor)
 
 
 def check_links(workspace: Workspace, *, is_given: bool) -> None:
@@ -111,7 +103,7 @@ def check_ways_out(
     while waiting:
         path = waiting.pop()
         target = Path(os.path.realpath(path))
-        if path.is_symlink() and (path in unlinked or not target.is_relative_to(top)):
+        if is_link(path) and (path in unlinked or not target.is_relative_to(top)):
             raise OutputError(
                 f"{path} is a link to {target}, where this program would write and delete; put a folder or file "
                 f"of its own in its place, or {remedy}."
@@ -123,19 +115,28 @@ def check_ways_out(
 
 def _folders_and_links(folder: Path) -> list[Path]:
     with suppress(OSError), os.scandir(folder) as entries:
-        return [Path(each.path) for each in entries if each.is_symlink() or each.is_dir(follow_symlinks=False)]
+        return [Path(each.path) for each in entries if _is_folder_or_link(each)]
     return []
 
 
-def _lock(descriptor: int, workspace: Workspace, kind: int = fcntl.LOCK_EX) -> None:
-    try:
-        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        raise OutputError(
-            f"Another run is at work in {workspace.root}; wait for its end or choose another --output."
-        ) from error
-    except OSError:  # some network file systems have no locks
-        pass
+def _is_folder_or_link(entry: os.DirEntry[str]) -> bool:
+    return entry.is_symlink() or entry.is_dir(follow_symlinks=False) or is_junction(Path(entry.path))
+
+
+@contextmanager
+def _held(workspace: Workspace, *, shared: bool = False) -> Iterator[None]:
+    with ExitStack() as held:
+        try:
+            held.enter_context(holding(workspace.state_dir, shared=shared))
+        except BlockingIOError as error:
+            raise OutputError(
+                f"Another run is at work in {workspace.root}; wait for its end or choose another --output."
+            ) from error
+        except OSError as error:
+            raise OutputError(
+                f"{workspace.state_dir} cannot be used ({reason_of(error)}); check permissions."
+            ) from error
+        yield
 
 
 def remove_leftovers(workspace: Workspace) -> None:

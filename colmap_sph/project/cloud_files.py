@@ -11,7 +11,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import OutputError
-from colmap_sph.project.files import atomic_file, make_dir, real_path, set_aside
+from colmap_sph.platforms.files import is_link, move_into_place, write_text
+from colmap_sph.platforms.links import link, symbolic_link
+from colmap_sph.project.files import atomic_file, make_dir, set_aside
 from colmap_sph.project.map_coordinates import move_cloud, move_model
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES
 from colmap_sph.project.workspace import Workspace
@@ -133,9 +135,8 @@ def link_workspace(
     if origin.any():
         move_model(model, origin)
     model.write_binary(linked.sparse_dir)
-    for link, target in ((linked.images_dir, workspace.images_dir), (linked.stereo_dir, workspace.stereo_dir)):
-        # Relative, so that the workspace can be moved as a whole.
-        link.symlink_to(os.path.relpath(real_path(target), real_path(folder)))
+    for place, target in ((linked.images_dir, workspace.images_dir), (linked.stereo_dir, workspace.stereo_dir)):
+        link(place, target)
 
 
 def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[np.float64]) -> None:
@@ -165,15 +166,15 @@ def move_cloud_into_place(scratch: Path, workspace: Workspace, origin: NDArray[n
     workspace.visibility_path.unlink(missing_ok=True)
     for made, place in zip(Workspace(scratch).cloud_paths, workspace.cloud_paths, strict=True):
         if made.exists():  # visibility is not always wanted
-            made.replace(place)
+            move_into_place(made, place)
 
 
 def remove_local_workspace(workspace: Workspace) -> None:
     """Remove what this program left there but the cloud, of which a record knows; what COLMAP made stays."""
     local = Workspace(workspace.local_dir)
-    for link in (local.images_dir, local.stereo_dir, local.visibility_path):
-        if link.is_symlink():
-            link.unlink()
+    for path in (local.images_dir, local.stereo_dir, local.visibility_path):
+        if is_link(path):
+            path.unlink()
     for name in (*MODEL_FILES, *RIG_FILES):
         (local.sparse_dir / f"{name}.bin").unlink(missing_ok=True)
     workspace.local_origin_path.unlink(missing_ok=True)
@@ -192,11 +193,12 @@ def _keep_local_workspace(workspace: Workspace, linked: Workspace, origin: NDArr
         (linked.stereo_dir, local.stereo_dir),
         (linked.sparse_dir, local.sparse_dir),
     ):
+        if made in (linked.images_dir, linked.stereo_dir) and not is_link(made):
+            continue  # no link, but a folder of links, on a disk that knows no others
         if os.path.lexists(kept):  # with files of the user
             set_aside(kept)
-        made.rename(kept)
-    # Relative, so that the workspace can be moved as a whole.
+        move_into_place(made, kept)
     if linked.visibility_path.exists():
-        local.visibility_path.symlink_to(os.path.relpath(workspace.visibility_path, local.root))
-    workspace.local_origin_path.write_text(" ".join(map(repr, origin.tolist())) + "\n")
+        symbolic_link(local.visibility_path, workspace.visibility_path)
+    write_text(workspace.local_origin_path, " ".join(map(repr, origin.tolist())) + "\n")
     move_cloud(local.fused_path, linked.fused_path, origin)

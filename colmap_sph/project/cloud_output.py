@@ -13,6 +13,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.platforms.files import move_into_place
 from colmap_sph.project.files import make_dir, open_regular, real_path, whole_digest
 from colmap_sph.project.map_coordinates import move_cloud
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, load_model
@@ -124,7 +125,7 @@ class CloudOutput:
             target = real_path(file)
             beside = target.with_name(f".{os.getpid()}.tmp")  # a disk of its own may be there
             shutil.move(source, beside)
-            beside.replace(target)
+            move_into_place(beside, target)
 
 
 def _check_room(folder: Path) -> None:

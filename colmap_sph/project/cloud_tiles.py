@@ -20,6 +20,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
+from colmap_sph.platforms.files import move_into_place
 from colmap_sph.project.cloud_files import ply_header, remove_local_workspace
 from colmap_sph.project.files import atomic_file, make_dir, remove, set_aside, whole_digest
 from colmap_sph.project.map_coordinates import move_cloud
@@ -195,7 +196,7 @@ def publish_tiles(made: Path, workspace: Workspace) -> None:
     retire_tiles(workspace)
     _retire_single(workspace)
     begin(workspace.tiles_record_path, [workspace.tiles_dir / INDEX])
-    made.replace(workspace.tiles_dir)
+    move_into_place(made, workspace.tiles_dir)
 
 
 def retire_tiles(workspace: Workspace) -> None:

@@ -14,9 +14,10 @@ import numpy as np
 import pycolmap
 
 from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.platforms.links import link
 from colmap_sph.project.cloud_files import check_places, link_workspace, move_cloud_into_place
 from colmap_sph.project.colmap_library import quiet_colmap
-from colmap_sph.project.files import make_dir, real_path, scratch_folder
+from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.map_coordinates import local_origin
 from colmap_sph.project.map_files import check_map
@@ -113,9 +114,9 @@ def _link_masks(folder: Path, cameras: Mapping[str, pycolmap.Camera], links: Pat
     for name, camera in cameras.items():
         mask = mask_path(folder, name)
         if read_mask(mask, camera.width, camera.height) is not None:
-            link = links / f"{name}.png"
-            make_dir(link.parent)
-            link.symlink_to(real_path(mask))
+            place = links / f"{name}.png"
+            make_dir(place.parent)
+            link(place, mask)
 
 
 def _check_written(made: Workspace, num_points: int) -> None:

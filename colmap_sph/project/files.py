@@ -1,7 +1,6 @@
 """Folders and files made, read and removed for the user: errors are sentences, no file is ever half-written."""
 
 import errno
-import fcntl
 import os
 import re
 import shutil
@@ -18,6 +17,14 @@ from typing import BinaryIO
 import xxhash
 
 from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.platforms.files import (
+    is_link,
+    move_into_place,
+    open_descriptor,
+    sync_descriptor,
+    sync_folder,
+)
+from colmap_sph.platforms.locks import holding
 
 # What a file is called until it is complete: short, so that it fits wherever the real name fits. One for each file
 # that a thread writes at a time; processes of other machines may have the same number. Earlier versions did not
@@ -26,8 +33,6 @@ _TEMPORARY_NAME = ".{process}-{thread}-{depth}.tmp"
 _TEMPORARY = re.compile(r"\.([\w-]{1,48}-)?\d+-\d+\.tmp")
 _open_files = threading.local()
 _check_before_writing: ContextVar[Callable[[], None] | None] = ContextVar("check_before_writing", default=None)
-# What a file system answers that cannot sync at all: there is nothing to wait for then.
-_NO_SYNC = {errno.EINVAL, errno.ENOTSUP, errno.ENOSYS}
 _READ_BYTES = 1 << 17
 _HOST_LETTERS = 32
 
@@ -104,11 +109,11 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
             yield NewFile(file)
             file.flush()
             if sync:
-                _sync(file.fileno())
+                sync_descriptor(file.fileno())
         check = _check_before_writing.get()
         if check is not None:
             check()
-        temporary.replace(path)
+        move_into_place(temporary, path)
         if sync:
             sync_folder(path.parent)
     except OSError as error:
@@ -131,29 +136,6 @@ def writing_only_if(check: Callable[[], None]) -> Iterator[None]:
         _check_before_writing.reset(token)
 
 
-def sync_file(path: Path) -> None:
-    """Wait until the disk has a file's content; raises `OSError`."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
-    try:
-        _sync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
-def sync_folder(folder: Path) -> None:
-    """Wait until the disk has the names in a folder; raises `OSError`."""
-    with suppress(PermissionError):  # one that may be written to, but not read
-        sync_file(folder)
-
-
-def _sync(descriptor: int) -> None:
-    try:
-        os.fsync(descriptor)
-    except OSError as error:
-        if error.errno not in _NO_SYNC:
-            raise
-
-
 def open_regular(path: Path, *, follow: bool = True) -> BufferedReader:
     """Open a file for reading: a regular one, never a pipe or device, for which one could wait for ever.
 
@@ -168,8 +150,7 @@ def open_regular(path: Path, *, follow: bool = True) -> BufferedReader:
     OSError
         It is not there, cannot be opened, or is no regular file.
     """
-    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)
-    descriptor = os.open(path, flags)
+    descriptor = open_descriptor(path, os.O_RDONLY, follow=follow)
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
         raise OSError(errno.EINVAL, "it is not a regular file", str(path))
@@ -218,7 +199,7 @@ def set_aside(path: Path) -> Path:
         number += 1
         backup = path.with_name(f"{path.name}.backup{number}")
     try:
-        path.rename(backup)
+        move_into_place(path, backup)
     except OSError as error:
         raise OutputError(f"{path} cannot be set aside ({reason_of(error)}); check permissions.") from error
     return backup
@@ -227,13 +208,8 @@ def set_aside(path: Path) -> Path:
 @contextmanager
 def folder_locked(folder: Path) -> Iterator[None]:
     """Wait until nobody else who calls this is at work in a folder; at once on disks that know no locks."""
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-    try:
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with holding(folder, wait=True):
         yield
-    finally:
-        os.close(descriptor)
 
 
 def remove_temporary_files(folder: Path) -> None:
@@ -247,7 +223,7 @@ def remove_temporary_files(folder: Path) -> None:
 def remove(path: Path) -> None:
     """Remove a file, a link, or a folder with all that is in it; `OutputError` where that is impossible."""
     try:
-        if path.is_dir() and not path.is_symlink():
+        if path.is_dir() and not is_link(path):
             shutil.rmtree(path)
         else:
             path.unlink(missing_ok=True)

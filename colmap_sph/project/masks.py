@@ -125,7 +125,7 @@ def warn_of_unused_masks(folder: Path, names: Iterable[str], image_dir: Path) ->
         known |= {folder / name for name in names}
     files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path not in known)
     unused = [
-        str(path.relative_to(folder))
+        path.relative_to(folder).as_posix()
         for path in files
         if not path.name.startswith(".") and path.name not in _NO_MASKS
     ]

@@ -6,7 +6,8 @@ from functools import cached_property
 from pathlib import Path, PurePosixPath
 from typing import Literal, get_args
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, OutputError
+from colmap_sph.platforms.names import longest_path, name_problem
 from colmap_sph.project.files import make_dir
 
 MapKind = Literal["photometric", "geometric"]
@@ -261,7 +262,7 @@ class Workspace:
         Raises
         ------
         OutputError
-            A folder cannot be created.
+            A folder cannot be created, or a path is longer than this system is set up for.
         """
         folders = {
             self.stereo_dir / "depth_maps",
@@ -272,8 +273,17 @@ class Workspace:
         for name in names:
             folders.add(self.depth_map_path(name, "geometric").parent)
             folders.add(self.normal_map_path(name, "geometric").parent)
+            self._check_length(self.normal_map_path(name, "photometric"))
         for folder in sorted(folders):
             make_dir(folder)
+
+    def _check_length(self, path: Path) -> None:
+        limit = longest_path()
+        if limit is not None and len(str(path.absolute())) > limit:
+            raise OutputError(
+                f"{path} has more than the {limit} characters that Windows allows here: choose a shorter "
+                "--output, or have an administrator turn on its long paths (LongPathsEnabled)."
+            )
 
 
 def mask_path(folder: Path, name: str) -> Path:
@@ -292,11 +302,15 @@ def checked_name(name: str) -> str:
     Raises
     ------
     InputError
-        It would lead out of the workspace, or leaves no room for the endings of our files.
+        It would lead out of the workspace, leaves no room for the endings of our files, or is none that a file
+        can have on this system.
     """
     parts = PurePosixPath(name)
     if not name or parts.is_absolute() or ".." in parts.parts:
         raise InputError(f"The image name {name!r} leads out of the workspace; rename the image in the model.")
+    problem = name_problem(name)
+    if problem is not None:
+        raise InputError(f"The image name {name!r} {problem}; rename the image, its file and in the model.")
     if len(parts.parts) > _MAX_FOLDERS:
         raise InputError(
             f"The image name '{name[:20]}…' has more than {_MAX_FOLDERS} folders; rename the image in the model."

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from colmap_sph.errors import OptionError, OutputError
+from colmap_sph.errors import OptionError, OutputError, reason_of
 from colmap_sph.synthetic.light import Light
 from colmap_sph.synthetic.model import (
     MAX_INCIDENCE,
@@ -29,7 +29,6 @@ from colmap_sph.synthetic.photographs.real_camera import real_camera
 from colmap_sph.synthetic.photographs.structure_from_motion import disturb
 from colmap_sph.synthetic.primitives import Surface
 from colmap_sph.synthetic.rays import Camera
-from colmap_sph.synthetic.render import Rendering
 
 logger = logging.getLogger(__name__)
 
@@ -261,7 +260,7 @@ def _write_view(
         seed=options.seed,
         number=number,
     )
-    _write_picture(root / "images" / name, rendering, options.jpeg_quality)
+    write_picture(root / "images" / name, rendering.image, options.jpeg_quality)
     # Half precision keeps a unit vector to 0.03 degrees in half the space.
     np.savez(
         root / "truth" / f"{name}.npz",
@@ -271,10 +270,17 @@ def _write_view(
     return rendering.image
 
 
-def _write_picture(path: Path, rendering: Rendering, quality: int) -> None:
-    picture = np.ascontiguousarray(rendering.image[..., ::-1])
-    if not cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, quality]):
-        raise OutputError(f"cannot write {path}: check the disk space and the folder's permissions")
+def write_picture(path: Path, picture: npt.NDArray[np.uint8], *quality: int) -> None:
+    """Write an RGB picture, as JPEG of a quality or as PNG; `OutputError` where that is impossible."""
+    flags = [cv2.IMWRITE_JPEG_QUALITY, *quality] if quality else []
+    # Not by OpenCV's own function of files, which on Windows knows names in one alphabet only.
+    encoded = cv2.imencode(path.suffix, np.ascontiguousarray(picture[..., ::-1]), flags)[1]
+    try:
+        path.write_bytes(encoded.tobytes())
+    except OSError as error:
+        raise OutputError(
+            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
+        ) from error
 
 
 def _point_colours(sparse: SparsePoints, pictures: list[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:

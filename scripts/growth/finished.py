@@ -6,6 +6,7 @@ finds everything there and up to date, in a workspace that took minutes to make 
     python -m growth.finished WORKSPACE
 """
 
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -19,7 +20,6 @@ from colmap_sph.pipeline.reconstruct import run
 from colmap_sph.pipeline.stages import confirm, fusion_parts, match, vote
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import write_estimate, write_pair
-from colmap_sph.project import files
 from colmap_sph.project.cloud_files import write_part
 from colmap_sph.scene import POINT
 from colmap_sph.stereo.depth import DepthEstimate
@@ -73,7 +73,7 @@ def finish(workspace: Path, words: Sequence[str] = ()) -> None:
     }
     for stage, make in stages.items():
         stage.make = staticmethod(make)
-    files._sync = lambda descriptor: None
+    os.fsync = lambda fd: None
     run(workspace=workspace, options=RunOptions(threads=1))
 
 

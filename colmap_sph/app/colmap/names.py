@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from colmap_sph.errors import InputError
+from colmap_sph.platforms.processes import become
 
 OWN = ("patch_match_stereo", "stereo_fusion")
 """Those that this program does itself."""
@@ -92,7 +93,7 @@ def hand_over(arguments: Sequence[str]) -> None:
         raise InputError(_not_there(arguments[0]))
     os.environ[_TRIED] = os.pathsep.join([*tried, colmap])
     try:
-        os.execv(colmap, ["colmap", *arguments])
+        become(colmap, ["colmap", *arguments])
     except OSError as error:
         raise InputError(f"{colmap} cannot be started ({error.strerror}); install COLMAP again.") from error
 

@@ -7,7 +7,6 @@ of theirs, and the leaves the rest. What is drawn of nodes, down to whichever, i
 written, and little kept in memory.
 """
 
-import os
 import threading
 from collections import OrderedDict
 from contextlib import suppress
@@ -151,6 +150,7 @@ class CloudBlocks:
         self._upper: list[Points] = []
         self._recent: OrderedDict[int, _Block] = OrderedDict()
         self._lock = threading.Lock()
+        self._reading = threading.Lock()
 
     @property
     def num_blocks(self) -> int:
@@ -246,7 +246,9 @@ class CloudBlocks:
         """Points of a block from one place in its order to another; those that are nowhere are left out."""
         item = self.layout.kind.itemsize
         count = min(_BLOCK, self.layout.count - block * _BLOCK)
-        data = os.pread(self._file.fileno(), count * item, self.layout.begin + block * _BLOCK * item)
+        with self._reading:
+            self._file.seek(self.layout.begin + block * _BLOCK * item)
+            data = self._file.read(count * item)
         if len(data) < count * item:
             raise InputError(f"{self.path} was cut off; start colmap_sph view again.")
         which = self._order[begin:end]

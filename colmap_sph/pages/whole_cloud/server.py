@@ -14,6 +14,7 @@ import numpy as np
 from colmap_sph.errors import InputError, OptionError, printable, reason_of
 from colmap_sph.pages.markup import from_template, style_and_script
 from colmap_sph.pages.whole_cloud.blocks import FAN, LEAVES, CloudBlocks, CloudFrame
+from colmap_sph.platforms.surroundings import REUSES_PORTS
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import real_path
@@ -145,6 +146,7 @@ def _frame_of(workspace: Workspace) -> CloudFrame:
 
 
 class _Server(ThreadingHTTPServer):
+    allow_reuse_address = REUSES_PORTS
     daemon_threads = True
     cloud: CloudServer
 

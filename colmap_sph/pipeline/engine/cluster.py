@@ -20,13 +20,14 @@ from colmap_sph.pipeline.engine import entry
 from colmap_sph.pipeline.engine.connection import connected, dashboard_of
 from colmap_sph.pipeline.engine.division import Asked, Division
 from colmap_sph.pipeline.engine.group import Answer, Group, Piece, RunSeen, folders_of
-from colmap_sph.pipeline.engine.lag import PATIENCE, look_again
+from colmap_sph.pipeline.engine.lag import PATIENCE
 from colmap_sph.pipeline.engine.worker import WorkerFacts, sees_token, unseen
 from colmap_sph.pipeline.execute import execute, tell_counts
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import Kept, Result, Stage
+from colmap_sph.platforms.files import look_again
 from colmap_sph.project.claim import remove_leftovers
 from colmap_sph.project.files import atomic_file, remove
 from colmap_sph.project.workspace import Workspace

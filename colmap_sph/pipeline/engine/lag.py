@@ -5,15 +5,14 @@ ask again.
 """
 
 import errno
-import os
 import time
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.platforms.files import look_again
 
 R = TypeVar("R")
 
@@ -22,13 +21,6 @@ PATIENCE = 5.0
 
 _FIRST_WAIT = 0.1
 _MISSING = {errno.ENOENT, errno.ESTALE}
-
-
-def look_again(folders: Iterable[Path]) -> None:
-    """Forget what is remembered of folders; need not exist."""
-    for folder in folders:
-        with suppress(OSError):
-            os.close(os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC))
 
 
 def made_with_patience(make: Callable[[], Facts], folders: Iterable[Path], patience: float = PATIENCE) -> Facts:

@@ -16,12 +16,14 @@ import cv2
 
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError
 from colmap_sph.pipeline.engine.group import Answer, Group, Outcome, Piece, RunSeen, folders_of
-from colmap_sph.pipeline.engine.lag import PATIENCE, look_again, made_with_patience
+from colmap_sph.pipeline.engine.lag import PATIENCE, made_with_patience
 from colmap_sph.pipeline.keys import program_digests
-from colmap_sph.pipeline.memory import MemoryGate, most_resident, resident
+from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import holding_caches
-from colmap_sph.pipeline.workers import is_memory_error, keep_freed_memory
+from colmap_sph.pipeline.workers import is_memory_error
+from colmap_sph.platforms.files import look_again
+from colmap_sph.platforms.memory import keep_freed_memory, most_resident, resident
 from colmap_sph.project.files import read_small, writing_only_if
 from colmap_sph.project.state.background import vouching_in_background
 

@@ -4,13 +4,11 @@ import math
 import re
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
-
-import psutil
 
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.platforms.memory import process_start_time
 
 _FORM = re.compile(r"(?:(\d+(?:\.\d+)?)\s*h)?\s*(?:(\d+(?:\.\d+)?)\s*(?:min|m))?\s*(?:(\d+(?:\.\d+)?)\s*s)?")
 _LONGEST = 1e7
@@ -103,9 +101,8 @@ def _value(options: RunOptions, dial: str) -> object:
 
 def process_start() -> float:
     """When this process was started, as `time.monotonic` tells: its imports are a part of the time, too."""
-    with suppress(OSError, psutil.Error):
-        return time.monotonic() - max(time.time() - float(psutil.Process().create_time()), 0.0)
-    return time.monotonic()
+    started = process_start_time()
+    return time.monotonic() - (0.0 if started is None else max(time.time() - started, 0.0))
 
 
 def parse_time(text: str) -> float:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from colmap_sph.errors import InputError, OptionError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.contradictions import check_numbers
-from colmap_sph.pipeline.engine.lag import PATIENCE, look_again
+from colmap_sph.pipeline.engine.lag import PATIENCE
 from colmap_sph.pipeline.execute import execute, made_by_threads, tell_counts
 from colmap_sph.pipeline.forecast.foresight import estimate
 from colmap_sph.pipeline.input.prepared import find_prepared, prepare
@@ -31,6 +31,7 @@ from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.pipeline.workers import for_all, room_for_workers
+from colmap_sph.platforms.files import look_again
 from colmap_sph.project.claim import claimed, shared
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.workspace import Workspace

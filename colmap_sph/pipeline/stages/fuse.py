@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
 from colmap_sph.pipeline.known.remembering import done
-from colmap_sph.pipeline.memory import format_memory, resident
+from colmap_sph.pipeline.memory import format_memory
 from colmap_sph.pipeline.stages.cloud import (
     begin_cloud,
     facts_of_cloud,
@@ -36,6 +36,7 @@ from colmap_sph.pipeline.stages.fusion_parts import (
 )
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_sound_maps, views_beside
+from colmap_sph.platforms.memory import resident
 from colmap_sph.project.cloud_files import (
     check_places,
     join_parts,

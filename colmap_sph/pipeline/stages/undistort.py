@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.stages.facts import Facts, UndistortedFacts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
+from colmap_sph.platforms.files import move_into_place
 from colmap_sph.project.cameras import plain_camera
 from colmap_sph.project.files import (
     make_dir,
@@ -121,7 +122,7 @@ def _publish(task: UndistortTask) -> None:
     begin(task.record, list(moves), sync=False)
     for target, made in moves.items():
         make_dir(target.parent)
-        made.replace(target)
+        move_into_place(made, target)
     vouch_when_on_disk(task.record, task.key, digests, facts)
 
 

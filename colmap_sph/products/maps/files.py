@@ -10,6 +10,7 @@ import numpy as np
 import OpenImageIO
 from numpy.typing import NDArray
 
+from colmap_sph.platforms.files import write_text
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.maps.reading import DepthAtCentres, MappedScene
 from colmap_sph.products.publishing import published_folder
@@ -100,7 +101,7 @@ def _write_cameras(
             for view in scene.scene.views
         ],
     }
-    path.write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+    write_text(path, json.dumps(content, indent=1, ensure_ascii=False))
 
 
 def camera_values(view: View, origin: NDArray[np.float64]) -> dict[str, Any]:

@@ -15,8 +15,9 @@ import cv2
 import numpy as np
 
 from colmap_sph.errors import InputError, printable
+from colmap_sph.platforms.files import write_text
+from colmap_sph.platforms.links import link
 from colmap_sph.products.publishing import published_folder
-from colmap_sph.products.scenes.links import relative
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
@@ -51,11 +52,11 @@ def write_mvsnet(workspace: Workspace, folder: Path) -> None:
         (made / "images").mkdir()
         for number, view in enumerate(scene.views):
             camera = _camera(view, points[seen[number]] if len(seen[number]) else points)
-            (made / "cams" / f"{number:08d}_cam.txt").write_text(camera)
+            write_text(made / "cams" / f"{number:08d}_cam.txt", camera)
             _put_image(workspace, view, made, folder, number)
-        (made / "pair.txt").write_text(_pairs(scene, selection))
+        write_text(made / "pair.txt", _pairs(scene, selection))
         names = "".join(f"{number:08d} {printable(view.name)}\n" for number, view in enumerate(scene.views))
-        (made / "names.txt").write_text(names, encoding="utf-8")
+        write_text(made / "names.txt", names)
 
 
 def _camera(view: View, points: np.ndarray) -> str:
@@ -89,10 +90,10 @@ def _put_image(workspace: Workspace, view: View, made: Path, folder: Path, numbe
     source = workspace.image_path(view.name)
     target = made / "images" / f"{number:08d}.jpg"
     if source.suffix.lower() in _JPEG:
-        target.symlink_to(relative(source, folder / "images"))
+        link(target, source, seen_from=folder / "images")
         return
-    image = cv2.imread(str(source), cv2.IMREAD_COLOR)
+    # Not by OpenCV's own functions of files, which on Windows know names in one alphabet only.
+    image = cv2.imdecode(np.fromfile(source, np.uint8), cv2.IMREAD_COLOR)
     if image is None:
         raise InputError(f"The image {source} cannot be read; run `colmap_sph run` on its project again.")
-    if not cv2.imwrite(str(target), image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]):
-        raise OSError("the image was not written")
+    target.write_bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes())

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from colmap_sph.platforms.files import write_text
 from colmap_sph.products.clouds.ply import write_ply
 from colmap_sph.products.clouds.thinning import ThinCloud
 from colmap_sph.products.maps.reading import MappedScene
@@ -62,7 +63,7 @@ def write_nerfstudio(scene: MappedScene, cloud: ThinCloud, folder: Path) -> None
             # nerfstudio works in 32-bit floats; ours, it looks at what it knows alone.
             "model_coordinates_of_origin": origin.tolist(),
         }
-        (made / "transforms.json").write_text(json.dumps(content, indent=1, ensure_ascii=False), encoding="utf-8")
+        write_text(made / "transforms.json", json.dumps(content, indent=1, ensure_ascii=False))
 
 
 def _frame(view: View, depth: str) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_sph.errors import InputError
+from colmap_sph.platforms.files import write_text
 from colmap_sph.products.clouds.ply import write_points
 from colmap_sph.products.clouds.thinning import ThinCloud
 from colmap_sph.products.publishing import published_folder, scratch_beside
@@ -68,7 +69,7 @@ def write_splats(workspace: Workspace, cloud: ThinCloud, folder: Path) -> None:
         origin = local_origin(model)
         if origin.any():
             move_model(model, origin)
-            (made / _ORIGIN).write_text(" ".join(map(repr, origin.tolist())) + "\n")
+            write_text(made / _ORIGIN, " ".join(map(repr, origin.tolist())) + "\n")
         (made / "sparse" / "0").mkdir(parents=True)
         model.write_binary(made / "sparse" / "0")
 

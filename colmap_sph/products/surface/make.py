@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import NoResultError, OutputError, reason_of
+from colmap_sph.platforms.files import move_into_place, sync_file
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.places import check_places
 from colmap_sph.products.surface.balance import balancing_gains
@@ -21,7 +22,7 @@ from colmap_sph.products.surface.placing import Placement, place
 from colmap_sph.products.surface.previews import PREVIEWS, write_previews
 from colmap_sph.products.surface.seen import SeenView, seen_views
 from colmap_sph.products.surface.tiles import Sightings, Tile, choose_side, tiles_of
-from colmap_sph.project.files import atomic_file, free_space, make_dir, scratch_folder, sync_file
+from colmap_sph.project.files import atomic_file, free_space, make_dir, scratch_folder
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 
@@ -223,7 +224,7 @@ def _publish(made: list[Path], folder: Path) -> list[Path]:
         target = folder / path.name
         try:
             sync_file(path)
-            path.replace(target)
+            move_into_place(path, target)
         except OSError as error:
             raise OutputError(
                 f"{target} cannot be written ({reason_of(error)}); choose another --output."

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 
 from colmap_sph.errors import InputError
+from colmap_sph.platforms.names import same_file_name
 from colmap_sph.project.workspace import checked_name
 
 # What COLMAP cuts off.
@@ -62,6 +63,14 @@ def _check_places(names: Sequence[str], sparse_dir: Path) -> None:
     if len(known) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
         raise InputError(f"The model in {sparse_dir} has two images named {twice!r}; rename one of them.")
+    alike: dict[str, str] = {}
+    for name in names:
+        other = alike.setdefault(same_file_name(name), name)
+        if other != name:
+            raise InputError(
+                f"The model in {sparse_dir} has the images {other!r} and {name!r}, which are the same file on "
+                "this system; rename one of them."
+            )
     for name in names:
         inside = next((str(folder) for folder in PurePosixPath(name).parents if str(folder) in known), None)
         if inside is not None:

@@ -115,7 +115,7 @@ def other_spellings(folder: Path, names: Iterable[str]) -> dict[str, str]:
 
 def _files_below(folder: Path) -> Iterable[str]:
     for place, _, files in os.walk(folder):
-        within = os.path.relpath(place, folder)
+        within = Path(place).relative_to(folder).as_posix()
         yield from (file if within == "." else f"{within}/{file}" for file in files)
 
 

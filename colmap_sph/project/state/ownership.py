@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import get_args
 
 from colmap_sph.errors import InputError
+from colmap_sph.platforms.files import is_link
+from colmap_sph.platforms.locks import remove_lock
 from colmap_sph.project.cloud_files import remove_local_workspace
 from colmap_sph.project.cloud_tiles import INDEX, damaged_tiles, read_index, retire_tiles
 from colmap_sph.project.files import remove, set_aside, whole_digest
@@ -221,6 +223,7 @@ def remove_recorded(workspace: Workspace) -> list[Path]:
     for path in workspace.known_paths:
         remove(path)
     folders = (workspace.records_dir, workspace.pairs_dir, workspace.photometric_dir, workspace.known_dir)
+    remove_lock(workspace.known_dir)
     remove_empty_folders(*folders)
     return altered
 
@@ -236,7 +239,7 @@ def _remove(places: Iterable[Place]) -> list[Path]:
     for place in places:
         others = altered_files(read_record(place.record), place.files, every_byte=True)
         for path in place.files:
-            if path not in others and (path.is_file() or path.is_symlink()):
+            if path not in others and (path.is_file() or is_link(path)):
                 remove(path)
         # Last, as only it says whose they are; it stays where some of them do.
         if not others:
@@ -248,7 +251,7 @@ def _remove(places: Iterable[Place]) -> list[Path]:
 def remove_empty_folders(*roots: Path) -> None:
     """Remove folders, and those inside of them, where there is no file in them."""
     for root in roots:
-        folders = [path for path in root.rglob("*") if path.is_dir() and not path.is_symlink()]
+        folders = [path for path in root.rglob("*") if path.is_dir() and not is_link(path)]
         for folder in [*sorted(folders, reverse=True), root]:
             with suppress(OSError):  # not empty, or not there
                 folder.rmdir()

@@ -18,14 +18,13 @@ import xxhash
 from msgspec import Meta
 
 from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.platforms.files import is_link, sync_file, sync_folder
 from colmap_sph.project.files import (
     atomic_file,
     make_dir,
     open_regular,
     read_small,
     set_aside,
-    sync_file,
-    sync_folder,
     whole_digest,
 )
 from colmap_sph.project.state import background
@@ -315,7 +314,7 @@ def altered_files(known: Record | None, files: Sequence[Path], *, every_byte: bo
     every_byte : bool
         Whether to look at all of a large file, too: before it is replaced or removed.
     """
-    there = [path for path in files if os.path.lexists(path) and (path.is_symlink() or not path.is_dir())]
+    there = [path for path in files if os.path.lexists(path) and (is_link(path) or not path.is_dir())]
     if known is None or not there:
         return there
     if known.state == "making":

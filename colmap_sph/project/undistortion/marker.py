@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.platforms.files import move_into_place
 from colmap_sph.project.files import atomic_file, make_dir, remove, set_aside
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
@@ -237,7 +238,7 @@ def publish_model(workspace: Workspace, marker: Marker, made: Path, names: Seque
             remove(path)
     try:
         for name in sorted(files):
-            (made / name).replace(workspace.sparse_dir / name)
+            move_into_place(made / name, workspace.sparse_dir / name)
     except OSError as error:
         raise OutputError(
             f"The model cannot be moved into {workspace.sparse_dir} ({reason_of(error)}); check permissions."

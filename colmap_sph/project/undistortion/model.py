@@ -5,7 +5,6 @@ model it writes; that is mended here.
 """
 
 import errno
-import os
 import tempfile
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.platforms.files import take_room
 from colmap_sph.project.cameras import change_camera, make_pinhole, plain_camera
 from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import free_space, make_dir
@@ -212,7 +212,7 @@ def raise_if_disk_is_full(folder: Path) -> None:
     """Raise `OutputError` where there is no room: the disk is full, or a quota or a limit on files is reached."""
     with tempfile.TemporaryFile(dir=folder) as file:
         try:
-            os.posix_fallocate(file.fileno(), 0, _FULL_DISK_BYTES)
+            take_room(file.fileno(), _FULL_DISK_BYTES)
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
                 raise OutputError(

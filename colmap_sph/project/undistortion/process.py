@@ -16,12 +16,15 @@ from pathlib import Path
 from typing import IO, Any
 
 from colmap_sph.errors import ColmapSphError, InputError, OutputError, reason_of
+from colmap_sph.platforms.processes import apart
 
 # What libjpeg says when it ends a process.
 _DISK_FULL = "Output file write error"
 # How COLMAP's library begins a message that ends a process.
 _FATAL = re.compile(r"^F\d{8} [^\]]*\] (.*)$", re.MULTILINE)
 _MAX_WORDS = 200
+# What tells programs of all systems where temporary files go.
+_TEMPORARY = ("TMPDIR", "TEMP", "TMP")
 
 
 class ChildProcess:
@@ -62,7 +65,7 @@ class ChildProcess:
             pickle.dump((function, argument), process.stdin)
             process.stdin.flush()
             error = pickle.load(process.stdout)
-        except (EOFError, BrokenPipeError, pickle.UnpicklingError):
+        except (EOFError, OSError, pickle.UnpicklingError):  # Windows calls a broken pipe an invalid argument
             raise self._epitaph(process, what) from None
         if error is not None:
             raise error
@@ -90,8 +93,8 @@ class ChildProcess:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=self._words,
-                env=os.environ | {"TMPDIR": str(self.folder)},
-                start_new_session=True,  # Ctrl-C is for this process, which then ends the other
+                env=os.environ | dict.fromkeys(_TEMPORARY, str(self.folder)),
+                **apart(),  # Ctrl-C is for this process, which then ends the other
             )
         except OSError as error:
             raise OutputError(f"A process for COLMAP cannot be started ({reason_of(error)}).") from error

@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from colmap_sph.errors import OutputError
-from colmap_sph.synthetic.capture import CaptureOptions
+from colmap_sph.synthetic.capture import CaptureOptions, write_picture
 from colmap_sph.synthetic.light import Light, ShadowMap
 from colmap_sph.synthetic.model import build_reconstruction, sample_sparse_points, write_reconstruction
 from colmap_sph.synthetic.photographs.optics import sensor_readings
@@ -229,6 +228,5 @@ def _write_view(
     image[~is_seen] = 0
     distance, _, _ = exact_geometry(surfaces, camera)
     distance[~is_seen] = 0
-    if not cv2.imwrite(str(root / "images" / name), np.ascontiguousarray(image[..., ::-1])):
-        raise OutputError(f"cannot write {root / 'images' / name}: check disk space and permissions")
+    write_picture(root / "images" / name, image)
     np.savez(root / "truth" / f"{name}.npz", range=distance.astype(np.float32), rays=rays.astype(np.float32))
