@@ -280,6 +280,7 @@ def depth_candidates(
     disparity_sigma: float,
     max_disparity_step: float,
     spherical: bool,
+    flatness: float,
     is_left: bool,
     first_row: int,
     depth: NDArray[np.float32],
@@ -299,6 +300,7 @@ def depth_candidates(
     disparity_sigma : float
     max_disparity_step : float
     spherical : bool
+    flatness : float
     is_left : bool
     first_row : int
     depth : (H, W) float32, written
@@ -721,6 +723,7 @@ def place_windows(
     origins: tuple[float, float],
     scales: tuple[float, float],
     spherical: bool,
+    flatness: float,
     columns: NDArray[np.float32],
     rows: NDArray[np.float32],
     /,
@@ -733,6 +736,7 @@ def place_windows(
     origins : tuple[float, float]
     scales : tuple[float, float]
     spherical : bool
+    flatness : float
     columns : (POINTS, H, W) float32, written
     rows : (POINTS, H, W) float32, written
     """
