@@ -283,6 +283,7 @@ def depth_candidates(
     disparity_sigma: float,
     max_disparity_step: float,
     spherical: bool,
+    flatness: float,
     is_left: bool,
     first_row: int,
     depth: NDArray[np.float32],
@@ -302,6 +303,7 @@ def depth_candidates(
     disparity_sigma : float
     max_disparity_step : float
     spherical : bool
+    flatness : float
     is_left : bool
     first_row : int
     depth : (H, W) float32, written
@@ -725,6 +727,7 @@ def place_windows(
     origins: tuple[float, float],
     scales: tuple[float, float],
     spherical: bool,
+    flatness: float,
     columns: NDArray[np.float32],
     rows: NDArray[np.float32],
     /,
@@ -737,6 +740,7 @@ def place_windows(
     origins : tuple[float, float]
     scales : tuple[float, float]
     spherical : bool
+    flatness : float
     columns : (POINTS, H, W) float32, written
     rows : (POINTS, H, W) float32, written
     """

@@ -240,7 +240,7 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     valid = np.full(scene.shape, 255, dtype=np.uint8)
 
     def candidates(backend: str) -> None:
-        arguments = ((width, width), origins, 0.0, 1.0, 0.25, 1.0, True, True, 0, depth, sigma)
+        arguments = ((width, width), origins, 0.0, 1.0, 0.25, 1.0, True, 1.0, True, 0, depth, sigma)
         _native.depth_candidates(backend, disparity, inverse_K, *arguments)
 
     candidates("scalar")

@@ -257,7 +257,7 @@ def place_windows(rng: Random) -> Arguments:
     inputs = [filled(rng, shape, np.float64) for shape in ((count, 2), (count, 2), (3, 3))]
     pairs = (number(rng), number(rng)), (number(rng), number(rng))
     shape = (count, *rng.integers(1, 33, 2).tolist())
-    return [*inputs, *pairs, bool(rng.integers(2)), *(np.zeros(shape, np.float32) for _ in range(2))]
+    return [*inputs, *pairs, bool(rng.integers(2)), number(rng), *(np.zeros(shape, np.float32) for _ in range(2))]
 
 
 def make_templates(rng: Random) -> Arguments:
@@ -285,7 +285,7 @@ def depth_candidates(rng: Random) -> Arguments:
     maps = [np.zeros(size(rng), np.float32)] * 2
     geometry = [filled(rng, (3, 3), np.float64), (number(rng), number(rng)), (number(rng), number(rng))]
     numbers = [number(rng) for _ in range(4)]
-    flags = [bool(rng.integers(2)), bool(rng.integers(2)), int(rng.integers(0, 9))]
+    flags = [bool(rng.integers(2)), number(rng), bool(rng.integers(2)), int(rng.integers(0, 9))]
     disparity = filled(rng, size(rng), np.float32)
     return [backend(rng), disparity, *geometry, *numbers, *flags, maps[0], maps[1].copy()]
 

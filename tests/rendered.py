@@ -53,6 +53,8 @@ def array_coordinates(pair, side, directions):
     x, y, z = pair.rectified_from_world @ np.asarray(directions).T
     if pair.surface == "spherical":
         along, across = np.arctan2(x, np.sqrt(y**2 + z**2)), np.arctan2(y, z)
+        if pair.flatness:
+            along = np.tan(pair.flatness * along) / pair.flatness
     else:
         along, across = x / z, y / z
     origin = pair.left_origin if side == "left" else pair.right_origin
@@ -79,6 +81,7 @@ def source_pixels(view, pair, side):
     along = (column + pair.column_origin(side)) / pair.columns_per_radian
     across = (row + pair.row_origin) / pair.rows_per_radian
     if pair.surface == "spherical":
+        along = np.arctan(pair.flatness * along) / pair.flatness if pair.flatness else along
         rays = [np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)]
     else:
         rays = [along, across, np.ones_like(along)]

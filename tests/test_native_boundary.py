@@ -137,6 +137,7 @@ def arguments(function):
             "disparity_sigma": 0.3,
             "max_disparity_step": 2.0,
             "spherical": True,
+            "flatness": 0.9,
             "is_left": True,
             "first_row": 0,
             "out depth": np.zeros((5, 6), f32),
@@ -394,6 +395,7 @@ def ties_arguments():
             "origins": (0.0, 0.0),
             "scales": (9.0, 9.0),
             "spherical": True,
+            "flatness": 0.9,
             "out columns": floats(count, side, side),
             "out rows": floats(count, side, side),
         },
@@ -1074,7 +1076,7 @@ def test_empty_maps_are_no_work(shape):
     _native.transfer_disparity(empty, 2.0, right)
     assert np.isnan(right).all()
     _native.transfer_disparity(np.ones((shape[0], 4), np.float32), 2.0, empty)
-    geometry = (np.eye(3), (9.0, 9.0), (0.0, 0.0), 1.0, 1.0, 0.3, 2.0, True, True, 0)
+    geometry = (np.eye(3), (9.0, 9.0), (0.0, 0.0), 1.0, 1.0, 0.3, 2.0, True, 0.9, True, 0)
     depth = np.ones((5, 6), np.float32)
     _native.depth_candidates("scalar", empty, *geometry, depth, np.ones_like(depth))
     assert not depth.any()
@@ -1159,7 +1161,6 @@ def test_rays_at_the_rim_of_a_map_stay_inside(u, size):
     disparity = np.full(size, 4, np.float32)
     for x, y in ((u, 0.0), (0.0, u), (u, u)):
         matrix = np.array([[0, 0, x], [0, 0, y], [0, 0, 1.0]])
-        _native.depth_candidates(
-            "scalar", disparity, matrix, (1.0, 1.0), (0.0, 0.0), 0.0, 1.0, 1.0, 9.0, False, True, 0, depth, sigma
-        )
+        geometry = disparity, matrix, (1.0, 1.0), (0.0, 0.0), 0.0, 1.0, 1.0, 9.0, False, 0.0, True, 0
+        _native.depth_candidates("scalar", *geometry, depth, sigma)
         assert depth[0, 0] in (0.0, 0.25)

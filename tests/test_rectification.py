@@ -27,7 +27,8 @@ from colmap_sph.stereo.resampling import resample
 
 SPHERE = RectificationOptions()
 FRAME = RectificationOptions(surface="frame")
-SURFACES = {"spherical": SPHERE, "frame": FRAME}
+ANGLES = RectificationOptions(columns="angles")
+SURFACES = {"spherical": SPHERE, "equal angles": ANGLES, "frame": FRAME}
 every_surface = pytest.mark.parametrize("options", SURFACES.values(), ids=SURFACES)
 
 
@@ -91,10 +92,7 @@ WITHOUT_PLANE = {
     "epipole in one image only",
 }
 CASES = [
-    (name, surface)
-    for surface in SURFACES
-    for name in PAIRS
-    if surface == "spherical" or name not in WITHOUT_PLANE
+    (name, surface) for surface in SURFACES for name in PAIRS if surface != "frame" or name not in WITHOUT_PLANE
 ]
 
 
@@ -125,9 +123,15 @@ def test_a_point_has_the_same_row_in_both_images(name, surface, swapped):
         np.testing.assert_allclose(world, points, atol=1e-10)
         positions.append(array_coordinates(pair, side, rays @ pair.rectified_from_world))
     np.testing.assert_allclose(positions[0][1], positions[1][1], atol=1e-6)
-    parallax = (positions[0][0] - positions[1][0] + pair.disparity_origin) / pair.columns_per_radian
+    columns = [
+        (position[0] + origin) / pair.columns_per_radian
+        for position, origin in zip(positions, (pair.left_origin, pair.right_origin), strict=True)
+    ]
+    if pair.flatness:
+        columns = [np.arctan(pair.flatness * column) / pair.flatness for column in columns]
+    parallax = columns[0] - columns[1]
     to_left, to_right = points - left.center, points - right.center
-    if surface == "spherical":
+    if surface != "frame":
         cosine = (to_left * to_right).sum(axis=1)
         sine = np.linalg.norm(np.cross(to_left, to_right), axis=1)
         np.testing.assert_allclose(parallax, np.arctan2(sine, cosine), atol=1e-9)
@@ -191,6 +195,43 @@ def test_sampling_follows_the_finer_image(name, options):
             areas.append(abs(np.linalg.det(step)))
         finest = min(areas)
         assert 0.7 * sampling**2 < finest < 1.7 * sampling**2
+
+
+@pytest.mark.parametrize("name", ["parallel", "convergent", "vertical", "strongly convergent"])
+def test_surfaces_parallel_to_the_baseline_have_one_disparity_in_a_row(name):
+    left, right, pair, _ = rectified(name, "spherical")
+    assert pair.flatness == 1
+    # Points on lines parallel to the baseline, one in each plane through it.
+    planes = np.linspace(-0.1, 0.1, 7)
+    away = np.stack([np.zeros(7), np.sin(planes), np.cos(planes)], axis=1) * np.linspace(8, 12, 7)[:, None]
+    along = np.array([1.0, 0, 0]) * np.linspace(-3, 3, 31)[:, None]
+    points = left.center + (away[:, None] + along).reshape(-1, 3) @ pair.rectified_from_world
+    disparity, _, rows = disparities(pair, left, right, points)
+    assert np.ptp(disparity.reshape(7, 31), axis=1).max() < 1e-9 * pair.columns_per_radian
+    assert np.ptp(rows.reshape(7, 31), axis=1).max() < 1e-9 * pair.rows_per_radian
+
+
+@pytest.mark.parametrize("name", [name for name in PAIRS if name in WITHOUT_PLANE])
+def test_columns_are_flattened_less_where_an_epipole_is_near(name):
+    _, _, pair, _ = rectified(name, "spherical")
+    limit = np.arccos(SPHERE.min_cosine)
+    assert np.degrees(pair.flatness * limit) == pytest.approx(75, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_flattened_columns_cost_no_pixels(name):
+    pixels = {}
+    for surface in ("spherical", "equal angles"):
+        _, _, pair, _ = rectified(name, surface)
+        pixels[surface] = pair.height * (pair.left_width + pair.right_width)
+    assert 0.7 < pixels["spherical"] / pixels["equal angles"] < 1.3
+
+
+def test_columns_go_by_angles_where_points_do_not_tell():
+    scene = scene_of(PAIRS["convergent"], POINTS[:20])
+    assert rectify_views(scene, SPHERE).flatness == 1
+    for points in (POINTS[:7], POINTS[:0]):
+        assert rectify_views(scene_of(PAIRS["convergent"], points), SPHERE).flatness == 0
 
 
 # ---- resampling --------------------------------------------------------------------------------------------
@@ -343,6 +384,7 @@ def test_sides_beyond_what_can_be_resampled_are_refused():
     ("name", "value"),
     [
         ("surface", "cylindrical"),
+        ("columns", "tangents"),
         *[("sampling", value) for value in (0.0, 0.04, 4.1, np.nan, np.inf, -1.0)],
         *[("min_cosine", value) for value in (0.0, 0.95, np.nan)],
         *[(name, value) for name in ("near_margin", "far_margin") for value in (0.9, 21.0, np.nan)],

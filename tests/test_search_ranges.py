@@ -20,21 +20,21 @@ from colmap_sph.stereo.search.ranges import MAX_DEPTH, STEP, num_levels, range_d
 
 
 def test_few_points_tell_no_range() -> None:
-    least, most = parallax_range(np.full(7, 0.1), near_margin=2, far_margin=2)
+    least, most = parallax_range(np.full(7, 0.05), np.full(7, 0.2))
     assert (least, most) == pytest.approx((np.radians(0.3), np.radians(60)))
 
 
 @pytest.mark.parametrize("scale", [1e-3, 0.02, 0.7])
 def test_the_range_holds_the_points_and_its_margins(scale: float) -> None:
     parallaxes = scale * np.linspace(1, 2, 1001)
-    least, most = parallax_range(parallaxes, near_margin=3, far_margin=1.5)
+    least, most = parallax_range(parallaxes / 1.5, parallaxes * 3)
     # All but a hundredth at either end, rounded outwards to 11 binary digits.
     assert 1.01 * scale / 1.5 * (1 - 2**-10) <= least <= 1.01 * scale / 1.5 * (1 + 1e-9)
     assert 1.99 * scale * 3 * (1 - 1e-9) <= most <= 1.99 * scale * 3 * (1 + 2**-10)
 
 
 def test_points_behind_the_cameras_do_not_turn_the_range_around() -> None:
-    least, most = parallax_range(np.linspace(-1, -0.5, 100), near_margin=1, far_margin=1)
+    least, most = parallax_range(np.linspace(-1, -0.5, 100), np.linspace(-1, -0.5, 100))
     assert 0 < least <= most
 
 

@@ -60,12 +60,15 @@ def test_maps_smaller_than_a_window_have_no_plane(shape):
 # ---- windows -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("surface", ["spherical", "frame"])
+@pytest.mark.parametrize(
+    ("surface", "columns_by"), [("spherical", "flat"), ("spherical", "angles"), ("frame", "flat")]
+)
 @pytest.mark.parametrize("coarse", [1.0, 0.02])
-def test_windows_are_placed_where_the_geometry_says(surface, coarse):
+def test_windows_are_placed_where_the_geometry_says(surface, columns_by, coarse):
     """Coarse ones are wider than sines of small angles are good for."""
     scene, left, right = scene_of_pair(syn.convergent_pair())
-    geometry = rectify_pair(scene, left, right, RectificationOptions(surface=surface)).resampled(coarse)
+    options = RectificationOptions(surface=surface, columns=columns_by)
+    geometry = rectify_pair(scene, left, right, options).resampled(coarse)
     rng = np.random.default_rng(1)
     places = rng.uniform(0, (geometry.right_width, geometry.height), (40, 2))
     slopes = rng.uniform((0.5, -0.5), (1.5, 0.5), (40, 2))
@@ -77,6 +80,7 @@ def test_windows_are_placed_where_the_geometry_says(surface, coarse):
         (geometry.right_origin, geometry.row_origin),
         (geometry.columns_per_radian, geometry.rows_per_radian),
         surface == "spherical",
+        geometry.flatness,
         columns,
         rows,
     )
@@ -94,7 +98,9 @@ def test_windows_are_placed_where_the_geometry_says(surface, coarse):
 def test_what_lies_behind_is_outside_of_the_image():
     columns, rows = np.empty((1, 3, 3), np.float32), np.empty((1, 3, 3), np.float32)
     behind = np.diag([1.0, 1.0, -1.0])
-    _native.place_windows(np.zeros((1, 2)), np.ones((1, 2)), behind, (0.0, 0.0), (9.0, 9.0), True, columns, rows)
+    _native.place_windows(
+        np.zeros((1, 2)), np.ones((1, 2)), behind, (0.0, 0.0), (9.0, 9.0), True, 0.9, columns, rows
+    )
     assert (columns < -1).all() and (rows < -1).all()
 
 

@@ -55,6 +55,7 @@ def test_ties_of_exact_poses_lie_where_the_surface_is(matched):
     along = (ties.left[:, 0] + geometry.left_origin) / geometry.columns_per_radian
     across = (ties.left[:, 1] + geometry.row_origin) / geometry.rows_per_radian
     if geometry.surface == "spherical":
+        along = np.arctan(geometry.flatness * along) / geometry.flatness
         rays = np.stack([np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)], axis=1)
     else:
         rays = np.stack([along, across, np.ones_like(along)], axis=1)

@@ -1,8 +1,9 @@
 """Sparse points of a pair → the range of parallaxes it is searched in, and the columns that can have a match.
 
-A parallax is an angle on the sphere and a tangent on the plane (see `rectified_pair`); times the columns per
-radian it is a disparity. The range is that of the sparse points, with a margin on either side: surfaces nearer and
-farther than these are common, and what lies outside of the range is never found.
+A parallax is a difference of what columns are equal steps of (see `rectified_pair`): on the sphere of angles or
+what they are flattened to, on the plane of tangents. Times the columns per radian it is a disparity. The range is
+that of the sparse points, with a margin on either side: surfaces nearer and farther than these are common, and
+what lies outside of the range is never found.
 """
 
 from collections.abc import Callable
@@ -11,13 +12,13 @@ import numpy as np
 
 from colmap_sph.errors import RectificationError
 from colmap_sph.scene import Photograph, View
-from colmap_sph.stereo.rectified_pair import Float, ray_angles
+from colmap_sph.stereo.rectified_pair import Float, columns_of_angles, ray_angles
 
 Range = tuple[float, float]
 """Least and most."""
 
 # Fewer shared points than this say too little about the range of parallaxes; what is then searched, in degrees.
-_MIN_POINTS = 8
+MIN_POINTS = 8
 _UNKNOWN_DEGREES = (0.3, 60.0)
 # Extremes of the sparse points that are believed; beyond are outliers.
 _PERCENTILES = (1, 99)
@@ -29,7 +30,9 @@ _MOST_TIMES = 4
 _DIGITS = 11
 
 
-def parallax_angles(left: View | Photograph, right: View | Photograph, rotation: Float, points: Float) -> Float:
+def sphere_parallaxes(
+    left: View | Photograph, right: View | Photograph, rotation: Float, points: Float, flatness: float = 0.0
+) -> Float:
     """Parallaxes of points on the sphere.
 
     Parameters
@@ -39,18 +42,20 @@ def parallax_angles(left: View | Photograph, right: View | Photograph, rotation:
         World to rectified frame.
     points : (n, 3) float64 ndarray
         World frame.
+    flatness : float
+        Of the columns.
 
     Returns
     -------
     (n,) float64 ndarray
-        θ_l − θ_r, radians (Elhashash & Qin, §3.2).
+        With flatness 0 θ_l − θ_r, radians (Elhashash & Qin, §3.2).
     """
-    _, left_angles = ray_angles((points - left.center) @ rotation.T)
-    _, right_angles = ray_angles((points - right.center) @ rotation.T)
-    return np.asarray(left_angles - right_angles)
+    seen = (ray_angles((points - view.center) @ rotation.T)[1] for view in (left, right))
+    in_left, in_right = (columns_of_angles(angles, flatness) for angles in seen)
+    return np.asarray(in_left - in_right)
 
 
-def parallax_tangents(left: View, rotation: Float, points: Float, baseline: float) -> Float:
+def plane_parallaxes(left: View, rotation: Float, points: Float, baseline: float) -> Float:
     """Parallaxes of points on the plane.
 
     Parameters
@@ -72,16 +77,14 @@ def parallax_tangents(left: View, rotation: Float, points: Float, baseline: floa
     return np.asarray(baseline / depth[depth > 0])
 
 
-def parallax_range(parallaxes: Float, near_margin: float, far_margin: float) -> Range:
+def parallax_range(farther: Float, nearer: Float) -> Range:
     """Range to search: robust extremes of the sparse points' parallaxes with a generous margin.
 
     Parameters
     ----------
-    parallaxes : (n,) float64 ndarray
-        Of sparse points; with fewer than 8 of them nearly everything is searched.
-    near_margin, far_margin : float
-        The nearest sparse points' distance divided by the first, and the farthest ones' times the second, is what
-        is looked for.
+    farther, nearer : (n,) float64 ndarray
+        Parallaxes of sparse points, moved away from the left image, and towards it, by the margin; with fewer
+        than 8 of them nearly everything is searched.
 
     Returns
     -------
@@ -93,15 +96,16 @@ def parallax_range(parallaxes: Float, near_margin: float, far_margin: float) -> 
     Parallax is about baseline over distance: points ten to twenty baselines away, searched from five to thirty.
 
     >>> import numpy as np
-    >>> least, most = parallax_range(1 / np.linspace(10, 20, 100), near_margin=2, far_margin=1.5)
+    >>> parallaxes = 1 / np.linspace(10, 20, 100)
+    >>> least, most = parallax_range(parallaxes / 1.5, parallaxes * 2)
     >>> bool(1 / 31 < least <= 1 / 29.5), bool(1 / 5.1 < most < 1 / 4.9)
     (True, True)
     """
-    if len(parallaxes) < _MIN_POINTS:
+    if len(nearer) < MIN_POINTS:
         least, most = np.radians(_UNKNOWN_DEGREES)
         return least, most
-    least, most = bounded_range(np.percentile(parallaxes, _PERCENTILES))
-    return least / far_margin, most * near_margin
+    low, high = _PERCENTILES
+    return bounded_range(np.array([np.percentile(farther, low), np.percentile(nearer, high)]))
 
 
 def bounded_range(parallaxes: Float) -> Range:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import RectificationError
 from colmap_sph.scene import View
-from colmap_sph.stereo.disparity_range import Range, parallax_angles, parallax_tangents
+from colmap_sph.stereo.disparity_range import Range
 from colmap_sph.stereo.rectified_pair import Float, ray_angles
 
 # Rows repeated on both sides of the seam where a whole circle of epipolar planes is in view.
@@ -44,8 +44,6 @@ class Extent:
         Least and most of the epipolar planes that both images have.
     columns : pair of (float, float)
         Least and most along these planes, in the left and in the right image.
-    parallaxes : (n,) float64 ndarray
-        Of the sparse points that both see.
     seam : int
         Rows to repeat on both sides, where the rows go round the whole circle.
     """
@@ -53,7 +51,6 @@ class Extent:
     rotation: Float
     rows: Range
     columns: tuple[Range, Range]
-    parallaxes: Float
     seam: int
 
 
@@ -66,7 +63,6 @@ def extent_on_sphere(
     rotation: Float,
     left: View,
     right: View,
-    points: Float,
     min_cosine: float,
     outlines: tuple[Float, Float] | None = None,
 ) -> Extent:
@@ -77,8 +73,6 @@ def extent_on_sphere(
     rotation : (3, 3) float64 ndarray
         World to rectified frame; that of the result is rolled about the baseline, so that the rows' middle is 0.
     left, right : View
-    points : (n, 3) float64 ndarray
-        Sparse points that both see, world frame.
     min_cosine : float
         Rays whose angle with the baseline has a sine (that is cos θ) below this are left out.
     outlines : pair of (n, 2) float64 ndarray, optional
@@ -103,12 +97,10 @@ def extent_on_sphere(
         raise RectificationError("the two images share no epipolar plane")
     rotation = rolled(rotation, centre)
     columns = [column_extent(*each, rotation, -half, half) for each in zip(views, outlines, signs, strict=True)]
-    return bounded_extent(rotation, half, columns, min_cosine, parallax_angles(left, right, rotation, points))
+    return bounded_extent(rotation, half, columns, min_cosine)
 
 
-def bounded_extent(
-    rotation: Float, half: float, columns: Sequence[Range], min_cosine: float, parallaxes: Float
-) -> Extent:
+def bounded_extent(rotation: Float, half: float, columns: Sequence[Range], min_cosine: float) -> Extent:
     """The extent with as many rows to both sides, and columns no nearer to the epipoles than `min_cosine`.
 
     Parameters
@@ -120,21 +112,17 @@ def bounded_extent(
         Least and most θ that the left and the right image show, radians.
     min_cosine : float
         See `extent_on_sphere`.
-    parallaxes : (n,) float64 ndarray
-        Of the sparse points, radians.
     """
     limit = float(np.arccos(min_cosine))
     left, right = ((max(low, -limit), min(high, limit)) for low, high in columns)
     seam = SEAM_ROWS if half >= np.pi else 0
-    return Extent(rotation, (-half, half), (left, right), parallaxes, seam)
+    return Extent(rotation, (-half, half), (left, right), seam)
 
 
 def extent_on_plane(
     rotation: Float,
     left: View,
     right: View,
-    points: Float,
-    baseline: float,
     outlines: tuple[Float, Float] | None = None,
 ) -> Extent:
     """What two images cover of the plane parallel to their baseline, at the distance 1 from it.
@@ -144,10 +132,6 @@ def extent_on_plane(
     rotation : (3, 3) float64 ndarray
         World to rectified frame.
     left, right : View
-    points : (n, 3) float64 ndarray
-        Sparse points that both see, world frame.
-    baseline : float
-        Distance of the projection centres, model units.
     outlines : pair of (n, 2) float64 ndarray, optional
         See `extent_on_sphere`.
 
@@ -174,8 +158,7 @@ def extent_on_plane(
     if high <= low:
         raise RectificationError("the two images share no epipolar plane")
     left_columns, right_columns = ((float(t[:, 0].min()), float(t[:, 0].max())) for t in tangents)
-    parallaxes = parallax_tangents(left, rotation, points, baseline)
-    return Extent(rotation, (low, high), (left_columns, right_columns), parallaxes, seam=0)
+    return Extent(rotation, (low, high), (left_columns, right_columns), seam=0)
 
 
 def rolled(rotation: Float, angle: float) -> Float:

@@ -4,27 +4,36 @@ The frame and the layout are those of `rectified_pair` (Elhashash & Qin, §3.1, 
 baseline and the viewing directions, the rows from what both images see, the columns from the disparity range.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from colmap_sph.errors import OptionError, RectificationError
 from colmap_sph.scene import Photograph, Scene, View, observed_by
 from colmap_sph.stereo.disparity_range import (
+    MIN_POINTS,
     Range,
     bounded_range,
     columns_with_counterparts,
     few_digits,
     limited_range,
-    parallax_angles,
     parallax_range,
-    parallax_tangents,
+    plane_parallaxes,
+    sphere_parallaxes,
 )
 from colmap_sph.stereo.extent import Extent, extent_on_plane, extent_on_sphere, outline_of
 from colmap_sph.stereo.partners.frusta import any_sees
 from colmap_sph.stereo.photographs.extent import extent_of_photographs, nearer_half
-from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Surface
+from colmap_sph.stereo.rectified_pair import (
+    Float,
+    RectifiedPair,
+    Surface,
+    angles_of_columns,
+    columns_of_angles,
+    ray_angles,
+)
 
 # In units of the depth: a parallax of some hundredths of a pixel, and more than centres on a grid are off.
 _LEAST_BASELINE = 1e-5
@@ -43,6 +52,10 @@ _MOST_SAMPLING = 1.3
 _DEPTH_SAMPLES = 17
 _DEPTH_STEP = 1.1
 _MOST_DEPTHS = 400
+# Columns near an epipole are flattened no farther than tangents of this angle.
+_FLATTENED = float(np.radians(75))
+# Rows that are as far apart as .8 columns find more, at the same number of pixels (measured).
+_ROWS_PER_COLUMN = 1.25
 # Fewer rows or columns than this are not worth matching.
 _MIN_SIDE = 16
 
@@ -56,6 +69,9 @@ class RectificationOptions:
     sampling: float = 1.0
     """Rectified pixels, as a factor on what the images' detail asks for: 1.3 per pixel where they are sharp, 0.5
     where they are soft."""
+    columns: Literal["flat", "angles"] = "flat"
+    """How the sphere's columns are spaced: so that surfaces parallel to the baseline look the same in both images
+    of a pair, as far as that can be, or by equal angles, as in the paper."""
     min_cosine: float = 0.1
     """Rays whose angle with the baseline has a smaller sine than this are left out: at 0.1, within 5.7° of the
     epipole."""
@@ -78,6 +94,8 @@ class RectificationOptions:
             raise OptionError(f"surface must be 'spherical' or 'frame', not {self.surface!r}.", "surface")
         if not 0.05 <= self.sampling <= 4:
             raise OptionError(f"sampling must lie in 0.05..4, not {self.sampling}.", "sampling")
+        if self.columns not in ("flat", "angles"):
+            raise OptionError(f"columns must be 'flat' or 'angles', not {self.columns!r}.", "columns")
         if not 0.01 <= self.min_cosine <= 0.9:
             raise OptionError(f"min_cosine must lie in 0.01..0.9, not {self.min_cosine}.", "min_cosine")
         for name in ("near_margin", "far_margin"):
@@ -161,18 +179,31 @@ def rectify_pair(
         raise RectificationError("the two images have the same projection centre")
     rotation = _rectifying_rotation(left, right)
     points = _points_in_both(scene, left, right)
-    extent = _extent(rotation, left, right, points, baseline, options, outlines)
+    extent = _extent(rotation, left, right, options, outlines)
+    is_sphere = options.surface == "spherical"
+    flatness = 0.0
+    # A whole sphere goes from epipole to epipole, and without points nobody knows what lies where.
+    if is_sphere and options.columns == "flat" and not _is_cut(left, right) and len(points) >= MIN_POINTS:
+        flatness = _FLATTENED / max(_FLATTENED, float(np.abs(extent.columns).max()))
+
+    def parallaxes(of: Float) -> Float:
+        if is_sphere:
+            return sphere_parallaxes(left, right, extent.rotation, of, flatness)
+        return plane_parallaxes(left.views[0], extent.rotation, of, baseline)
+
     samplings = (1.0, 1.0) if details is None else (sampling_of(details[0]), sampling_of(details[1]))
     scales = _scale(left, points), _scale(right, points)
     scale = options.sampling * max(samplings[0] * scales[0], samplings[1] * scales[1])
     scale = few_digits(scale, np.round)
-    searched = parallax_range(extent.parallaxes, options.near_margin, options.far_margin)
+    margins = options.far_margin, 1 / options.near_margin
+    moved = [left.center + margin * (points - left.center) for margin in margins]
+    searched = parallax_range(*map(parallaxes, moved))
     if options.depths is not None:
-        given = _range_of_depths(left, right, extent.rotation, options.depths, options.surface, baseline)
-        searched = limited_range(given, searched)
+        searched = limited_range(_range_of_depths(left, right, options.depths, parallaxes), searched)
     if _is_cut(left, right):
         extent = replace(extent, columns=(nearer_half(extent.columns[0], searched[1]), extent.columns[1]))
-    pair = _laid_out(options.surface, extent, baseline, scale, searched)
+    rays = (points - left.center) @ extent.rotation.T
+    pair = _laid_out(options.surface, extent, baseline, scale, searched, flatness, rays)
     _check_size(pair, left, right, options.max_pixels_ratio * max(1.0, scale / max(scales)) ** 2)
     return pair
 
@@ -194,8 +225,6 @@ def _extent(
     rotation: Float,
     left: View | Photograph,
     right: View | Photograph,
-    points: Float,
-    baseline: float,
     options: RectificationOptions,
     outlines: tuple[Sequence[Float], Sequence[Float]] | None,
 ) -> Extent:
@@ -203,13 +232,13 @@ def _extent(
     if outlines is None:
         outlines = ([outline_of(view) for view in left.views], [outline_of(view) for view in right.views])
     if _is_cut(left, right) and options.surface == "spherical":
-        return extent_of_photographs(rotation, left, right, points, options.min_cosine, outlines)
+        return extent_of_photographs(rotation, left, right, options.min_cosine, outlines)
     if _is_cut(left, right):
         raise RectificationError("a plane cannot hold an image that was cut into several views")
     views = (left.views[0], right.views[0])
     if options.surface == "spherical":
-        return extent_on_sphere(rotation, *views, points, options.min_cosine, (outlines[0][0], outlines[1][0]))
-    return extent_on_plane(rotation, *views, points, baseline, (outlines[0][0], outlines[1][0]))
+        return extent_on_sphere(rotation, *views, options.min_cosine, (outlines[0][0], outlines[1][0]))
+    return extent_on_plane(rotation, *views, (outlines[0][0], outlines[1][0]))
 
 
 def _rectifying_rotation(left: View | Photograph, right: View | Photograph) -> Float:
@@ -256,10 +285,8 @@ def _scale(photograph: View | Photograph, points: Float) -> float:
 def _range_of_depths(
     left: View | Photograph,
     right: View | Photograph,
-    rotation: Float,
     depths: tuple[float, float],
-    surface: Surface,
-    baseline: float,
+    parallaxes: Callable[[Float], Float],
 ) -> Range:
     """Parallaxes of what either view sees between two depths in it, and the other has in view."""
     grid = np.linspace(0, 1, _DEPTH_SAMPLES)
@@ -273,27 +300,54 @@ def _range_of_depths(
         camera = depth.reshape(-1, 1) * (pixels @ np.linalg.inv(view.K).T)
         points = (camera - view.t) @ view.R
         seen.append(points[any_sees(other, points)])
-    points = np.concatenate(seen)
-    if surface == "spherical":
-        parallaxes = parallax_angles(left, right, rotation, points)
-    else:
-        parallaxes = parallax_tangents(left.views[0], rotation, points, baseline)
-    if not len(parallaxes):
+    found = parallaxes(np.concatenate(seen))
+    if not len(found):
         raise RectificationError("the two images do not overlap at the depths that are asked for")
-    return bounded_range(parallaxes)
+    return bounded_range(found)
 
 
-def _laid_out(surface: Surface, extent: Extent, baseline: float, scale: float, searched: Range) -> RectifiedPair:
-    """The rectified images, at `scale` pixels per radian, of what can have a counterpart."""
+def _scales_on_sphere(
+    ends: tuple[Range, Range], scale: float, flatness: float, rays: Float
+) -> tuple[float, float]:
+    """Columns and rows per radian of images with `scale` pixels per radian.
+
+    `ends` are those of their columns, and `rays` go from the left centre to the sparse points.
+    """
+    angles = angles_of_columns(np.array(ends), flatness)
+    # Meridians are widest apart on the equator: where the images come nearest to it a pixel is a pixel high.
+    widest = float(np.cos(min(map(_off_zero, angles.tolist()))))
+    if flatness == 0:
+        return scale, scale * widest
+    seen = ray_angles(rays)[1]
+    # Rows per column where pixels are square in the middle of the left image's points, and a little more.
+    rows = _ROWS_PER_COLUMN * float(np.median(np.cos(seen) / np.cos(flatness * seen) ** 2))
+    rows = few_digits(rows, np.round)
+    # As many pixels as by equal angles.
+    shrunk = float(np.ptp(angles, axis=1).sum() / np.ptp(ends, axis=1).sum())
+    columns = scale * few_digits(float(np.sqrt(widest * shrunk / rows)), np.round)
+    return columns, columns * rows
+
+
+def _laid_out(
+    surface: Surface,
+    extent: Extent,
+    baseline: float,
+    scale: float,
+    searched: Range,
+    flatness: float,
+    rays: Float,
+) -> RectifiedPair:
+    """The rectified images of what can have a counterpart, see `_scales_on_sphere`."""
     least, most = searched
-    left, right = columns_with_counterparts(*extent.columns, least, most)
+    along = columns_of_angles(np.array(extent.columns), flatness).tolist()
+    left, right = columns_with_counterparts(tuple(along[0]), tuple(along[1]), least, most)
     low, high = extent.rows
     rows_per_radian = scale
     if surface == "spherical":
-        # Meridians are widest apart on the equator: where the images come nearest to it a pixel is a pixel high.
-        rows_per_radian *= float(np.cos(min(_off_zero(left), _off_zero(right))))
+        scale, rows_per_radian = _scales_on_sphere((left, right), scale, flatness, rays)
     return RectifiedPair(
         surface=surface,
+        flatness=flatness,
         rectified_from_world=extent.rotation,
         baseline=baseline,
         columns_per_radian=scale,

@@ -5,9 +5,10 @@ Rectified frame: x along the baseline from the left to the right centre, z towar
 
     (sin θ, cos θ sin λ, cos θ cos λ),   λ = row angle about the baseline, θ = angle inside the epipolar plane
 
-and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. On the plane ("frame", §3.1) the
-ray is (x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described by one record, `RectifiedPair`:
-array coordinate = (angle or tangent) · scale − origin, with pixel centres at whole array coordinates.
+and a point seen at θ_l and θ_r has the parallax angle δ = θ_l − θ_r > 0. Rows are equal steps of λ, columns equal
+steps of tan(κθ) / κ, with κ the pair's flatness, see `columns_of_angles`. On the plane ("frame", §3.1) the ray is
+(x, y, 1) and the parallax x_l − x_r = baseline / Z. Both are described by one record, `RectifiedPair`:
+array coordinate = (what its steps are equal of) · scale − origin, with pixel centres at whole array coordinates.
 """
 
 import math
@@ -40,13 +41,15 @@ class RectifiedPair:
     baseline : float
         Distance of the projection centres, model units.
     columns_per_radian, rows_per_radian : float
-        Scale of the sphere; both the focal length in pixels on the plane.
+        Scale of the sphere, of columns at θ = 0; both the focal length in pixels on the plane.
     row_origin, left_origin, right_origin : float
-        Angle (or tangent) times scale at array coordinate 0: of the rows, and of each image's columns.
+        What rows, and each image's columns, are equal steps of, times scale, at array coordinate 0.
     height, left_width, right_width : int
         Sizes of the rectified images.
     min_disparity, max_disparity : float
         Range to search, in array coordinates: column in the left image minus column in the right image.
+    flatness : float
+        κ of the sphere's columns, 0 to 1; 0 on the plane.
     """
 
     surface: Surface
@@ -62,6 +65,7 @@ class RectifiedPair:
     right_width: int
     min_disparity: float
     max_disparity: float
+    flatness: float = 0.0
 
     def resampled(self, factor: float) -> "RectifiedPair":
         """The same pair with so many times the rows and columns."""
@@ -78,6 +82,16 @@ class RectifiedPair:
             min_disparity=self.min_disparity * factor,
             max_disparity=self.max_disparity * factor,
         )
+
+    @property
+    def scales(self) -> tuple[float, float]:
+        """Columns and rows per radian half-way between the angles of the left image's first and last columns."""
+        if self.surface == "frame":
+            return self.columns_per_radian, self.rows_per_radian
+        ends = np.array([self.left_origin, self.left_origin + self.left_width - 1]) / self.columns_per_radian
+        angle = float(angles_of_columns(ends, self.flatness).mean())
+        columns = self.columns_per_radian / math.cos(self.flatness * angle) ** 2
+        return columns, self.rows_per_radian / math.cos(angle)
 
     @property
     def disparity_origin(self) -> float:
@@ -98,6 +112,20 @@ def ray_angles(rays: Float) -> tuple[Float, Float]:
     return np.arctan2(rays[:, 1], rays[:, 2]), np.arctan2(rays[:, 0], np.hypot(rays[:, 1], rays[:, 2]))
 
 
+def columns_of_angles(angles: Float, flatness: float) -> Float:
+    """What the sphere's columns are equal steps of: tan(κθ) / κ of (n,) angles θ, radians, with κ the flatness.
+
+    With 0 these are the angles themselves (Elhashash & Qin, §3.2). With 1 they are tangents, which go evenly along
+    any surface that is parallel to the baseline.
+    """
+    return np.asarray(np.tan(flatness * angles) / flatness) if flatness > 0 else angles
+
+
+def angles_of_columns(along: Float, flatness: float) -> Float:
+    """(n,) angles θ, radians: the inverse of `columns_of_angles`."""
+    return np.asarray(np.arctan(flatness * along) / flatness) if flatness > 0 else along
+
+
 def pixel_from_rectified_ray(view: View, pair: RectifiedPair) -> Float:
     """(3, 3) matrix from a ray in the rectified frame to the homogeneous pixel of `view`."""
     return np.asarray(view.K @ view.R @ pair.rectified_from_world.T)
@@ -111,7 +139,8 @@ def rectified_ray_from_pixel(view: View, pair: RectifiedPair) -> Float:
 def coordinates_of_rays(pair: RectifiedPair, side: Side, rays: Float) -> Float:
     """(n, 2) columns and rows, rectified array coordinates, of (n, 3) rays in the rectified frame."""
     if pair.surface == "spherical":
-        across, along = ray_angles(rays)
+        across, angles = ray_angles(rays)
+        along = columns_of_angles(angles, pair.flatness)
     else:
         along, across = rays[:, 0] / rays[:, 2], rays[:, 1] / rays[:, 2]
     return np.column_stack(
@@ -133,7 +162,8 @@ def rays_of_coordinates(pair: RectifiedPair, side: Side, places: NDArray[np.floa
     along = (places[:, 0].astype(float) + pair.column_origin(side)) / pair.columns_per_radian
     across = (places[:, 1].astype(float) + pair.row_origin) / pair.rows_per_radian
     if pair.surface == "spherical":
-        return np.stack([np.sin(along), np.cos(along) * np.sin(across), np.cos(along) * np.cos(across)])
+        angles = angles_of_columns(along, pair.flatness)
+        return np.stack([np.sin(angles), np.cos(angles) * np.sin(across), np.cos(angles) * np.cos(across)])
     return np.stack([along, across, np.ones_like(along)])
 
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.scene import View
-from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, pixel_from_rectified_ray
+from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, angles_of_columns, pixel_from_rectified_ray
 
 # Images are resampled in bands of this many rows, which bounds the memory for their maps.
 _BAND_ROWS = 128
@@ -100,11 +100,12 @@ class RayTables:
 def ray_tables(view: View, pair: RectifiedPair, side: Side) -> RayTables:
     """Tables of the source pixels of a rectified image."""
     A = pixel_from_rectified_ray(view, pair)
-    along = (np.arange(pair.width(side)) + pair.column_origin(side)) / pair.columns_per_radian
+    along = (np.arange(pair.width(side), dtype=np.float64) + pair.column_origin(side)) / pair.columns_per_radian
     across = (np.arange(pair.height) + pair.row_origin) / pair.rows_per_radian
     if pair.surface == "spherical":
-        column_table = np.sin(along)
-        column_weight = np.cos(along)
+        angles = angles_of_columns(along, pair.flatness)
+        column_table = np.sin(angles)
+        column_weight = np.cos(angles)
         row_table = np.outer(A[:, 1], np.sin(across)) + np.outer(A[:, 2], np.cos(across))
     else:
         column_table = along

@@ -125,6 +125,7 @@ def _triangulate(
         _disparity_sigma(view, geometry, options, residual),
         options.max_disparity_step,
         geometry.surface == "spherical",
+        geometry.flatness,
         side == "left",
         first,
         depth,
@@ -134,8 +135,9 @@ def _triangulate(
 
 def _disparity_sigma(view: View, geometry: RectifiedPair, options: VoteOptions, residual: float) -> float:
     """Standard deviation of a pair's disparities on smooth surfaces, rectified pixels."""
-    softness = min(max(float(view.K[0, 0]) / geometry.columns_per_radian, _LEAST_SOFTNESS), _MOST_SOFTNESS)
-    shift = min(residual * geometry.columns_per_radian, _MOST_RESIDUAL)
+    columns, _ = geometry.scales
+    softness = min(max(float(view.K[0, 0]) / columns, _LEAST_SOFTNESS), _MOST_SOFTNESS)
+    shift = min(residual * columns, _MOST_RESIDUAL)
     return math.hypot(options.disparity_sigma * softness, shift)
 
 

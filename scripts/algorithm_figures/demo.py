@@ -20,7 +20,14 @@ from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.matching import MatchingOptions, match_pair
 from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
-from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, pixel_from_rectified_ray
+from colmap_sph.stereo.rectified_pair import (
+    PairDisparity,
+    RectifiedPair,
+    Side,
+    angles_of_columns,
+    columns_of_angles,
+    pixel_from_rectified_ray,
+)
 from colmap_sph.stereo.resampling import resample
 from colmap_sph.stereo.search.seeds import Seeds, seeds_of_points, shared_points
 from colmap_sph.synthetic import read_truth
@@ -123,7 +130,8 @@ class Demo:
         )
         # A ray's depth in the camera is the third coordinate of its pixel.
         points = rays * (depth / pixel[..., 2])[..., None] - [geometry.baseline, 0, 0]
-        right = np.arctan2(points[..., 0], np.hypot(points[..., 1], points[..., 2]))
+        angles = np.arctan2(points[..., 0], np.hypot(points[..., 1], points[..., 2]))
+        right = columns_of_angles(angles, geometry.flatness)
         column = right * geometry.columns_per_radian - geometry.right_origin
         disparity = np.arange(geometry.left_width) - column
         return np.where((depth > 0) & (pair.left_image.valid > 0), disparity, np.nan)
@@ -131,9 +139,12 @@ class Demo:
 
 def sphere_rays(geometry: RectifiedPair, side: Side) -> NDArray[np.float64]:
     """(H, W, 3) unit rays of a side's rectified pixels in the rectified frame."""
-    along = (np.arange(geometry.width(side)) + geometry.column_origin(side)) / geometry.columns_per_radian
+    along = (
+        np.arange(geometry.width(side), dtype=np.float64) + geometry.column_origin(side)
+    ) / geometry.columns_per_radian
     across = (np.arange(geometry.height) + geometry.row_origin) / geometry.rows_per_radian
-    sine, cosine = np.sin(along), np.cos(along)
+    angles = angles_of_columns(along, geometry.flatness)
+    sine, cosine = np.sin(angles), np.cos(angles)
     rays = (
         np.outer(np.ones_like(across), sine),
         np.outer(np.sin(across), cosine),

@@ -10,13 +10,14 @@
 typedef struct {
     double rectified_from_pixel[9]; /* pixel (col, row, 1) to its ray, of depth 1, in the rectified frame */
     double columns_per_radian, rows_per_radian; /* sphere; focal length in pixels for the planar model */
-    double column_origin, row_origin;           /* angle (or tangent) times scale, at array coordinate 0 */
+    double column_origin, row_origin;           /* what steps are equal of, times scale, at array coordinate 0 */
     double disparity_origin;                    /* added to a disparity before it is turned into a parallax */
     double baseline;
     double disparity_sigma; /* standard deviation of a disparity, pixels */
     double max_disparity_step;
-    int spherical; /* 1: sphere, 0: plane */
-    int is_left;   /* the rays belong to the left image */
+    int spherical;   /* 1: sphere, 0: plane */
+    double flatness; /* columns of the sphere are equal steps of tan(flatness * angle) / flatness, 0: of angles */
+    int is_left;     /* the rays belong to the left image */
 } pair_geometry;
 
 /* z-depth and its standard deviation for rows [first_row, first_row + rows) of a depth map; 0 = none. */

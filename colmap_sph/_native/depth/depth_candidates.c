@@ -2,7 +2,8 @@
  *
  * Sphere: ray (X, Y, Z) = r (sin t, cos t sin l, cos t cos l); with parallax angle delta and baseline b the
  * distance along the left ray is b cos(t - delta) / sin(delta) = b (cos t cot(delta) + sin t), along the right
- * ray b (cos t cot(delta) - sin t). Plane: Z = b f / d. */
+ * ray b (cos t cot(delta) - sin t). Columns are equal steps of u = tan(k t) / k, with flatness k, so that
+ * tan(k delta) = k (u_l - u_r) / (1 + k u_l k u_r), or of t where k = 0. Plane: Z = b f / d. */
 #include <math.h>
 #include <string.h>
 
@@ -38,6 +39,32 @@ static inline double arctangent2(double y, double x) {
     return y < 0 ? -sum : sum;
 }
 
+/* Cotangent within (0, pi / 2) by the series of sine and cosine: absolute error < 1e-9. */
+static inline double cotangent(double angle) {
+    const double s = angle * angle;
+    double sine = 1.0 / (14 * 15), cosine = 1.0 / (15 * 16);
+/* Divisors as factors: divisions take longest of all. */
+#define TERM(sum, divisor) sum = (1 - s * sum) * (1.0 / (divisor))
+    TERM(cosine, 13 * 14);
+    TERM(sine, 12 * 13);
+    TERM(cosine, 11 * 12);
+    TERM(sine, 10 * 11);
+    TERM(cosine, 9 * 10);
+    TERM(sine, 8 * 9);
+    TERM(cosine, 7 * 8);
+    TERM(sine, 6 * 7);
+    TERM(cosine, 5 * 6);
+    TERM(sine, 4 * 5);
+    TERM(cosine, 3 * 4);
+    TERM(sine, 2 * 3);
+    TERM(cosine, 1 * 2);
+#undef TERM
+    return (1 - s * cosine) / (angle * (1 - s * sine));
+}
+
+/* Tangent within (-pi / 2, pi / 2). */
+static inline double tangent(double angle) { return copysign(1 / cotangent(fabs(angle)), angle); }
+
 typedef struct {
     const float *values;
     ptrdiff_t height, width;
@@ -56,7 +83,8 @@ typedef struct {
     float centre[BLOCK];                      /* disparity of the nearest pixel, and of those ... */
     float left[BLOCK], right[BLOCK], above[BLOCK], below[BLOCK]; /* ... around it, NaN beyond the rim ... */
     float across[BLOCK];                                         /* ... and that beyond (u, v) */
-    float change[BLOCK], spread[BLOCK]; /* of the disparity from there to (u, v); its standard deviation */
+    float change[BLOCK], spread[BLOCK];     /* of the disparity from there to (u, v); its standard deviation */
+    double parallax[BLOCK], stretch[BLOCK]; /* the parallax angle, and its change with that of columns */
     float depth[BLOCK], sigma[BLOCK];
 } block;
 
@@ -74,8 +102,17 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
         for (int i = 0; i < BLOCK; i++) {
             const double across = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
             k->across_axis[i] = across;
-            k->u[i] = arctangent2(k->x[i], across) * columns - column_origin;
+            k->u[i] = arctangent2(k->x[i], across);
             k->v[i] = arctangent2(k->y[i], k->z[i]) * rows - row_origin;
+        }
+        const double flatness = g->flatness;
+        if (flatness > 0) {
+            for (int i = 0; i < BLOCK; i++) {
+                k->u[i] = tangent(flatness * k->u[i]) / flatness;
+            }
+        }
+        for (int i = 0; i < BLOCK; i++) {
+            k->u[i] = k->u[i] * columns - column_origin;
         }
     } else {
         for (int i = 0; i < BLOCK; i++) {
@@ -171,42 +208,32 @@ static inline void interpolate(double max_disparity_step, block *k) {
     }
 }
 
-/* Cotangent within (0, pi / 2) by the series of sine and cosine: absolute error < 1e-9. */
-static inline double cotangent(double angle) {
-    const double s = angle * angle;
-    double sine = 1.0 / (14 * 15), cosine = 1.0 / (15 * 16);
-/* Divisors as factors: divisions take longest of all. */
-#define TERM(sum, divisor) sum = (1 - s * sum) * (1.0 / (divisor))
-    TERM(cosine, 13 * 14);
-    TERM(sine, 12 * 13);
-    TERM(cosine, 11 * 12);
-    TERM(sine, 10 * 11);
-    TERM(cosine, 9 * 10);
-    TERM(sine, 8 * 9);
-    TERM(cosine, 7 * 8);
-    TERM(sine, 6 * 7);
-    TERM(cosine, 5 * 6);
-    TERM(sine, 4 * 5);
-    TERM(cosine, 3 * 4);
-    TERM(sine, 2 * 3);
-    TERM(cosine, 1 * 2);
-#undef TERM
-    return (1 - s * cosine) / (angle * (1 - s * sine));
-}
-
 /* With the ray r of depth 1, sin t = x / |r| and cos t = across / |r|: depth, the distance over |r|, has |r|^2 as
  * its only divisor. */
 static inline void triangulate_sphere(const pair_geometry *g, block *k) {
     const double side = g->is_left ? 1 : -1, radians = 1 / g->columns_per_radian;
     for (int i = 0; i < BLOCK; i++) {
-        const double delta = ((double)k->centre[i] + k->change[i] + g->disparity_origin) * radians;
+        k->parallax[i] = ((double)k->centre[i] + k->change[i] + g->disparity_origin) * radians;
+        k->stretch[i] = 1;
+    }
+    const double flatness = g->flatness;
+    if (flatness > 0) {
+        for (int i = 0; i < BLOCK; i++) {
+            const double own = flatness * radians * (k->u[i] + g->column_origin);
+            const double apart = flatness * k->parallax[i], other = own - side * apart;
+            k->parallax[i] = arctangent2(apart, 1 + own * other) / flatness;
+            k->stretch[i] = 1 / (1 + other * other);
+        }
+    }
+    for (int i = 0; i < BLOCK; i++) {
+        const double delta = k->parallax[i];
         const double cot = cotangent(delta), across = k->across_axis[i];
         const double scale = g->baseline / (k->x[i] * k->x[i] + across * across);
         const double depth = scale * (across * cot + side * k->x[i]);
         const double slope = scale * across * (1 + cot * cot);
         const int found = delta > 0 && delta < HALF_PI && depth > 0; /* false for NaN */
         k->depth[i] = found ? (float)depth : 0;
-        k->sigma[i] = found ? (float)(slope * radians * k->spread[i]) : 0;
+        k->sigma[i] = found ? (float)(slope * k->stretch[i] * radians * k->spread[i]) : 0;
     }
 }
 

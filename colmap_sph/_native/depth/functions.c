@@ -33,6 +33,7 @@ FUNCTION(transfer_disparity, TRANSFER_DISPARITY, any,
     X(VALUE, double, disparity_sigma) \
     X(VALUE, double, max_disparity_step) \
     X(VALUE, flag, spherical) \
+    X(VALUE, double, flatness) \
     X(VALUE, flag, is_left) \
     X(VALUE, ptrdiff, first_row) \
     X(OUT, float32, depth, H, W) \
@@ -59,6 +60,7 @@ static int run_depth_candidates(void *arguments) {
                               .disparity_sigma = a->disparity_sigma,
                               .max_disparity_step = a->max_disparity_step,
                               .spherical = a->spherical,
+                              .flatness = a->flatness,
                               .is_left = a->is_left};
     memcpy(geometry.rectified_from_pixel, a->rectified_from_pixel, sizeof geometry.rectified_from_pixel);
     a->backend->depth_candidates(a->disparity, a->size.MAP_H, a->size.MAP_W, &geometry, a->first_row, a->size.H,

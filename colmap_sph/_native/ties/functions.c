@@ -36,6 +36,7 @@ FUNCTION(fit_surfaces, FIT_SURFACES, any,
     X(VALUE, pair, origins) \
     X(VALUE, pair, scales) \
     X(VALUE, flag, spherical) \
+    X(VALUE, double, flatness) \
     X(OUT, float32, columns, POINTS, H, W) \
     X(OUT, float32, rows, POINTS, H, W)
 ARGUMENTS(place_windows, PLACE_WINDOWS);
@@ -47,8 +48,8 @@ static int check_place_windows(const void *arguments) {
 
 static int run_place_windows(void *arguments) {
     const place_windows_arguments *a = arguments;
-    const rectified_camera camera = {a->pixel_from_ray, a->origins.first, a->origins.second,
-                                     a->scales.first,   a->scales.second, a->spherical};
+    const rectified_camera camera = {a->pixel_from_ray, a->origins.first, a->origins.second, a->scales.first,
+                                     a->scales.second,  a->spherical,     a->flatness};
     place_windows(a->places, a->slopes, camera, a->size.POINTS, a->size.H, a->size.W, a->columns, a->rows);
     return 0;
 }

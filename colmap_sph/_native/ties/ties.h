@@ -28,6 +28,7 @@ typedef struct {
     double column_origin, row_origin, column_scale,
         row_scale; /* (place + origin) / scale is an angle, or tangent */
     int spherical;
+    double flatness; /* of the sphere: of its columns the angle is arctan(flatness * that) / flatness */
 } rectified_camera;
 
 /* Where the image shows the pixels of windows around places, as cv2.remap counts; far outside where it does not.

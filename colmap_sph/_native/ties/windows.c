@@ -29,7 +29,8 @@ ALWAYS_INLINE direction turned(direction d, float angle) {
 
 /* A window's row in the image: pixel i's ray is `along` its direction, and what the row has in common. */
 typedef struct {
-    double angle, step;     /* of the row's middle pixel, and from pixel to pixel */
+    double middle, step;    /* what columns are equal steps of: at the middle pixel, and from pixel to pixel */
+    double flatness;        /* of the sphere's columns */
     float along[3], row[3]; /* homogeneous pixel = along · sine + row · cosine */
 } window_row;
 
@@ -42,22 +43,40 @@ ALWAYS_INLINE void project(const window_row *row, direction d, float *column, fl
     *image_row = (z > 0 ? y / z : -1) - 0.5f;
 }
 
+/* Angle of a column of the sphere. */
+static double angle_of(const window_row *row, double along) {
+    return row->flatness > 0 ? atan(row->flatness * along) / row->flatness : along;
+}
+
+/* Angle, if small, from the row's middle to a column so far from it: arctan b - arctan a is the arctangent of
+ * (b - a) / (1 + a b). */
+ALWAYS_INLINE float angle_from_middle(const window_row *row, float flatness, float away) {
+    if (flatness > 0) {
+        const float a = flatness * (float)row->middle, x = flatness * away / (1 + a * (a + flatness * away));
+        const float square = x * x;
+        return x * (1 - square * (1.0f / 3 - square * (1.0f / 5 - square * (1.0f / 7)))) / flatness;
+    }
+    return away;
+}
+
 static void place_row(const window_row *row, int spherical, ptrdiff_t width, float *columns, float *rows) {
     const int first = -(int)(width / 2);
-    const direction middle = direction_of(row->angle);
     if (!spherical) {
         for (int i = 0; i < (int)width; i++) {
-            const direction d = {(float)(row->angle + row->step * (first + i)), 1};
+            const direction d = {(float)(row->middle + row->step * (first + i)), 1};
             project(row, d, columns + i, rows + i);
         }
     } else if (fabs(row->step) * (double)width <= SMALL_ANGLE) {
-        const float step = (float)row->step;
+        const direction middle = direction_of(angle_of(row, row->middle));
+        const float step = (float)row->step, flatness = (float)row->flatness;
         for (int i = 0; i < (int)width; i++) {
-            project(row, turned(middle, step * (float)(first + i)), columns + i, rows + i);
+            const float angle = angle_from_middle(row, flatness, step * (float)(first + i));
+            project(row, turned(middle, angle), columns + i, rows + i);
         }
     } else {
         for (int i = 0; i < (int)width; i++) {
-            project(row, direction_of(row->angle + row->step * (first + i)), columns + i, rows + i);
+            const double angle = angle_of(row, row->middle + row->step * (first + i));
+            project(row, direction_of(angle), columns + i, rows + i);
         }
     }
 }
@@ -72,7 +91,8 @@ void place_windows(const double *places, const double *slopes, rectified_camera 
             const sine_pair sines = sines_of(camera.spherical ? across : 0);
             const double down = camera.spherical ? sines.sine : across, ahead = sines.cosine;
             const double column = places[2 * p] + slopes[2 * p + 1] * j + camera.column_origin;
-            window_row row = {column / camera.column_scale, slopes[2 * p] / camera.column_scale, {0}, {0}};
+            window_row row = {
+                column / camera.column_scale, slopes[2 * p] / camera.column_scale, camera.flatness, {0}, {0}};
             for (int k = 0; k < 3; k++) {
                 row.along[k] = (float)matrix[3 * k];
                 row.row[k] = (float)(matrix[3 * k + 1] * down + matrix[3 * k + 2] * ahead);

@@ -64,4 +64,4 @@ def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) ->
 
 def _finer(left: View, right: View, geometry: RectifiedPair) -> float:
     """How many times finer than a rectified pixel one of the images is."""
-    return max(float(view.K[0, 0]) for view in (left, right)) / geometry.columns_per_radian
+    return max(float(view.K[0, 0]) for view in (left, right)) / geometry.scales[0]

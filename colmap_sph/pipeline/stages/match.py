@@ -320,7 +320,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         if all(view.reprojection_error <= _PRECISE_POSES for view in (*left.views, *right.views)):
             return 1.0
         pixels_per_radian = max(float(view.K[0, 0]) for view in (left.lead, right.lead))
-        return min(_TRIAL_SAMPLING * pixels_per_radian / geometry.columns_per_radian, 1.0)
+        return min(_TRIAL_SAMPLING * pixels_per_radian / geometry.scales[0], 1.0)
 
     def _photo(self, view: View) -> PhotoFile:
         if view.name not in self._photos:

@@ -115,7 +115,7 @@ def facts_of_pair(path: Path, key: str, left: str, right: str, geometry: Rectifi
 
 
 def _facts(residual: float | None, geometry: RectifiedPair) -> Facts:
-    return Facts(row_residual=None if residual is None else residual / geometry.columns_per_radian)
+    return Facts(row_residual=None if residual is None else residual / geometry.scales[1])
 
 
 def residuals_of(matched: Mapping[Pair, Result]) -> dict[Pair, float]:

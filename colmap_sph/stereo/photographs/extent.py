@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import RectificationError
 from colmap_sph.scene import Photograph, View
-from colmap_sph.stereo.disparity_range import Range, parallax_angles
+from colmap_sph.stereo.disparity_range import Range
 from colmap_sph.stereo.extent import Extent, bounded_extent, column_extent, epipole_sign, rolled, row_arc
 from colmap_sph.stereo.rectified_pair import Float
 
@@ -27,7 +27,6 @@ def extent_of_photographs(
     rotation: Float,
     left: View | Photograph,
     right: View | Photograph,
-    points: Float,
     min_cosine: float,
     outlines: tuple[Sequence[Float], Sequence[Float]],
 ) -> Extent:
@@ -38,8 +37,6 @@ def extent_of_photographs(
     rotation : (3, 3) float64 ndarray
         World to rectified frame; that of the result is rolled about the baseline, so that the rows' middle is 0.
     left, right : View or Photograph
-    points : (n, 3) float64 ndarray
-        Sparse points that both see, world frame.
     min_cosine : float
         Rays whose angle with the baseline has a sine (that is cos θ) below this are left out.
     outlines : pair of sequence of (n, 2) float64 ndarray
@@ -68,7 +65,7 @@ def extent_of_photographs(
             for view, outline in zip(photograph.views, shown, strict=True)
         ]
         columns.append((min(least for least, _ in ranges), max(most for _, most in ranges)))
-    return bounded_extent(rotation, half, columns, min_cosine, parallax_angles(left, right, rotation, points))
+    return bounded_extent(rotation, half, columns, min_cosine)
 
 
 def nearer_half(columns: Range, most: float) -> Range:

@@ -283,6 +283,7 @@ def _windows(
         (geometry.column_origin(side), geometry.row_origin),
         (geometry.columns_per_radian, geometry.rows_per_radian),
         geometry.surface == "spherical",
+        geometry.flatness,
         columns,
         rows,
     )
