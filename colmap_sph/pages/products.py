@@ -14,6 +14,7 @@ import numpy as np
 from colmap_sph.errors import InputError
 from colmap_sph.pages.pictures import picture_uri
 from colmap_sph.pages.words import number
+from colmap_sph.platforms.files import is_link
 from colmap_sph.project.images.decoding import read_header
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.reading import read_colours
@@ -70,9 +71,9 @@ def products_of(workspace: Workspace) -> tuple[list[ProductFile], list[ProductPi
 def _entries(folder: Path) -> list[os.DirEntry[str]]:
     """Files and folders that are not hidden; none where the folder is a link or cannot be read."""
     with suppress(OSError):
-        if not folder.is_symlink() and folder.is_dir():
+        if not is_link(folder) and folder.is_dir():
             with os.scandir(folder) as found:
-                shown = [each for each in found if not each.name.startswith(".") and not each.is_symlink()]
+                shown = [each for each in found if not each.name.startswith(".") and not is_link(Path(each.path))]
             return sorted(shown, key=lambda entry: entry.name)[:_MOST_FILES]
     return []
 

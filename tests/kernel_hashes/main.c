@@ -212,7 +212,7 @@ static void run_mean_offsets(const kernel_table *k, image_size size) {
     HASH(mean, PIXELS);
 }
 
-static void depth_candidates_of(const kernel_table *k, image_size size, int spherical) {
+static void depth_candidates_of(const kernel_table *k, image_size size, int spherical, double flatness) {
     FILL(float, disparity, PIXELS, seldom(8) ? NAN : 8 + 0.02f * (float)x + real_between(0, 0.5f))
     MAKE(float, depth, PIXELS);
     MAKE(float, sigma, PIXELS);
@@ -227,6 +227,7 @@ static void depth_candidates_of(const kernel_table *k, image_size size, int sphe
                                     0.3,
                                     1.5,
                                     spherical,
+                                    flatness,
                                     spherical};
     EACH_TIME k->depth_candidates(disparity, size.height, size.width, &geometry, 0, size.height, size.width, depth,
                                   sigma);
@@ -235,8 +236,9 @@ static void depth_candidates_of(const kernel_table *k, image_size size, int sphe
 }
 
 static void run_depth_candidates(const kernel_table *k, image_size size) {
-    depth_candidates_of(k, size, 0);
-    depth_candidates_of(k, size, 1);
+    depth_candidates_of(k, size, 0, 0);
+    depth_candidates_of(k, size, 1, 0);
+    depth_candidates_of(k, size, 1, 0.5);
 }
 
 static void run_vote_depth(const kernel_table *k, image_size size) {

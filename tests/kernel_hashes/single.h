@@ -22,9 +22,10 @@ static void run_place_windows(const kernel_table *k, image_size size) {
     enum { WINDOW = 9 * 7 };
     MAKE(float, columns, WINDOW *PIXELS);
     MAKE(float, rows, WINDOW *PIXELS);
-    for (int spherical = 0; spherical < 2; spherical++) {
+    const double flatness[] = {0, 0, 0.5}; /* a plane, a sphere, one with flat columns */
+    for (int kind = 0; kind < 3; kind++) {
         for (int scale = 6; scale <= 600; scale *= 10) { /* wide and narrow windows have sines of two kinds */
-            const rectified_camera camera = {matrix, 20.5, -3.5, scale, scale + 1, spherical};
+            const rectified_camera camera = {matrix, 20.5, -3.5, scale, scale + 1, kind > 0, flatness[kind]};
             place_windows(places, slopes, camera, PIXELS, 7, 9, columns, rows);
             add_floats_to_hash(columns, WINDOW * PIXELS);
             add_floats_to_hash(rows, WINDOW * PIXELS);

@@ -1,6 +1,7 @@
 /* Windows of the two images of a pair, and the least squares between them; see ties.h. */
 #include <math.h>
 
+#include "arctangent.h"
 #include "ties/sines.h"
 #include "ties/ties.h"
 
@@ -45,7 +46,7 @@ ALWAYS_INLINE void project(const window_row *row, direction d, float *column, fl
 
 /* Angle of a column of the sphere. */
 static double angle_of(const window_row *row, double along) {
-    return row->flatness > 0 ? atan(row->flatness * along) / row->flatness : along;
+    return row->flatness > 0 ? arctangent2(row->flatness * along, 1) / row->flatness : along;
 }
 
 /* Angle, if small, from the row's middle to a column so far from it: arctan b - arctan a is the arctangent of
