@@ -5,7 +5,7 @@ from types import ModuleType
 
 import pytest
 
-SAID = "census 1 1 1 32 b05018b6e79c79d3\nkernels: avx2\nkernels: neon\nkernels: scalar\n"
+SAID = "census 1 1 1 32 b05018b6e79c79d3\nwine: created a folder\nkernels: avx2\nkernels: neon\nkernels: scalar\n"
 
 
 @pytest.fixture
