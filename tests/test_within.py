@@ -274,7 +274,7 @@ def size_for(project: Path, seconds: float, *kept: str, overwrite: bool = False)
 @pytest.mark.usefixtures("small_images")
 def test_images_are_reduced_where_time_is_short(project: Path) -> None:
     assert size_for(project, 100) == -1
-    assert 320 > size_for(project, 3.0) > size_for(project, 1.4) >= 40
+    assert 320 > size_for(project, 1.2) > size_for(project, 0.9) >= 40
     assert size_for(project, 1e-6) >= 40
     assert size_for(project, 1e-6, SIZE) == -1
 
