@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from colmap_sph.pages.pictures import COLOURS, shaded
 from colmap_sph.pages.reasons import Reason
 from colmap_sph.pages.samples import MapSamples
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 
 Bytes = NDArray[np.uint8]
 
@@ -147,20 +147,25 @@ class Ground:
 
     def add(self, view: View, samples: MapSamples, reasons: Bytes, depth: NDArray[np.float32]) -> None:
         """Add a view's samples, with what `find_reasons` says of them."""
-        points = surface_points(view, samples, depth)
+        self.add_points(surface_points(view, samples, depth), reasons.ravel(), depth.ravel(), view.K[0, 0])
+
+    def add_points(
+        self, points: NDArray[np.float64], reasons: Bytes, depth: NDArray[np.float32], focal: np.float64
+    ) -> None:
+        """Add (n,) samples of an image with a focal length: world points (n, 3), their `Reason`s and depths."""
         height = points @ self.frame.axes[2]
         slack = 0.1 * (self.frame.high - self.frame.low)
         # Sky and the like have a depth that is made up.
-        likely = (depth.ravel() > 0) & (height >= self.frame.low - slack) & (height <= self.frame.high + slack)
+        likely = (depth > 0) & (height >= self.frame.low - slack) & (height <= self.frame.high + slack)
         shape = self.images.shape
         cells, inside = _cells(self.frame, points, (shape[0], shape[1]))
         likely = likely[inside]
         cells = cells[likely]
-        which = reasons.ravel()[inside][likely]
+        which = reasons[inside][likely]
         np.add.at(self.samples.reshape(len(Reason), -1), (which, cells), 1)
         seen = cells[which == Reason.CONFIRMED]
         self.images.ravel()[np.unique(seen)] += 1
-        gsd = (depth.ravel()[inside][likely] / view.K[0, 0])[which == Reason.CONFIRMED]
+        gsd = (depth[inside][likely] / focal)[which == Reason.CONFIRMED]
         np.minimum.at(self.gsd.reshape(-1), seen, gsd)
 
     def count_layer(self) -> tuple[Bytes, tuple[float, float]]:
@@ -213,7 +218,7 @@ def footprint(view: View, samples: MapSamples, depth: NDArray[np.float32], frame
     return frame.place(np.array([grid[0, 0], grid[0, -1], grid[-1, -1], grid[-1, 0]]))
 
 
-def looks_towards(view: View, frame: Frame) -> NDArray[np.float64]:
+def looks_towards(view: View | Photograph, frame: Frame) -> NDArray[np.float64]:
     """(2,) direction of view on a map, to the right and down; short where the camera looks along its normal."""
     along = frame.axes[:2] @ view.viewing_direction
     return np.array([along[0], -along[1]])

@@ -11,7 +11,7 @@ from colmap_sph.pages.pair_facts import PairFacts
 from colmap_sph.pages.products import ProductFile, ProductPicture
 from colmap_sph.pages.run_facts import RunFacts
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import Scene
+from colmap_sph.scene import Photograph, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +51,10 @@ class Content:
     scene : Scene
     run : RunFacts or None
         None where no run has come to its end.
+    photographs : list of Photograph
+        By their names.
     images : list of ImageFacts
-        Of the scene's views, in their order.
+        Of the photographs, in their order.
     pairs : list of PairFacts
     cloud : CloudSample
     frame : Frame
@@ -66,6 +68,7 @@ class Content:
     workspace: Workspace
     scene: Scene
     run: RunFacts | None
+    photographs: list[Photograph]
     images: list[ImageFacts]
     pairs: list[PairFacts]
     cloud: CloudSample

@@ -1,5 +1,6 @@
 """One image of a workspace → its small pictures, and what became of its pixels."""
 
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from colmap_sph.pages.pictures import depth_picture, normal_picture, picture_uri
 from colmap_sph.pages.reasons import Reason
 from colmap_sph.pages.samples import MapSamples, read_normals
 from colmap_sph.project.images.reading import image_problem, read_small_colours
+from colmap_sph.project.wide.projection import Lens
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
 from colmap_sph.stereo.blank import blank_pixels
@@ -57,6 +59,10 @@ class ImageFacts:
         Empty where none are shown.
     footprint : (4, 2) float64 ndarray or None
         Corners on the map, see `Frame.place`.
+    width, height : int
+        Pixels.
+    cut_into : tuple of str
+        Names of the views that were cut from it; none of an image that is whole.
     """
 
     name: str
@@ -66,6 +72,9 @@ class ImageFacts:
     has_maps: bool
     pictures: tuple[Picture, ...]
     footprint: NDArray[np.float64] | None
+    width: int
+    height: int
+    cut_into: tuple[str, ...] = ()
 
     @property
     def coverage(self) -> float:
@@ -109,6 +118,8 @@ def facts_of_image(
         samples.has_maps,
         pictures,
         footprint,
+        view.width,
+        view.height,
     )
 
 
@@ -128,25 +139,36 @@ def small_pictures(
     shown : int
         Images whose pictures share the page.
     """
-    most = min(_ALL_BYTES / shown, _MOST_BYTES)
-    made = []
+    parts: dict[str, Bytes] = {}
+    note = ""
     if picture is not None:
         scale = min(1, _PICTURE_SIDE * max(reasons.shape) / max(picture.shape[:2]))
         size = [max(round(scale * side), 1) for side in picture.shape[1::-1]]
         small = cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB)
-        made.append(_picture("picture", np.asarray(small, np.uint8), view, most))
+        parts["picture"] = np.asarray(small, np.uint8)
     if samples.has_maps:
-        depth, ends = depth_picture(np.where(samples.has_geometric, samples.geometric, samples.photometric))
+        parts["depth"], ends = depth_picture(
+            np.where(samples.has_geometric, samples.geometric, samples.photometric)
+        )
         note = "" if ends is None else f"{ends[0]:.4g} (yellow) to {ends[1]:.4g} (blue)"
-        made.append(_picture("depth", depth, view, most, note))
         normals = read_normals(workspace, view, samples)
         if normals is not None:
-            made.append(_picture("normals", normal_picture(normals), view, most))
-    made.append(_picture("reasons", reason_picture(reasons), view, most))
-    return tuple(made)
+            parts["normals"] = normal_picture(normals)
+    parts["reasons"] = reason_picture(reasons)
+    return make_pictures(parts, view, shown, note)
 
 
-def _picture(name: str, pixels: Bytes, view: View, most: float, note: str = "") -> Picture:
+def make_pictures(
+    parts: Mapping[str, Bytes], view: View | Lens, shown: int, depth_note: str
+) -> tuple[Picture, ...]:
+    """Pictures of one of `shown` images by their names, of the shape of `view`; a note goes with depth."""
+    most = min(_ALL_BYTES / shown, _MOST_BYTES)
+    return tuple(
+        _picture(name, pixels, view, most, depth_note if name == "depth" else "") for name, pixels in parts.items()
+    )
+
+
+def _picture(name: str, pixels: Bytes, view: View | Lens, most: float, note: str) -> Picture:
     exact = name == "reasons"
     uri = picture_uri(pixels, int(most * _PARTS[name]), exact=exact)
     shown = "confirmed, and lost" if exact else name

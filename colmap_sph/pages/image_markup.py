@@ -1,5 +1,6 @@
 """Images of a page: the table, and what belongs to each picture."""
 
+from dataclasses import dataclass
 from typing import Any
 
 from colmap_sph.pages.content import Content
@@ -10,7 +11,7 @@ from colmap_sph.pages.pictures import colour_of
 from colmap_sph.pages.reasons import WORDS, Reason
 from colmap_sph.pages.run_facts import RunFacts
 from colmap_sph.pages.words import cell, number, percent, plain
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph
 
 MOST_LINES = 100
 """Lines of what was left out."""
@@ -31,11 +32,9 @@ _COLUMNS = [
 def image_values(content: Content, run: RunFacts) -> dict[str, Any]:
     """Values of the template for the images, and for the cameras and footprints on the map."""
     partners: list[list[PairFacts]] = [[] for _ in content.images]
-    scene = content.scene
     for pair in content.pairs:
         for place in (pair.left, pair.right):
-            for view in scene.photograph(scene.views[place].name).views:
-                partners[scene.index_of[view.name]].append(pair)
+            partners[place].append(pair)
     left_out = [
         *run.skipped_images.items(),
         *((name, f"incomplete: {why}") for name, why in run.incomplete.items()),
@@ -55,21 +54,52 @@ def image_values(content: Content, run: RunFacts) -> dict[str, Any]:
     }
 
 
+@dataclass(frozen=True)
+class _Told:
+    """What the run's report says of an image, None where it says nothing."""
+
+    coverage: float
+    agreement: float | None
+    row_residual: float | None
+    points: int | None
+
+
+def _told(image: ImageFacts, photograph: Photograph, run: RunFacts) -> _Told:
+    if not image.cut_into:
+        name = image.name
+        coverage = run.coverage.get(name, image.coverage)
+        return _Told(coverage, run.agreement.get(name), run.row_residuals.get(name), run.points_of.get(name))
+    points = [run.points_of[view.name] for view in photograph.views if view.name in run.points_of]
+    seen, agreed = 0, 0.0
+    for view in photograph.views:
+        share = run.agreement.get(view.name)
+        if share is not None:
+            seen += len(view.point_indices)
+            agreed += share * len(view.point_indices)
+    counted = image.coverage if run.last_maps == "geometric" else image.found
+    return _Told(
+        # Of a region the report knows no share of the image's own pixels.
+        run.originals.get(image.name, counted) if run.region is None else counted,
+        agreed / seen if seen else None,
+        run.row_residuals.get(photograph.lead.name),
+        sum(points) if points else None,
+    )
+
+
 def _image_row(place: int, content: Content, run: RunFacts, pairs: list[PairFacts]) -> dict[str, Any]:
     image = content.images[place]
-    view = content.scene.views[place]
+    photograph = content.photographs[place]
+    told = _told(image, photograph, run)
     lost = max(
         (share, reason) for reason, share in zip(Reason, image.shares, strict=True) if reason > Reason.OUTSIDE
     )
-    coverage = run.coverage.get(image.name, image.coverage)
-    points = run.points_of.get(image.name)
     cells = [
-        cell(coverage, percent(coverage)),
+        cell(told.coverage, percent(told.coverage)),
         cell(image.found, percent(image.found)),
-        cell(run.agreement.get(image.name), percent(run.agreement.get(image.name), "")),
-        cell(run.row_residuals.get(image.name), plain(run.row_residuals.get(image.name), ".2f")),
+        cell(told.agreement, percent(told.agreement, "")),
+        cell(told.row_residual, plain(told.row_residual, ".2f")),
         cell(image.gsd, plain(image.gsd, ".3g")),
-        cell(points, plain(points, ",")),
+        cell(told.points, plain(told.points, ",")),
         cell(len(pairs), str(len(pairs))),
         {"value": None, "text": f"{WORDS[lost[1]][0]} {percent(lost[0])}" if lost[0] > 0 else ""},
     ]
@@ -77,10 +107,10 @@ def _image_row(place: int, content: Content, run: RunFacts, pairs: list[PairFact
         "number": place,
         "name": image.name,
         "cells": cells,
-        "camera": camera_path(view, content.frame, len(content.images)),
+        "camera": camera_path(photograph, content.frame, len(content.images)),
         "footprint": "" if image.footprint is None else outline(image.footprint, content.frame),
         "pictures": image.pictures,
-        "words": _image_words(image, view, pairs, points),
+        "words": _image_words(image, pairs, told.points),
         **_bar(image),
     }
 
@@ -101,16 +131,18 @@ def _bar(image: ImageFacts) -> dict[str, Any]:
     return {"bar": pieces, "bar_words": ", ".join(named)}
 
 
-def _image_words(image: ImageFacts, view: View, pairs: list[PairFacts], points: int | None) -> str:
+def _image_words(image: ImageFacts, pairs: list[PairFacts], points: int | None) -> str:
     named = [
         f"{WORDS[reason][0]} {percent(share)}"
         for reason, share in zip(Reason, image.shares, strict=True)
         if share >= 0.0005
     ]
-    words = f"{view.width} × {view.height} pixels: {', '.join(named)}."
+    words = f"{image.width} × {image.height} pixels: {', '.join(named)}."
     if points is not None:
         words += f" {points:,} points of the cloud."
     angles = sorted(pair.angle for pair in pairs if pair.angle is not None)
     if angles:
         words += f" {number(len(pairs), 'partner')}, {angles[0]:.1f}° to {angles[-1]:.1f}°."
+    if image.cut_into:
+        words += f" Its maps are those of {number(len(image.cut_into), 'view')}: {', '.join(image.cut_into)}."
     return words

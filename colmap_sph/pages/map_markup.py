@@ -13,7 +13,7 @@ from colmap_sph.pages.pictures import colour_of, picture_uri
 from colmap_sph.pages.reasons import WORDS, Reason
 from colmap_sph.pages.small_cloud import STEPS, thin_out
 from colmap_sph.pages.words import percent
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 
 # Of the map: units of its drawing along the longer side, a camera's size, and bytes of a layer at most.
 _MAP_UNITS = 1000
@@ -123,7 +123,7 @@ def _reason(reason: Reason, images: list[ImageFacts]) -> dict[str, str]:
     }
 
 
-def camera_path(view: View, frame: Frame, among: int) -> str:
+def camera_path(view: View | Photograph, frame: Frame, among: int) -> str:
     """One of so many cameras: a triangle that points to where it looks, or a diamond where that is down or up."""
     middle = frame.place(view.center[None])[0] * _drawing_size(frame)
     ahead = looks_towards(view, frame)

@@ -85,6 +85,7 @@ def _hash(text: str) -> str:
 def _head(content: Content, run: RunFacts) -> dict[str, Any]:
     notices = list(run.warnings)
     changed = changed_since(content.workspace, run, content.scene.index_of)
+    changed = list(dict.fromkeys(content.scene.photograph(name).name for name in changed))
     if changed:
         some = ", ".join(changed[:3]) + (f" and {len(changed) - 3} more" if len(changed) > 3 else "")
         notices.insert(0, ("out of date", f"maps were made again after the run that this tells of ended: {some}."))

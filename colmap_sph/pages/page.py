@@ -1,5 +1,6 @@
 """A dense workspace → its page ``colmap_sph/report.html``, one file that shows what came out and loads nothing."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,18 +20,23 @@ from colmap_sph.pages.image_facts import (
     small_pictures,
 )
 from colmap_sph.pages.markup import render
+from colmap_sph.pages.originals import WideImage
 from colmap_sph.pages.pair_facts import PairFacts, pairs_of
 from colmap_sph.pages.products import products_of
 from colmap_sph.pages.reasons import Partner, Reason, find_reasons
 from colmap_sph.pages.run_facts import RunFacts, read_run_facts
-from colmap_sph.pages.samples import MapSamples, read_samples, samples_per_side
+from colmap_sph.pages.samples import MapSamples, read_normals, read_samples, samples_per_side
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.wide.cuts import Cut
+from colmap_sph.project.wide.table import read_cuts
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Photograph, Scene, View
 from colmap_sph.stereo.partners.facing import Facing
 from colmap_sph.stereo.partners.pairs import overlapping_views
 from colmap_sph.stereo.region.map_axes import map_axes
+
+Bytes = NDArray[np.uint8]
 
 # Points of an image's surface, to stand for it where there is no cloud; of the cloud, to frame the map.
 _SURFACE_SAMPLE = 300
@@ -108,13 +114,15 @@ def gather(workspace: Workspace, progress: Progress) -> Content:
         )
     block = _Block(workspace, scene, told, samples, cloud)
     images = []
-    for view in scene.views:
-        images.append(block.look_at(view))
-        progress.advance()
+    for photograph in block.photographs:
+        images.append(block.look_at(photograph))
+        for _ in photograph.views:
+            progress.advance()
     return Content(
         workspace,
         scene,
         facts,
+        block.photographs,
         images,
         block.pairs,
         cloud,
@@ -134,15 +142,18 @@ class _Block:
     facts: RunFacts
     samples: dict[str, MapSamples]
     cloud: CloudSample
+    photographs: list[Photograph] = field(init=False)
     pairs: list[PairFacts] = field(init=False)
     frame: Frame = field(init=False)
     ground: Ground = field(init=False)
 
     def __post_init__(self) -> None:
+        self.photographs = sorted(self.scene.photographs, key=lambda photograph: photograph.name)
+        self._cuts = read_cuts(self.workspace.sparse_dir)
         surfaces = {view.name: self._surface(view) for view in self.scene.views}
         surface = self.cloud.points[:: -(-len(self.cloud.points) // _FRAME_SAMPLE) or 1]
         surface = surface if len(surface) else np.concatenate(list(surfaces.values()))
-        self.pairs = pairs_of(self.workspace, self.scene, self.facts, surfaces)
+        self.pairs = pairs_of(self.workspace, self.scene, self.photographs, self.facts, surfaces)
         region = self.facts.region
         self._region = None if region is None else region.as_region().moved(-self.scene.origin)
         self._partners = self._find_partners()
@@ -152,10 +163,35 @@ class _Block:
         self.frame = frame_around(surface, centers, axes)
         self.ground = Ground(self.frame)
 
-    def look_at(self, view: View) -> ImageFacts:
-        """Work out what became of a view's pixels, make its pictures, and put it on the map."""
+    def look_at(self, photograph: Photograph) -> ImageFacts:
+        """Work out what became of a photograph's pixels, make its pictures, and put it on the map."""
+        cuts = [(view, self._cuts[view.name]) for view in photograph.views if view.name in self._cuts]
+        return self._look_at_cut(photograph.name, cuts) if cuts else self._look_at_whole(photograph.lead)
+
+    def _look_at_whole(self, view: View) -> ImageFacts:
+        samples, picture = self.samples[view.name], read_picture(self.workspace, view)
+        reasons, depth = self._reasons(view, picture)
+        self.ground.add(view, samples, reasons, depth)
+        pictures: tuple[Picture, ...] = ()
+        if view.name in self._shown:
+            pictures = small_pictures(self.workspace, view, samples, reasons, picture, len(self._shown))
+        corners = footprint(view, samples, depth, self.frame) if depth.any() else None
+        return facts_of_image(view, samples, reasons, pictures, corners)
+
+    def _look_at_cut(self, name: str, cuts: Sequence[tuple[View, Cut]]) -> ImageFacts:
+        is_shown = name in self._shown
+        image = WideImage(name, cuts[0][1].lens, samples_per_side(len(self.photographs)), is_shown)
+        for view, cut in cuts:
+            samples, picture = self.samples[view.name], read_picture(self.workspace, view)
+            reasons, depth = self._reasons(view, picture)
+            normals = read_normals(self.workspace, view, samples) if is_shown else None
+            image.add(view, cut, samples, reasons, depth, normals, picture)
+        image.put_on(self.ground)
+        return image.facts(len(self._shown))
+
+    def _reasons(self, view: View, picture: Bytes | None) -> tuple[Bytes, NDArray[np.float32]]:
+        """See `find_reasons`."""
         samples = self.samples[view.name]
-        picture = read_picture(self.workspace, view)
         others = [self.scene.view(name) for name in self._partners[view.name]]
         reasons, depth = find_reasons(
             view,
@@ -167,12 +203,7 @@ class _Block:
         )
         if not self.facts.kinds_of(view.name):
             reasons[:] = Reason.OUTSIDE
-        self.ground.add(view, samples, reasons, depth)
-        pictures: tuple[Picture, ...] = ()
-        if view.name in self._shown:
-            pictures = small_pictures(self.workspace, view, samples, reasons, picture, len(self._shown))
-        corners = footprint(view, samples, depth, self.frame) if depth.any() else None
-        return facts_of_image(view, samples, reasons, pictures, corners)
+        return reasons, depth
 
     def _surface(self, view: View) -> NDArray[np.float64]:
         """Some points that a view sees."""
@@ -188,31 +219,39 @@ class _Block:
         facing = Facing(self.scene)
         partners: dict[str, list[str]] = {view.name: [] for view in self.scene.views}
         for pair in self.pairs:
-            names = [self.scene.views[place].name for place in (pair.left, pair.right)]
-            for own, other in (names, reversed(names)):
-                for view in self.scene.photograph(own).views:
-                    partners[view.name] += facing.views(view.name, [other])[0]
+            both = [self.photographs[place] for place in (pair.left, pair.right)]
+            for own, other in (both, reversed(both)):
+                for view in own.views:
+                    partners[view.name] += facing.views(view.name, [other.lead.name])[0]
         return partners
 
     def _choose_shown(self) -> set[str]:
         """Images whose pictures the page has room for."""
-        names = [view.name for view in self.scene.views]
+        names = [photograph.name for photograph in self.photographs]
         if len(names) <= _MOST_SHOWN:
             return set(names)
-        by_coverage = sorted(names, key=lambda name: float((self.samples[name].geometric > 0).mean()))
-        worst = by_coverage[: _MOST_SHOWN // 2]
+        by_coverage = sorted(self.photographs, key=self._share)
+        worst = [photograph.name for photograph in by_coverage[: _MOST_SHOWN // 2]]
         rest = sorted(set(names) - set(worst))
         return {*worst, *(rest[k] for k in np.linspace(0, len(rest) - 1, _MOST_SHOWN - len(worst)).astype(int))}
+
+    def _share(self, photograph: Photograph) -> float:
+        """Share of samples with a geometric depth, of an image or on average of its views."""
+        return float(np.mean([(self.samples[view.name].geometric > 0).mean() for view in photograph.views]))
 
 
 def _missing(block: _Block, facts: RunFacts | None) -> str:
     """What is missing of a finished run, in a sentence."""
     lacks = []
-    expected = block.samples if facts is None else {name for name, share in facts.coverage.items() if share > 0}
+    names = block.samples if facts is None else [name for name, share in facts.coverage.items() if share > 0]
     told = block.facts
-    without = [name for name in expected if name in block.samples and not block.samples[name].has(told.last_maps)]
+    known = [name for name in names if name in block.samples]
+    photograph_of = {name: block.scene.photograph(name).name for name in known}
+    expected = {photograph_of.get(name, name) for name in names}
+    without = {photograph_of[name] for name in known if not block.samples[name].has(told.last_maps)}
     if without:
-        lacks.append(f"{len(without)} of {len(expected)} images have no {told.last_maps} depth map")
+        what = "views without a" if any(view.original for view in block.scene.views) else "no"
+        lacks.append(f"{len(without)} of {len(expected)} images have {what} {told.last_maps} depth map")
     if not block.cloud.total and told.until == "cloud":
         lacks.append("the cloud is of other depth maps" if block.cloud.is_of_others else "there is no cloud")
     if facts is None:

@@ -1,6 +1,6 @@
 """Which images were matched with which, and under what parallax."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from colmap_sph.pages.run_facts import RunFacts
 from colmap_sph.project.pair_lists import pairs_on_disk
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import Scene
+from colmap_sph.scene import Photograph, Scene
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles
 
 # As `pipeline.context.Context.pair_path` names them.
@@ -25,7 +25,7 @@ class PairFacts:
     Attributes
     ----------
     left, right : int
-        Places of its views in the scene; of a photograph that was cut into several, that of the first.
+        Places of its photographs among those of the page.
     angle : float or None
         Parallax at the points that both see, degrees; None where they share none.
     rows : float or None
@@ -39,7 +39,11 @@ class PairFacts:
 
 
 def pairs_of(
-    workspace: Workspace, scene: Scene, facts: RunFacts, surfaces: Mapping[str, NDArray[np.float64]]
+    workspace: Workspace,
+    scene: Scene,
+    photographs: Sequence[Photograph],
+    facts: RunFacts,
+    surfaces: Mapping[str, NDArray[np.float64]],
 ) -> list[PairFacts]:
     """Find the pairs that were matched: as the report says, or else as files of disparity maps are called.
 
@@ -47,6 +51,8 @@ def pairs_of(
     ----------
     workspace : Workspace
     scene : Scene
+    photographs : sequence of Photograph
+        All of the scene's, in the order of the page.
     facts : RunFacts
     surfaces : mapping of str to (n, 3) float64 ndarray
         Some points that images see, which tell angles where the model has no tracks.
@@ -57,10 +63,11 @@ def pairs_of(
     """
     told = facts.matched_pairs or [(left, right, None) for left, right in pairs_on_disk(workspace, scene)]
     known = [pair for pair in told if pair[0] in scene.index_of and pair[1] in scene.index_of]
+    place_of = {view.name: place for place, photograph in enumerate(photographs) for view in photograph.views}
     return [
         PairFacts(
-            scene.index_of[left],
-            scene.index_of[right],
+            place_of[left],
+            place_of[right],
             _angle(scene, left, right, surfaces.get(left)),
             None if rows is None else round(rows, 3),
         )

@@ -95,6 +95,11 @@ def reason_picture(reasons: Bytes) -> Bytes:
     return np.asarray(table[reasons])
 
 
+def uncovered(picture: Bytes, where: NDArray[np.bool_]) -> Bytes:
+    """A picture (h, w, 3) that shows nothing in some places (h, w)."""
+    return np.asarray(np.where(where[:, :, None], np.array(_NOTHING, np.uint8), picture))
+
+
 def _empty(shape: tuple[int, ...]) -> Bytes:
     return np.full((*shape, 3), _NOTHING, np.uint8)
 

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.pages.samples import MapSamples
+from colmap_sph.pages.samples import MapSamples, nearest_in
 from colmap_sph.scene import Region, View, pixel_transfer
 from colmap_sph.stereo.region.inside import is_inside
 from colmap_sph.stereo.region.shown import filled
@@ -164,15 +164,9 @@ def _in_view(
     y = np.where(in_front, moved[1] / scale, -1)
     view = partner.view
     in_view = (x >= 0) & (x <= view.width - 1) & (y >= 0) & (y <= view.height - 1)
-    rows = _nearest(partner.samples.rows, np.where(in_view, y, 0))
-    columns = _nearest(partner.samples.columns, np.where(in_view, x, 0))
+    rows = nearest_in(partner.samples.rows, np.where(in_view, y, 0))
+    columns = nearest_in(partner.samples.columns, np.where(in_view, x, 0))
     return in_view, (rows, columns)
-
-
-def _nearest(grid: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Places in an even grid next to values."""
-    step = grid[1] - grid[0] if len(grid) > 1 else 1
-    return np.asarray(np.clip(np.rint((values - grid[0]) / step), 0, len(grid) - 1), np.int64)
 
 
 def _depths_around(samples: MapSamples) -> NDArray[np.float32]:

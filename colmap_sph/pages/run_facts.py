@@ -64,6 +64,7 @@ class RunFacts(msgspec.Struct, frozen=True):
     region: RegionFacts | None = None
     out_of_region: dict[str, str] = {}
     coverage: dict[str, Share] = {}
+    originals: dict[str, Share] = {}
     agreement: dict[str, Share | None] = {}
     overall_agreement: Share | None = None
     doubts: str = ""

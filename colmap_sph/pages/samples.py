@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.project.map_files import map_size, read_some_pixels
 from colmap_sph.project.masks import read_mask
+from colmap_sph.project.wide.projection import Lens
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import View
 
@@ -64,7 +65,7 @@ class MapSamples:
         return self.has_photometric or self.has_geometric
 
 
-def grid_of(view: View, per_side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def grid_of(view: View | Lens, per_side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns of pixels, evenly spread, about `per_side` of them along the longer side."""
     step = max(1, math.ceil(max(view.width, view.height) / per_side))
     first = step // 2
@@ -72,6 +73,12 @@ def grid_of(view: View, per_side: int) -> tuple[NDArray[np.int64], NDArray[np.in
     rows = np.arange(min(first, view.height - 1), view.height, step)
     columns = np.arange(min(first, view.width - 1), view.width, step)
     return rows, columns
+
+
+def nearest_in(grid: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Places in an even grid next to values."""
+    step = grid[1] - grid[0] if len(grid) > 1 else 1
+    return np.asarray(np.clip(np.rint((values - grid[0]) / step), 0, len(grid) - 1), np.int64)
 
 
 def read_samples(

@@ -122,11 +122,13 @@ def _intrinsics(lens: Lens) -> tuple[Float, Float, Parameters]:
 
 
 def focal_length(lens: Lens) -> float:
-    """Pixels per radian in the middle of the image."""
+    """Pixels per radian in the middle of the image; NaN of a lens that shows nothing there."""
     if lens.model == PANORAMA:
         return max(lens.params[0] / (2 * np.pi), lens.params[1] / np.pi)
     focal, _, _ = _intrinsics(lens)
     _, radius = _table(lens)
+    if len(radius) == 1:
+        return float("nan")
     return float(focal.mean() * radius[1] / (np.pi / (_NODES - 1)))
 
 
