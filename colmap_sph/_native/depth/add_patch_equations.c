@@ -22,6 +22,7 @@ enum { SIDE = 6 };
 
 typedef float lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
+typedef uint32_t uint_lanes __attribute__((vector_size(4 * LANES)));
 
 /* Where a window may lie around its centre in the source; also what makes positions positive, so that cutting off
  * their fraction rounds down. */
@@ -240,7 +241,7 @@ static inline lanes sample(const block_taps *k, lanes u, lanes v, lanes *slope) 
     const int_lanes four = load_pairs(k->values, offset), a = four & 255, c = four >> 8 & 255;
     /* Differences of integers are exact as well, and leave the units of floating-point numbers free. */
     const lanes across = __builtin_convertvector((four >> 16 & 255) - a, lanes),
-                across_below = __builtin_convertvector((four >> 24 & 255) - c, lanes);
+                across_below = __builtin_convertvector((int_lanes)((uint_lanes)four >> 24) - c, lanes);
     const lanes above = __builtin_convertvector(a, lanes) + fu * across,
                 below = __builtin_convertvector(c, lanes) + fu * across_below;
     *slope = (across + fv * (across_below - across)) * k->uw + (below - above) * k->vw;
