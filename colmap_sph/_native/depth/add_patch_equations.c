@@ -197,10 +197,14 @@ static inline int_lanes load_pairs(const uint16_t *values, int_lanes offset) {
 #elif defined(__AVX2__)
     return (int_lanes)_mm256_i32gather_epi32((const int *)(const void *)values, (__m256i)offset, 2);
 #else
+    /* In bytes, below 2^31 as sources have fewer than 2^30 pixels; compilers add such offsets to an address at no
+     * cost. */
+    const uint8_t *bytes = (const uint8_t *)values;
+    const uint_lanes at = (uint_lanes)(offset + offset);
     int_lanes words;
     for (int l = 0; l < LANES; l++) {
         int32_t word;
-        memcpy(&word, values + offset[l], sizeof word);
+        memcpy(&word, bytes + at[l], sizeof word);
         words[l] = word;
     }
     return words;
