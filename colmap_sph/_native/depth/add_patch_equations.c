@@ -257,7 +257,9 @@ static inline void accumulate_row(const block_taps *taps, const lanes *reference
                                   block_sums *sums) {
     lanes g[2] = {{0}}, gr[2] = {{0}}, gs[2] = {{0}}, gg[3] = {{0}};
     const lanes down_u = taps->uy * dy, down_v = taps->vy * dy;
+#ifndef __aarch64__ /* there, gcc works on all taps side by side, for which registers are too few */
 #pragma GCC unroll 6
+#endif
     for (int i = 0; i < SIDE; i++) {
         const float dx = (float)i - 0.5f * (SIDE - 1);
         lanes slope;
