@@ -22,6 +22,7 @@ enum { SIDE = 6 };
 
 typedef float lanes __attribute__((vector_size(4 * LANES)));
 typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
+typedef uint32_t uint_lanes __attribute__((vector_size(4 * LANES)));
 
 /* Where a window may lie around its centre in the source; also what makes positions positive, so that cutting off
  * their fraction rounds down. */
@@ -196,10 +197,14 @@ static inline int_lanes load_pairs(const uint16_t *values, int_lanes offset) {
 #elif defined(__AVX2__)
     return (int_lanes)_mm256_i32gather_epi32((const int *)(const void *)values, (__m256i)offset, 2);
 #else
+    /* In bytes, below 2^31 as sources have fewer than 2^30 pixels; compilers add such offsets to an address at no
+     * cost. */
+    const uint8_t *bytes = (const uint8_t *)values;
+    const uint_lanes at = (uint_lanes)(offset + offset);
     int_lanes words;
     for (int l = 0; l < LANES; l++) {
         int32_t word;
-        memcpy(&word, values + offset[l], sizeof word);
+        memcpy(&word, bytes + at[l], sizeof word);
         words[l] = word;
     }
     return words;
@@ -240,7 +245,7 @@ static inline lanes sample(const block_taps *k, lanes u, lanes v, lanes *slope) 
     const int_lanes four = load_pairs(k->values, offset), a = four & 255, c = four >> 8 & 255;
     /* Differences of integers are exact as well, and leave the units of floating-point numbers free. */
     const lanes across = __builtin_convertvector((four >> 16 & 255) - a, lanes),
-                across_below = __builtin_convertvector((four >> 24 & 255) - c, lanes);
+                across_below = __builtin_convertvector((int_lanes)((uint_lanes)four >> 24) - c, lanes);
     const lanes above = __builtin_convertvector(a, lanes) + fu * across,
                 below = __builtin_convertvector(c, lanes) + fu * across_below;
     *slope = (across + fv * (across_below - across)) * k->uw + (below - above) * k->vw;
@@ -252,7 +257,9 @@ static inline void accumulate_row(const block_taps *taps, const lanes *reference
                                   block_sums *sums) {
     lanes g[2] = {{0}}, gr[2] = {{0}}, gs[2] = {{0}}, gg[3] = {{0}};
     const lanes down_u = taps->uy * dy, down_v = taps->vy * dy;
+#ifndef __aarch64__ /* there, gcc works on all taps side by side, for which registers are too few */
 #pragma GCC unroll 6
+#endif
     for (int i = 0; i < SIDE; i++) {
         const float dx = (float)i - 0.5f * (SIDE - 1);
         lanes slope;
