@@ -104,7 +104,7 @@ class Demo:
     def rectified(self, left: str, right: str, options: RectificationOptions | None = None) -> MatchedPair:
         """Rectify a pair; its disparity map comes when it is asked for."""
         views = self.scene.view(left), self.scene.view(right)
-        geometry = rectify_pair(self.scene, *views, options or RectificationOptions())
+        geometry = rectify_pair(self.scene, *views, options or RectificationOptions(columns="angles"))
         sides: tuple[Side, Side] = ("left", "right")
         images = (
             resample(read_grey(self.workspace.image_path(view.name)), view, geometry, side)

@@ -78,7 +78,11 @@ def recorded() -> Iterator[list[Level]]:
         match(*arguments)
         _, left, right, _, _, base, surface, image, p1, p2, max_slant, _, _, scratch, offset = arguments
         images = left.copy(), right.copy(), base.copy(), surface.copy(), image.copy()
-        levels.append(Level(*predicted[-1], *images, p1, p2.copy(), max_slant, scratch.shape[-1], offset.copy()))
+        # A level whose images are not stretched against each other is not warped.
+        how = (np.zeros(base.shape, np.int32), 0, np.empty((0, 0), np.float32))
+        if predicted and predicted[-1][0].shape == base.shape:
+            how = predicted[-1]
+        levels.append(Level(*how, *images, p1, p2.copy(), max_slant, scratch.shape[-1], offset.copy()))
 
     with mock.patch.multiple(_native, match=match_and_record, warp=warp_and_record):
         yield levels

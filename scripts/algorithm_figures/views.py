@@ -197,7 +197,7 @@ def plane(demo: Demo, path: Path) -> None:
         start = 0.0
         texts = []
         for model in ("spherical", "frame"):
-            pair = demo.rectified(*names, RectificationOptions(model))
+            pair = demo.rectified(*names, RectificationOptions(model, columns="angles"))
             pixels = 0
             for image in (pair.left_image, pair.right_image):
                 height, width = image.image.shape
