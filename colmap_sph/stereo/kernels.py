@@ -30,5 +30,5 @@ def shortcoming() -> str:
     )
 
 
-if shortcoming():
-    logger.warning("%s", shortcoming())
+if _words := shortcoming():
+    logger.warning("%s", _words)

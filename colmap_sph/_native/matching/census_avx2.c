@@ -1,6 +1,6 @@
 #include <immintrin.h>
 
-#include "matching/matching.h"
+#include "matching/census_blocks.h"
 
 enum { LANES = 32 };
 
@@ -29,7 +29,7 @@ static void store_words(const __m256i bytes[8], uint64_t *words) {
     }
 }
 
-static void census_32_pixels(const int16_t *window, ptrdiff_t stride, uint64_t *words) {
+static inline void census_32_pixels(const int16_t *window, ptrdiff_t stride, uint64_t *words) {
     const int16_t *middle = window + CENSUS_RADIUS_Y * stride + CENSUS_RADIUS_X;
     const __m256i margin = _mm256_set1_epi16(CENSUS_MARGIN);
     /* Nothing is darker than the number at which this saturates. */
@@ -59,20 +59,5 @@ static void census_32_pixels(const int16_t *window, ptrdiff_t stride, uint64_t *
 
 void census_avx2(const int16_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
                  uint64_t *census) {
-    if (width < LANES) {
-        census_scalar(padded, valid, height, width, census);
-        return;
-    }
-    const ptrdiff_t stride = width + 2 * CENSUS_RADIUS_X;
-    for (ptrdiff_t y = 0; y < height; y++) {
-        uint64_t *row = census + y * width;
-        for (ptrdiff_t x = 0; x < width; x += LANES) {
-            /* The last block overlaps the one before it. */
-            const ptrdiff_t start = x + LANES <= width ? x : width - LANES;
-            census_32_pixels(padded + y * stride + start, stride, row + start);
-        }
-        for (ptrdiff_t x = 0; x < width; x++) {
-            row[x] = valid[y * width + x] ? row[x] : CENSUS_INVALID;
-        }
-    }
+    census_in_blocks(census_32_pixels, LANES, padded, valid, height, width, census);
 }

@@ -1,6 +1,6 @@
 #include <arm_neon.h>
 
-#include "matching/matching.h"
+#include "matching/census_blocks.h"
 
 enum { LANES = 8, MIDDLE = CENSUS_BITS / 2 };
 
@@ -35,20 +35,5 @@ static inline void census_8_pixels(const int16_t *window, ptrdiff_t stride, uint
 
 void census_neon(const int16_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
                  uint64_t *census) {
-    if (width < LANES) {
-        census_scalar(padded, valid, height, width, census);
-        return;
-    }
-    const ptrdiff_t stride = width + 2 * CENSUS_RADIUS_X;
-    for (ptrdiff_t y = 0; y < height; y++) {
-        uint64_t *row = census + y * width;
-        for (ptrdiff_t x = 0; x < width; x += LANES) {
-            /* The last block overlaps the one before it. */
-            const ptrdiff_t start = x + LANES <= width ? x : width - LANES;
-            census_8_pixels(padded + y * stride + start, stride, row + start);
-        }
-        for (ptrdiff_t x = 0; x < width; x++) {
-            row[x] = valid[y * width + x] ? row[x] : CENSUS_INVALID;
-        }
-    }
+    census_in_blocks(census_8_pixels, LANES, padded, valid, height, width, census);
 }
