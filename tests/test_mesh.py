@@ -23,6 +23,7 @@ from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.options import MeshOptions
 from colmap_sph.products.mesh.preview import write_preview
+from colmap_sph.products.mesh.texture.textured import plain
 from colmap_sph.products.mesh.triangles import Triangles, read_ply, write_ply
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
@@ -92,7 +93,7 @@ def pyramid() -> Triangles:
 
 def test_a_glb_file_is_read_upright_by_others(tmp_path):
     mesh = pyramid()
-    write_glb(tmp_path / "mesh.glb", mesh, np.eye(3))
+    write_glb(tmp_path / "mesh.glb", [plain(mesh)], np.eye(3))
     found: Any = trimesh.load(tmp_path / "mesh.glb", process=False, force="mesh")
     middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
     x, y, z = (mesh.points - middle).T
@@ -213,6 +214,8 @@ def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path):
     assert len(few.faces) == pytest.approx(0.2 * len(full.faces), rel=0.1)
     assert few.volume == pytest.approx(full.volume, rel=0.01)
     assert not (tmp_path / "few" / "mesh.glb").exists()
+    above = np.asarray(few.visual.vertex_colors)[few.vertices[:, 2] > 9][:, :3].astype(int)
+    assert np.abs(above - RED).max() <= 3
 
 
 # ---- what is refused ---------------------------------------------------------------------------------------
@@ -232,6 +235,10 @@ def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path):
 )
 def test_nonsense_is_refused(options, name):
     assert_refused(MeshOptions(**options), name)
+
+
+def test_a_texture_for_no_format_that_has_one_is_refused():
+    assert_refused(MeshOptions(formats=("ply",), texture=True), "texture", "formats")
 
 
 def test_a_missing_open3d_is_one_sentence(workspace, tmp_path, monkeypatch):

@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.mesh.glb import write_glb
+from colmap_sph.products.mesh.obj import write_obj
 from colmap_sph.products.mesh.options import MeshOptions
 from colmap_sph.products.mesh.preview import PREVIEW, write_preview
+from colmap_sph.products.mesh.texture.textured import Sheet, plain, textured
 from colmap_sph.products.mesh.triangles import Triangles, joined, read_ply, write_ply
 from colmap_sph.products.mesh.tsdf import Volume, open3d
 from colmap_sph.products.places import check_places
@@ -24,6 +27,8 @@ from colmap_sph.scene import Scene
 from colmap_sph.stereo.region.map_axes import map_axes
 
 _DEPTHS = (6, 13)
+# Depths of one surface, as the mesh and a view have it, differ by no more than this many pixels on it.
+_TOLERANCE = 6.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,9 +89,13 @@ def make_mesh(
             advance()
         if options.simplify < 1:
             mesh = _simplified(mesh, request, scratch)
-    if not len(mesh.faces):
-        raise NoResultError("There is no surface: give a larger --voxel or a smaller --min-images.")
-    return _written(request, mesh, scene, seen), len(mesh.faces)
+        if not len(mesh.faces):
+            raise NoResultError("There is no surface: give a larger --voxel or a smaller --min-images.")
+        sheets = [plain(mesh)]
+        if options.texture:
+            start("texture", len(seen))
+            sheets = textured(mesh, request.workspace, scene, seen, _TOLERANCE * gsd, scratch, advance)
+        return _written(request, mesh, sheets, scene, seen), len(mesh.faces)
 
 
 def _of_maps(
@@ -126,23 +135,31 @@ def _simplified(mesh: Triangles, request: MeshRequest, scratch: Path) -> Triangl
     full, fewer = scratch / "full.ply", scratch / "fewer.ply"
     write_ply(full, mesh, mesh.points)
     simplify(full, fewer, ratio=request.options.simplify, threads=request.threads)
-    return read_ply(fewer)
+    found = read_ply(fewer)
+    # COLMAP drops colours.
+    _, nearest = cKDTree(mesh.points).query(found.points)
+    return Triangles(found.points, mesh.colours[nearest], found.faces)
 
 
-def _written(request: MeshRequest, mesh: Triangles, scene: Scene, seen: list[SeenView]) -> list[Path]:
+def _written(
+    request: MeshRequest, mesh: Triangles, sheets: list[Sheet], scene: Scene, seen: list[SeenView]
+) -> list[Path]:
     is_on_map = bool(request.georeference.crs) or not request.georeference.is_identity or bool(scene.origin.any())
     axes = _axes(request.georeference, scene, seen, is_on_map=is_on_map)
+
+    def placed(points: NDArray[np.float32]) -> NDArray[np.floating]:
+        return request.georeference.to_map(points.astype(np.float64) + scene.origin) if is_on_map else points
+
     paths = []
     for each in dict.fromkeys(request.options.formats):
         path = request.folder / f"mesh.{each}"
-        if each == "ply":
-            places: NDArray[np.floating] = mesh.points
-            if is_on_map:
-                places = request.georeference.to_map(mesh.points.astype(np.float64) + scene.origin)
-            write_ply(path, mesh, places)
-        else:
-            write_glb(path, mesh, axes)
         paths.append(path)
+        if each == "ply":
+            write_ply(path, mesh, placed(mesh.points))
+        elif each == "glb":
+            write_glb(path, sheets, axes)
+        else:
+            paths += write_obj(path, sheets, [placed(sheet.points) for sheet in sheets])[1:]
     write_preview(request.folder / PREVIEW, mesh, axes)
     return [*paths, request.folder / PREVIEW]
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 from colmap_sph.errors import OptionError
 
-MeshFormat = Literal["ply", "glb"]
+MeshFormat = Literal["ply", "glb", "obj"]
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,8 @@ class MeshOptions:
     """tsdf: of the depth maps, averaged in voxels, by Open3D; poisson: of the cloud, smooth, by COLMAP."""
     formats: tuple[MeshFormat, ...] = ("ply", "glb")
     """Files to write."""
+    texture: bool = False
+    """Give glb and obj pictures, of the images that see each triangle best, instead of the colours of corners."""
     voxel: float = 0.0
     """Side of a voxel of tsdf, or of poisson's finest cell, in units of the model; 0: what a pixel covers, the
     median over all maps, and twice that for poisson."""
@@ -37,5 +39,9 @@ class MeshOptions:
             raise OptionError(f"min_images must be at least 1, not {self.min_images}.", "min_images")
         if not 0 <= self.trim <= 20:
             raise OptionError(f"trim must lie between 0 and 20, not {self.trim}.", "trim")
+        if self.texture and not {"glb", "obj"} & set(self.formats):
+            raise OptionError(
+                "texture is for glb and obj, neither of which is among formats.", "texture", "formats"
+            )
         if not self.formats:
-            raise OptionError("formats must name at least one of ply and glb.", "formats")
+            raise OptionError("formats must name at least one of ply, glb and obj.", "formats")

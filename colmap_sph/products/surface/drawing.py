@@ -1,6 +1,5 @@
 """A tile and the maps of the views that see it → its surface and its orthophoto."""
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,8 +8,9 @@ from numpy.typing import NDArray
 
 from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.options import SurfaceOptions
+from colmap_sph.products.surface.pictures import Pictures
 from colmap_sph.products.surface.placing import Placement
-from colmap_sph.products.surface.seen import Box, Part, SeenView, read_part, read_picture
+from colmap_sph.products.surface.seen import Box, Part, SeenView, read_part
 from colmap_sph.products.surface.tiles import Sightings, Tile
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.surface.coarser import coarser_colours, coarser_surface
@@ -43,34 +43,6 @@ class Drawn:
     shade: NDArray[np.uint8]
     colours: NDArray[np.uint8]
     source: NDArray[np.uint16]
-
-
-class Pictures:
-    """Images with their colours balanced, of which the latest are kept."""
-
-    def __init__(
-        self, workspace: Workspace, seen: Sequence[SeenView], gains: NDArray[np.float32], memory: int
-    ) -> None:
-        self._workspace = workspace
-        self._seen = seen
-        self._gains = gains
-        self._memory = memory
-        self._kept: OrderedDict[int, NDArray[np.uint8]] = OrderedDict()
-
-    def of(self, index: int) -> NDArray[np.uint8]:
-        """(H, W, 3) image of a view."""
-        if index in self._kept:
-            self._kept.move_to_end(index)
-            return self._kept[index]
-        picture = read_picture(self._workspace, self._seen[index].view)
-        for colour, gain in enumerate(self._gains[index]):
-            table = np.clip(np.rint(np.arange(256) * gain), 0, 255).astype(np.uint8)
-            picture[..., colour] = table[picture[..., colour]]
-        while self._kept and sum(each.nbytes for each in self._kept.values()) + picture.nbytes > self._memory:
-            self._kept.popitem(last=False)
-        if picture.nbytes <= self._memory:
-            self._kept[index] = picture
-        return picture
 
 
 @dataclass(frozen=True, eq=False)

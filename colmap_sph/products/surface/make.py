@@ -14,10 +14,10 @@ from colmap_sph.errors import NoResultError, OutputError, reason_of
 from colmap_sph.platforms.files import move_into_place, sync_file
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.places import check_places
-from colmap_sph.products.surface.balance import balancing_gains
-from colmap_sph.products.surface.drawing import Drawing, Drawn, Pictures, margin_of
+from colmap_sph.products.surface.drawing import Drawing, Drawn, margin_of
 from colmap_sph.products.surface.geotiff import NO_HEIGHT, Layer, LayerFiles, gdal
 from colmap_sph.products.surface.options import SurfaceOptions
+from colmap_sph.products.surface.pictures import pictures_of
 from colmap_sph.products.surface.placing import Placement, place
 from colmap_sph.products.surface.previews import PREVIEWS, write_previews
 from colmap_sph.products.surface.seen import SeenView, seen_views
@@ -156,11 +156,7 @@ def _prepared(
     side, spare = choose_side(placement.raster, sightings, seen, margin, placement.factor, request.memory)
     pictures = None
     if options.orthophoto:
-        indices = [each.index for each in seen]
-        gains = np.ones((len(seen), 3), np.float32)
-        if options.balance:
-            gains = balancing_gains(request.workspace, scene, indices)
-        pictures = Pictures(request.workspace, seen, gains, spare)
+        pictures = pictures_of(request.workspace, scene, seen, balance=options.balance, memory=spare)
     drawing = Drawing(request.workspace, seen, placement, sightings, options, pictures)
     return drawing, tiles_of(placement.raster, side)
 

@@ -15,6 +15,25 @@ _AT_BORDER = 0.3
 
 
 @dataclass(frozen=True, eq=False)
+class Found:
+    """What a depth map says about points.
+
+    Attributes
+    ----------
+    is_free : ndarray of bool
+        In view, and no depth around is nearer.
+    matches : ndarray of bool
+        A depth around is the point's own.
+    is_hole : ndarray of bool
+        There are no depths around.
+    """
+
+    is_free: NDArray[np.bool_]
+    matches: NDArray[np.bool_]
+    is_hole: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
 class Sight:
     """What a view sees of a raster's cells.
 
@@ -64,28 +83,53 @@ def sight_of(
     Sight
     """
     x, y, z, worth = _projected(view, height, raster)
+    found = looked_up(depth, x, y, z, tolerance)
+    worth *= towards_border(x, y, view, full_view)
+    return Sight(
+        (x - 0.5).astype(np.float32),
+        (y - 0.5).astype(np.float32),
+        found.is_free & found.matches,
+        found.is_free & (found.matches | found.is_hole),
+        worth.astype(np.float32),
+    )
+
+
+def looked_up(
+    depth: NDArray[np.float32],
+    x: NDArray[np.float64],
+    y: NDArray[np.float64],
+    z: NDArray[np.float64],
+    tolerance: float,
+) -> Found:
+    """Compare points with the four depths around them in a depth map.
+
+    Parameters
+    ----------
+    depth : (H, W) float32 ndarray
+        z-depth along the ray K⁻¹ (column, row, 1), model units; 0 = none.
+    x, y, z : float64 ndarrays of one shape
+        Image coordinates of the points, NaN for none, and their depths.
+    tolerance : float
+        By which depths of the same surface differ at most, model units.
+
+    Returns
+    -------
+    Found
+    """
+    height, width = depth.shape
     # Depth maps hold the depths of pixels' upper left corners.
     left = np.floor(np.nan_to_num(x, nan=-2.0)).astype(np.int64)
     top = np.floor(np.nan_to_num(y, nan=-2.0)).astype(np.int64)
-    inside = (left >= 0) & (top >= 0) & (left + 1 < view.width) & (top + 1 < view.height) & (z > 0)
-    index = np.where(inside, top * view.width + left, 0)
+    inside = (left >= 0) & (top >= 0) & (left + 1 < width) & (top + 1 < height) & (z > 0)
+    index = np.where(inside, top * width + left, 0)
     flat = depth.ravel()
-    around = [flat.take(index + step, mode="clip") for step in (0, 1, view.width, view.width + 1)]
+    around = [flat.take(index + step, mode="clip") for step in (0, 1, width, width + 1)]
     nearest = np.full(z.shape, np.inf, np.float32)
     matches = np.zeros(z.shape, bool)
     for each in around:
         np.minimum(nearest, np.where(each > 0, each, np.inf), out=nearest)
         matches |= (each > 0) & (np.abs(each - z) <= tolerance)
-    is_free = inside & (nearest >= z - tolerance)
-    is_hole = ~np.isfinite(nearest)
-    worth *= _towards_border(x, y, view, full_view)
-    return Sight(
-        (x - 0.5).astype(np.float32),
-        (y - 0.5).astype(np.float32),
-        is_free & matches,
-        is_free & (matches | is_hole),
-        worth.astype(np.float32),
-    )
+    return Found(inside & (nearest >= z - tolerance), matches, ~np.isfinite(nearest))
 
 
 def _projected(
@@ -114,7 +158,7 @@ def _projected(
     return x, y, z, worth
 
 
-def _towards_border(
+def towards_border(
     x: NDArray[np.float64], y: NDArray[np.float64], view: View, full_view: View
 ) -> NDArray[np.float64]:
     """From 1 inside of the image to less at its border."""

@@ -1,0 +1,1 @@
+"""A mesh and the images that see it → a textured mesh."""
