@@ -69,8 +69,8 @@ class Drawing:
         surface, chosen = coarser_surface(fine, factor)
         surface = filled(surface, self.options.fill, window.cell, self._tolerance)
         shade = hillshade(surface.height, window.cell)
-        mosaic = self._mosaic(fine_window, views, _with_filled(fine, surface, factor))
-        colours, source = coarser_colours(mosaic.colours, mosaic.source, factor, chosen)
+        colours, source = self._orthophoto(fine_window, views, _with_filled(fine, surface, factor))
+        colours, source = coarser_colours(colours, source, factor, chosen)
         inner = (slice(margin, margin + tile.height), slice(margin, margin + tile.width))
         return Drawn(
             Surface(surface.height[inner], surface.deviation[inner], surface.count[inner]),
@@ -100,19 +100,23 @@ class Drawing:
             part.depth[~((height >= low) & (height <= high))] = 0
         return part
 
-    def _mosaic(self, window: Raster, views: Sequence[tuple[int, Box]], surface: Surface) -> Mosaic:
+    def _orthophoto(
+        self, window: Raster, views: Sequence[tuple[int, Box]], surface: Surface
+    ) -> tuple[NDArray[np.uint8], NDArray[np.uint16]]:
+        """(h, w, 3) colours, and (h, w) numbers of the images that they are from."""
+        pictures = self.pictures
+        if pictures is None or not np.isfinite(surface.height).any():
+            return np.zeros((*window.shape, 3), np.uint8), np.zeros(window.shape, np.uint16)
         is_filled = np.isfinite(surface.height) & (surface.count == 0)
         mosaic = Mosaic(surface.height, is_filled, self._tolerance)
-        if self.pictures is None or not np.isfinite(surface.height).any():
-            return mosaic
         tolerance = 2 * self._tolerance / window.scale
         for index, box in views:
-            seen = self.seen[index]
-            part = read_part(self.workspace, seen.view, box)
-            sight = sight_of(part.view, seen.view, part.depth, surface.height, window, tolerance)
-            if (sight.is_open & (sight.is_seen | is_filled)).any():
-                mosaic.add(sight, self.pictures.of(index), box[:2], seen.index + 1)
-        return mosaic
+            view = self.seen[index].view
+            part = read_part(self.workspace, view, box, with_normals=False)
+            sight = sight_of(part.view, view, part.depth, surface.height, window, tolerance)
+            mosaic.add(sight, box[:2], index + 1)
+        numbers = np.array([0, *(each.index + 1 for each in self.seen)], np.uint16)
+        return mosaic.colours(lambda number: pictures.of(number - 1)), numbers[mosaic.source]
 
 
 def margin_of(options: SurfaceOptions, factor: int) -> int:

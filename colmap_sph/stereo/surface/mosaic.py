@@ -1,5 +1,7 @@
 """Views of a surface, one after the other → the colours of the one that sees each cell best."""
 
+from collections.abc import Callable
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -29,21 +31,19 @@ class Mosaic:
         self._is_filled = is_filled
         self._tolerance = tolerance
         self._worth = np.zeros(height.shape, np.float32)
-        self.colours = np.zeros((*height.shape, 3), np.uint8)
-        """(h, w, 3) red, green and blue."""
+        self._columns = np.zeros(height.shape, np.float32)
+        self._rows = np.zeros(height.shape, np.float32)
         self.source = np.zeros(height.shape, np.uint16)
         """(h, w) number of the view that each cell's colour is from; 0: none sees it."""
 
-    def add(self, sight: Sight, picture: NDArray[np.uint8], corner: tuple[int, int], number: int) -> None:
-        """Let a view give its colours to the cells that it sees best so far.
+    def add(self, sight: Sight, corner: tuple[int, int], number: int) -> None:
+        """Let a view have the cells that it sees best so far.
 
         Parameters
         ----------
         sight : Sight
-        picture : (H, W, 3) uint8 ndarray
-            The whole image.
         corner : (int, int)
-            Column and row of it where the sight's part begins.
+            Column and row of the image where the sight's part begins.
         number : int
             Of the view, from 1.
         """
@@ -55,11 +55,18 @@ class Mosaic:
         better = usable & (np.maximum(worth, np.float32(1e-20)) > self._worth)
         if not better.any():
             return
-        columns = sight.columns[better] + np.float32(corner[0])
-        rows = sight.rows[better] + np.float32(corner[1])
-        self.colours[better] = _sampled(picture, columns, rows)
+        self._columns[better] = sight.columns[better] + np.float32(corner[0])
+        self._rows[better] = sight.rows[better] + np.float32(corner[1])
         self.source[better] = number
         self._worth[better] = np.maximum(worth[better], np.float32(1e-20))
+
+    def colours(self, picture_of: Callable[[int], NDArray[np.uint8]]) -> NDArray[np.uint8]:
+        """(h, w, 3) red, green and blue, from the whole images, by number, of those views that have cells."""
+        colours = np.zeros((*self.source.shape, 3), np.uint8)
+        for number in np.unique(self.source[self.source > 0]).tolist():
+            cells = self.source == number
+            colours[cells] = _sampled(picture_of(number), self._columns[cells], self._rows[cells])
+        return colours
 
 
 def _sampled(

@@ -1,6 +1,7 @@
 """Cells of a surface and a view's depth map → where the view sees them, and how well."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -40,13 +41,13 @@ class Sight:
     Attributes
     ----------
     columns, rows : (h, w) float32 ndarray
-        Where the cells lie in the view: indices of its pixels' centres, as `cv2.remap` takes them.
+        Where open cells lie in the view: indices of its pixels' centres, as `cv2.remap` takes them.
     is_seen : (h, w) bool ndarray
         Its depth map shows the very surface there, and nothing nearer beside it.
     is_open : (h, w) bool ndarray
         In view, and nothing that is nearer is known: seen, or without a depth.
     worth : (h, w) float32 ndarray
-        Pixels of the view per cell, less towards the image's border.
+        Pixels of the view per cell, less towards the image's border; 0 where it is not open.
     """
 
     columns: NDArray[np.float32]
@@ -82,15 +83,23 @@ def sight_of(
     -------
     Sight
     """
-    x, y, z, worth = _projected(view, height, raster)
+    cells, x, y, z = _projected(view, height, raster)
     found = looked_up(depth, x, y, z, tolerance)
-    worth *= towards_border(x, y, view, full_view)
+    is_open = found.is_free & (found.matches | found.is_hole)
+    cells, x, y, z = cells[is_open], x[is_open], y[is_open], z[is_open]
+    worth = _pixels_per_cell(view, raster, x, y, z) * towards_border(x, y, view, full_view)
+
+    def placed(values: NDArray[Any], kind: type) -> NDArray[Any]:
+        whole = np.zeros(height.size, kind)
+        whole[cells] = values
+        return whole.reshape(height.shape)
+
     return Sight(
-        (x - 0.5).astype(np.float32),
-        (y - 0.5).astype(np.float32),
-        found.is_free & found.matches,
-        found.is_free & (found.matches | found.is_hole),
-        worth.astype(np.float32),
+        placed(x - 0.5, np.float32),
+        placed(y - 0.5, np.float32),
+        placed(found.matches[is_open], np.bool_),
+        placed(True, np.bool_),
+        placed(worth, np.float32),
     )
 
 
@@ -134,28 +143,32 @@ def looked_up(
 
 def _projected(
     view: View, height: NDArray[np.float32], raster: Raster
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Image coordinates x and y, depth, and pixels per cell; NaN where there is no surface or no image of it."""
+) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Cells whose surface lies in front of a view and in it; their image coordinates x and y, and depths."""
     matrix, shift = raster.cells_from_camera(view)
-    inverse = np.linalg.inv(matrix)
-    pixels = view.K @ inverse
+    pixels = view.K @ np.linalg.inv(matrix)
     start = pixels @ shift
     column = np.arange(raster.width)
     row = np.arange(raster.height)[:, None]
     h = height.astype(np.float64)
-    u, v, z = (pixels[k, 0] * column + pixels[k, 1] * row + pixels[k, 2] * h - start[k] for k in range(3))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        x = u / z
-        y = v / z
-        # A level cell is spanned by two vectors of the camera frame, whose cross product is its area N; the
-        # image of that is N · ray / z² times the focal lengths.
-        across = np.cross(inverse[:, 0], inverse[:, 1])
-        focal = np.linalg.inv(view.K)
-        ray = focal @ np.stack([x.ravel(), y.ravel(), np.ones(x.size)])
-        facing = np.abs(across @ ray).reshape(x.shape)
-        worth = view.K[0, 0] * view.K[1, 1] * facing / z**2
-    worth[~(np.isfinite(worth) & (z > 0))] = 0
-    return x, y, z, worth
+    u, v, z = (pixels[k, 0] * column + (pixels[k, 1] * row - start[k]) + pixels[k, 2] * h for k in range(3))
+    # NaN is nowhere.
+    inside = (z > 0) & (u >= 0) & (v >= 0) & (u < view.width * z) & (v < view.height * z)
+    cells = np.flatnonzero(inside)
+    far = z.ravel()[cells]
+    return cells, u.ravel()[cells] / far, v.ravel()[cells] / far, far
+
+
+def _pixels_per_cell(
+    view: View, raster: Raster, x: NDArray[np.float64], y: NDArray[np.float64], z: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """How many pixels of a view a level cell at these image coordinates and this depth covers."""
+    # A cell is spanned by two vectors of the camera frame, whose cross product is its area N; the image of that is
+    # N · ray / z² times the focal lengths.
+    inverse = np.linalg.inv(raster.cells_from_camera(view)[0])
+    across = np.cross(inverse[:, 0], inverse[:, 1]) @ np.linalg.inv(view.K)
+    facing = np.abs(across[0] * x + across[1] * y + across[2])
+    return np.asarray(view.K[0, 0] * view.K[1, 1] * facing / z**2)
 
 
 def towards_border(
@@ -165,9 +178,8 @@ def towards_border(
     left, top = full_view.K[:2, 2] - view.K[:2, 2]
     from_side = np.minimum(x + left, full_view.width - left - x) / full_view.width
     from_end = np.minimum(y + top, full_view.height - top - y) / full_view.height
-    with np.errstate(invalid="ignore"):
-        inner = np.clip(np.minimum(from_side, from_end) / _BORDER, 0, 1)
-    return np.asarray(_AT_BORDER + (1 - _AT_BORDER) * np.nan_to_num(inner))
+    inner = np.clip(np.minimum(from_side, from_end) / _BORDER, 0, 1)
+    return np.asarray(_AT_BORDER + (1 - _AT_BORDER) * inner)
 
 
 def smoothed_worth(
@@ -182,7 +194,17 @@ def smoothed_worth(
     So neighbouring cells of one surface take the same view, and views meet along edges: costs filtered with the
     surface as guide (Hosni et al. 2011, with the guided filter of He et al. 2010).
     """
-    guide = np.nan_to_num(height, nan=0.0).astype(np.float32)
-    ours = np.where(usable, worth, np.float32(0))
-    smooth = cv2.ximgproc.guidedFilter(guide, ours, radius, float(tolerance) ** 2)
-    return np.where(usable, smooth, np.float32(-1))
+    smooth = np.full(worth.shape, -1, np.float32)
+    # The filter looks so far around: two means, one of the other.
+    part = tuple(_reach(usable.any(axis=axis), 2 * radius + 1) for axis in (1, 0))
+    guide = np.nan_to_num(height[part], nan=0.0).astype(np.float32)
+    ours = np.where(usable[part], worth[part], np.float32(0))
+    found = cv2.ximgproc.guidedFilter(guide, ours, radius, float(tolerance) ** 2)
+    smooth[part] = np.where(usable[part], found, np.float32(-1))
+    return smooth
+
+
+def _reach(is_there: NDArray[np.bool_], around: int) -> slice:
+    """From the first place to the last one, and so many around them."""
+    places = np.flatnonzero(is_there)
+    return slice(max(int(places[0]) - around, 0), int(places[-1]) + around + 1)
