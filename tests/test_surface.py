@@ -427,6 +427,7 @@ def test_holes_stay_or_are_filled_from_their_rims(tmp_path):
         ({"up": "0,0,0"}, ["up"]),
         ({"plane": ("0,0,0", "1,0,0", "2,0,0")}, ["plane"]),
         ({"plane": ("0,0,0", "1,0", "0,1,0")}, ["plane"]),
+        ({"plane": ("0,0,0", "1e300,0,0", "0,1e300,0")}, ["plane"]),
         ({"plane": ("0,0,0", "1,0,0", "0,1,0"), "up": "z"}, ["up", "plane"]),
         ({"plane_depth": 1.0}, ["plane_depth", "plane"]),
     ],
@@ -438,6 +439,8 @@ def test_nonsense_is_refused(options, names):
 def test_a_raster_without_end_is_refused(workspace, tmp_path):
     with pytest.raises(OptionError, match=r"larger cell"):
         made(workspace, tmp_path, cell=1e-6)
+    with pytest.raises(OptionError, match=r"smaller cell"):
+        made(workspace, tmp_path, cell=1e6)
 
 
 def test_a_workspace_without_maps_is_told_what_to_do(tmp_path):

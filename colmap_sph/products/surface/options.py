@@ -14,6 +14,8 @@ _AXES = {
     for name, axis in zip("xyz", factor * np.eye(3), strict=True)
 }
 
+_FARTHEST = 1e9
+
 
 @dataclass(frozen=True)
 class SurfaceOptions:
@@ -73,6 +75,8 @@ class SurfaceOptions:
         if self.plane is None:
             return None
         corners = np.array([_three_numbers(text, "plane") for text in self.plane])
+        if np.abs(corners).max() > _FARTHEST:
+            raise OptionError(f"plane has coordinates beyond {_FARTHEST:g}, where no map reaches.", "plane")
         across = corners[1:] - corners[0]
         lengths = np.linalg.norm(across, axis=1)
         if not (lengths > 0).all() or np.linalg.norm(np.cross(*across)) < 0.1 * lengths.prod():

@@ -78,14 +78,19 @@ def place(
         places = np.concatenate([each.points @ linear[:2].T + offset[:2] for each in seen])
         least, most = _extent(places)
         first = np.floor(least / cell) * cell
-        columns, rows = np.ceil((most - first) / cell).astype(int)
+        columns, rows = np.maximum(np.ceil((most - first) / cell), 1)
+        if cell > max(most - least):
+            raise OptionError(
+                f"a cell of {cell:g} is larger than all that is seen, {max(most - least):g}; give a smaller cell.",
+                "cell",
+            )
     else:
         first = np.zeros(2)
         size = _sides(corners)
-        columns, rows = np.maximum(np.ceil(size / cell - 1e-6), 1).astype(int)
+        columns, rows = np.maximum(np.ceil(size / cell - 1e-6), 1)
         depth = options.plane_depth or _SLAB * float(size[0])
         slab = (-depth, depth)
-    _check_size(int(columns), int(rows), cell)
+    _check_size(columns, rows, cell)
     raster = Raster(linear, offset, float(first[0]), float(first[1] + rows * cell), cell, int(columns), int(rows))
     if not any(_is_met(raster, each, slab) for each in seen):
         raise NoResultError(
@@ -154,10 +159,10 @@ def _rounded(size: float) -> float:
     return float(f"{math.ceil(size / step - 1e-9) * step:.12g}")
 
 
-def _check_size(columns: int, rows: int, cell: float) -> None:
+def _check_size(columns: float, rows: float, cell: float) -> None:
     if max(columns, rows) > _MOST_ON_A_SIDE or columns * rows > _MOST_CELLS:
         raise OptionError(
-            f"a cell of {cell:g} makes a raster of {columns:,} x {rows:,} cells; give a larger cell.", "cell"
+            f"a cell of {cell:g} makes a raster of {columns:,.0f} x {rows:,.0f} cells; give a larger cell.", "cell"
         )
 
 
