@@ -275,6 +275,9 @@ def test_similarity_of_places_in_one_plane(number: int) -> None:
         source = plane + np.array([0, 0, height])
         found = estimate_similarity(source, on_map(source))
         np.testing.assert_allclose(found(centers()), on_map(centers()), atol=1e-6)
+        shift = np.array([5e5, 5.4e6, 300])
+        level = estimate_similarity(source, source + shift)  # exactly in a plane in both frames
+        np.testing.assert_allclose(level(centers()), centers() + shift, atol=1e-6)
 
 
 def test_places_on_a_line_tell_no_similarity() -> None:

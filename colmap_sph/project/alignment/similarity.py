@@ -82,13 +82,19 @@ _Fit = tuple[float, NDArray[np.float64], NDArray[np.float64]]
 
 def _fitted(source: NDArray[np.float64], target: NDArray[np.float64]) -> _Fit | None:
     # COLMAP (4.2) takes places for degenerate whose plane contains the origin: they are moved off it.
-    _, spread, axes = np.linalg.svd(source - source.mean(axis=0), full_matrices=True)
-    off = spread[0] * axes[2] - source.mean(axis=0)
-    found = pycolmap.estimate_sim3d(source + off, target)
+    off = _away_from_plane(source)
+    target_off = _away_from_plane(target)
+    found = pycolmap.estimate_sim3d(source + off, target + target_off)
     if found is None or not np.isfinite(found.matrix()).all() or not found.scale > 0:
         return None
     rotation = np.array(found.rotation.matrix())
-    return float(found.scale), rotation, found.translation + found.scale * rotation @ off
+    return float(found.scale), rotation, found.translation + found.scale * rotation @ off - target_off
+
+
+def _away_from_plane(places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) shift of places off the origin, across the plane that fits them best, as far as they spread."""
+    _, spread, axes = np.linalg.svd(places - places.mean(axis=0), full_matrices=True)
+    return np.asarray(spread[0] * axes[2] - places.mean(axis=0))
 
 
 def _distances(fit: _Fit, source: NDArray[np.float64], target: NDArray[np.float64]) -> NDArray[np.float64]:
