@@ -1,11 +1,14 @@
 """Measure a surface model and an orthophoto against exact depth maps, and against LiDAR.
 
-    python scripts/measure_surface.py SURFACE MODEL DEPTH [--depth-scale 0.005] [--lidar CLOUD] [--demo]
+    python scripts/measure_surface.py SURFACE MODEL DEPTH [--depth-scale 0.005] [--demo]
+                                      [--lidar CLOUD [--cloud CLOUD]]
 
 SURFACE is what `colmap_sph surface` has made in the model's own frame, MODEL its sparse model, DEPTH a folder with
 exact depth at pixel centres. The truth of a cell is the highest exact point in its middle half each way, from all
 images together: it has nothing from our own maps. With --demo, for the block of `colmap_sph demo`, colours are
-also compared with a picture that the demo's renderer takes of the same village from straight above.
+also compared with a picture that the demo's renderer takes of the same village from straight above. --cloud
+measures a fused cloud against the LiDAR as the surface is: by height, its highest point in a cell against the
+LiDAR's points there, and in space, from each point, or cell, to the nearest of the LiDAR's.
 """
 
 import argparse
@@ -17,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import rasterio
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from colmap_sph.evaluation import read_geometry
 from colmap_sph.evaluation.depth_files import read_exact_depth
@@ -45,13 +49,13 @@ class Cells:
     top: float
     cell: float
 
-    def of(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Flat indices of (n, 3) points' cells, and which points lie in the middle half of one."""
+    def of(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+        """Flat indices of (n, 3) points' cells, which points lie in one, and which in the middle half of one."""
         places = np.stack([points[:, 0] - self.left, self.top - points[:, 1]], axis=1) / self.cell
         numbers = np.floor(places).astype(np.int64)
-        inside = ((numbers >= 0) & (numbers < self.shape[::-1])).all(axis=1)
+        inside = np.asarray(((numbers >= 0) & (numbers < self.shape[::-1])).all(axis=1))
         middle = np.asarray(inside & (np.abs(places - numbers - 0.5) < 0.25).all(axis=1))
-        return np.where(inside, numbers[:, 1] * self.shape[1] + numbers[:, 0], 0), middle
+        return np.where(inside, numbers[:, 1] * self.shape[1] + numbers[:, 0], 0), inside, middle
 
     def points(self, heights: Array) -> Array:
         """(n, 3) centres of all cells, at these heights."""
@@ -115,6 +119,33 @@ def report_colours(cells: Cells, colours: Array, has_colour: NDArray[np.bool_]) 
           f"a shift by one cell {np.median(shifted):.1f}, {(shifted <= 20).mean():.4f}")  # fmt: skip
 
 
+def points_of(path: Path) -> Array:
+    """(n, 3) points of a cloud, or corners of a mesh."""
+    found = read_geometry(path)
+    return np.asarray(found.points if isinstance(found, PointCloud) else found.vertices, np.float64)
+
+
+def highest(cells: Cells, points: Array) -> Array:
+    """(h, w) height of the highest point in each cell, NaN for none."""
+    index, inside, _ = cells.of(points)
+    top = np.full(math.prod(cells.shape), -np.inf)
+    np.maximum.at(top, index[inside], points[inside, 2])
+    return np.where(np.isfinite(top), top, np.nan).reshape(cells.shape)
+
+
+def report_against_lidar(name: str, cells: Cells, height: Array, points: Array, lidar: Array) -> None:
+    """Print how far heights of cells, and points in the LiDAR's extent, are off the LiDAR's points."""
+    index, _, middle = cells.of(lidar)
+    middle &= np.isfinite(height.ravel()[index])
+    report_heights(name, height.ravel()[index[middle]] - lidar[middle, 2], cells.cell)
+    inside = (points[:, :2] >= lidar[:, :2].min(axis=0)) & (points[:, :2] <= lidar[:, :2].max(axis=0))
+    points = points[inside.all(axis=1) & np.isfinite(points[:, 2])]
+    distance, _ = cKDTree(lidar).query(points)
+    print(
+        f"{name}, in space: {len(points):,}, mean distance {distance.mean():.4f}, median {np.median(distance):.4f}"
+    )
+
+
 def main() -> None:
     """Read, measure, print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -123,6 +154,7 @@ def main() -> None:
     parser.add_argument("depth", type=Path)
     parser.add_argument("--depth-scale", type=float)
     parser.add_argument("--lidar", type=Path)
+    parser.add_argument("--cloud", type=Path)
     parser.add_argument("--demo", action="store_true")
     given = parser.parse_args()
     with rasterio.open(given.surface / "dsm.tif") as file:
@@ -144,7 +176,7 @@ def main() -> None:
     truth = np.full(height.size, -np.inf)
     for view in views:
         points = exact_points(view, truths[view.name])
-        index, middle = cells.of(points)
+        index, _, middle = cells.of(points)
         np.maximum.at(truth, index[middle], points[middle, 2])
     known = np.isfinite(truth)
     tops = cells.points(truth)
@@ -169,11 +201,12 @@ def main() -> None:
             *colours, alpha = file.read()
         report_colours(cells, np.dstack(colours).astype(np.float64), alpha > 0)
     if given.lidar is not None:
-        cloud = read_geometry(given.lidar)
-        points = cloud.points if isinstance(cloud, PointCloud) else cloud.vertices
-        index, middle = cells.of(points)
-        middle &= height.ravel()[index] > -9999
-        report_heights("LiDAR", height.ravel()[index[middle]] - points[middle, 2], cells.cell)
+        lidar = points_of(given.lidar)
+        height[height <= -9999] = np.nan
+        report_against_lidar("LiDAR", cells, height, cells.points(height), lidar)
+        if given.cloud is not None:
+            cloud = points_of(given.cloud)
+            report_against_lidar("cloud against LiDAR", cells, highest(cells, cloud), cloud, lidar)
 
 
 if __name__ == "__main__":
