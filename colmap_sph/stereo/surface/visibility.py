@@ -89,8 +89,8 @@ def sight_of(
     cells, x, y, z = cells[is_open], x[is_open], y[is_open], z[is_open]
     worth = _pixels_per_cell(view, raster, x, y, z) * towards_border(x, y, view, full_view)
 
-    def placed(values: NDArray[Any], kind: type) -> NDArray[Any]:
-        whole = np.zeros(height.size, kind)
+    def placed(values: NDArray[Any] | bool, kind: type) -> NDArray[Any]:
+        whole: NDArray[Any] = np.zeros(height.size, kind)
         whole[cells] = values
         return whole.reshape(height.shape)
 
@@ -196,7 +196,7 @@ def smoothed_worth(
     """
     smooth = np.full(worth.shape, -1, np.float32)
     # The filter looks so far around: two means, one of the other.
-    part = tuple(_reach(usable.any(axis=axis), 2 * radius + 1) for axis in (1, 0))
+    part = tuple(_reach(np.asarray(usable.any(axis=axis)), 2 * radius + 1) for axis in (1, 0))
     guide = np.nan_to_num(height[part], nan=0.0).astype(np.float32)
     ours = np.where(usable[part], worth[part], np.float32(0))
     found = cv2.ximgproc.guidedFilter(guide, ours, radius, float(tolerance) ** 2)
