@@ -9,12 +9,13 @@ import pytest
 import trimesh
 from surveyed import BLUE, BOX, GREEN, RED, ROOF, surveyed_workspace
 
+from colmap_sph.errors import OutputError
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.obj import write_obj
 from colmap_sph.products.mesh.options import MeshOptions
-from colmap_sph.products.mesh.texture.atlas import unfold
+from colmap_sph.products.mesh.texture.atlas import lay_out
 from colmap_sph.products.mesh.texture.choice import choose_views
 from colmap_sph.products.mesh.texture.neighbours import neighbours_of
 from colmap_sph.products.mesh.texture.textured import Sheet, textured
@@ -135,13 +136,13 @@ def test_pages_have_what_the_images_show(solids, sheets):
 def test_parts_of_images_do_not_overlap_on_pages(workspace, solids):
     _, seen = seen_views(workspace)
     chosen = choose_views(solids, workspace, seen, TOLERANCE, lambda: None)
-    charts, unfolded = unfold(solids, chosen, seen)
+    charts, on_pages = lay_out(solids, chosen, seen)
     taken = [np.zeros(size[::-1], int) for size in charts.sizes]
     for box, page, corner in zip(charts.box, charts.page, charts.corner, strict=True):
         width, height = box[2:] - box[:2]
         taken[page][corner[1] : corner[1] + height, corner[0] : corner[0] + width] += 1
     assert all(page.max() == 1 for page in taken)
-    assert sorted(unfolded.faces.tolist()) == np.flatnonzero(chosen >= 0).tolist()
+    assert sorted(on_pages.faces.tolist()) == np.flatnonzero(chosen >= 0).tolist()
 
 
 def test_other_programs_read_glb_and_obj_with_their_pictures(solids, sheets, tmp_path):
@@ -166,6 +167,16 @@ def test_other_programs_read_glb_and_obj_with_their_pictures(solids, sheets, tmp
         up = pictured.triangles_center[:, 2]  # not turned: that is the scene's part
         on_roof = up > up.max() - 1e-3
         assert (np.abs(colours[on_roof].astype(int) - RED).max(axis=1) < 60).mean() > 0.97
+
+
+def test_pictures_and_materials_of_others_are_not_replaced(workspace, tmp_path):
+    for number, name in enumerate(("mesh.mtl", "mesh_3.jpg")):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        (folder / name).write_bytes(b"mine")
+        options = MeshOptions("poisson", formats=("obj",), texture=True)
+        with pytest.raises(OutputError, match=f"{name} is there already"):
+            make_mesh(MeshRequest(workspace, Georeference(), options, folder, 8 << 30, 1), print, print)
 
 
 def test_the_command_makes_textures_of_a_mesh_on_the_map(workspace, tmp_path):

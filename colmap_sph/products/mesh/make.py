@@ -74,8 +74,7 @@ def make_mesh(
     options.check()
     if options.method == "tsdf":
         open3d()
-    names = [*(f"mesh.{each}" for each in options.formats), PREVIEW]
-    check_places(request.workspace, request.folder, names, overwrite=request.overwrite)
+    check_places(request.workspace, request.folder, _names(request), overwrite=request.overwrite)
     scene, seen = seen_views(request.workspace)
     gsd = float(np.median(np.concatenate([each.footprint for each in seen])))
     make_dir(request.folder)
@@ -96,6 +95,14 @@ def make_mesh(
             start("texture", len(seen))
             sheets = textured(mesh, request.workspace, scene, seen, _TOLERANCE * gsd, scratch, advance)
         return _written(request, mesh, sheets, scene, seen), len(mesh.faces)
+
+
+def _names(request: MeshRequest) -> list[str]:
+    """What may be written, or replaced."""
+    names = [*(f"mesh.{each}" for each in request.options.formats), PREVIEW]
+    if "obj" in request.options.formats:
+        names += ["mesh.mtl", *(path.name for path in request.folder.glob("mesh_*.jpg"))]
+    return names
 
 
 def _of_maps(

@@ -46,7 +46,7 @@ class Charts:
 
 
 @dataclass(frozen=True, eq=False)
-class Unfolded:
+class OnPages:
     """Where faces lie on pages.
 
     Attributes
@@ -63,7 +63,7 @@ class Unfolded:
     uv: NDArray[np.float32]
 
 
-def unfold(mesh: Triangles, chosen: NDArray[np.int32], seen: Sequence[SeenView]) -> tuple[Charts, Unfolded]:
+def lay_out(mesh: Triangles, chosen: NDArray[np.int32], seen: Sequence[SeenView]) -> tuple[Charts, OnPages]:
     """Cut the images and lay the parts onto pages.
 
     Parameters
@@ -76,7 +76,7 @@ def unfold(mesh: Triangles, chosen: NDArray[np.int32], seen: Sequence[SeenView])
     Returns
     -------
     charts : Charts
-    unfolded : Unfolded
+    on_pages : OnPages
     """
     faces = np.flatnonzero(chosen >= 0)
     faces = faces[np.argsort(chosen[faces], kind="stable")]
@@ -92,7 +92,7 @@ def unfold(mesh: Triangles, chosen: NDArray[np.int32], seen: Sequence[SeenView])
     sizes = np.array(charts.sizes, np.float64).reshape(-1, 2)
     shift = charts.corner - charts.box[:, :2]
     uv = (pixels + shift[number][:, None]) / sizes[charts.page[number]][:, None]
-    return charts, Unfolded(faces, charts.page[number], uv.astype(np.float32))
+    return charts, OnPages(faces, charts.page[number], uv.astype(np.float32))
 
 
 def _pixels(

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.products.mesh.texture.atlas import drawn_pages, unfold
+from colmap_sph.products.mesh.texture.atlas import drawn_pages, lay_out
 from colmap_sph.products.mesh.texture.choice import choose_views
 from colmap_sph.products.mesh.triangles import Triangles
 from colmap_sph.products.surface.pictures import pictures_of
@@ -83,13 +83,13 @@ def textured(
     chosen = choose_views(mesh, workspace, seen, tolerance, advance)
     sheets = []
     if (chosen >= 0).any():
-        charts, unfolded = unfold(mesh, chosen, seen)
+        charts, on_pages = lay_out(mesh, chosen, seen)
         pictures = pictures_of(workspace, scene, seen, balance=True, memory=0)
         for number, page in enumerate(drawn_pages(charts, pictures.of)):
             path = folder / f"page-{number}.jpg"
             _write_jpeg(path, page)
-            of_page = unfolded.page == number
-            sheets.append(_sheet(mesh, unfolded.faces[of_page], unfolded.uv[of_page], path))
+            of_page = on_pages.page == number
+            sheets.append(_sheet(mesh, on_pages.faces[of_page], on_pages.uv[of_page], path))
     unseen = np.flatnonzero(chosen < 0)
     if len(unseen):
         used, renumbered = np.unique(mesh.faces[unseen], return_inverse=True)
