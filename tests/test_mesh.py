@@ -208,12 +208,13 @@ def test_poissons_mesh_of_a_sphere_is_a_sphere(cloudy, tmp_path):
     assert (tmp_path / "mesh.glb").exists()
 
 
-def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path):
+def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path, capfd):
     full = made(cloudy, tmp_path / "full", method="poisson", voxel=0.7, trim=0.0)
     few = made(cloudy, tmp_path / "few", method="poisson", voxel=0.7, trim=0.0, simplify=0.2, formats=("ply",))
     assert len(few.faces) == pytest.approx(0.2 * len(full.faces), rel=0.1)
     assert few.volume == pytest.approx(full.volume, rel=0.01)
     assert not (tmp_path / "few" / "mesh.glb").exists()
+    assert not capfd.readouterr().err  # of COLMAP's
     above = np.asarray(few.visual.vertex_colors)[few.vertices[:, 2] > 9][:, :3].astype(int)
     assert np.abs(above - RED).max() <= 3
 

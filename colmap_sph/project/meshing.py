@@ -5,6 +5,7 @@ from pathlib import Path
 import pycolmap
 
 from colmap_sph.errors import NoResultError, reason_of
+from colmap_sph.project.colmap_library import quiet_colmap
 
 
 def poisson_mesh(cloud: Path, mesh: Path, *, depth: int, trim: float, threads: int) -> None:
@@ -29,7 +30,8 @@ def poisson_mesh(cloud: Path, mesh: Path, *, depth: int, trim: float, threads: i
     options.trim = trim
     options.num_threads = threads
     try:
-        pycolmap.poisson_meshing(cloud, mesh, options)
+        with quiet_colmap():
+            pycolmap.poisson_meshing(cloud, mesh, options)
     except (RuntimeError, ValueError) as error:
         raise NoResultError(f"{cloud} cannot be meshed ({reason_of(error)}); try --method tsdf.") from error
     if not mesh.exists():
@@ -42,7 +44,8 @@ def simplify(source: Path, target: Path, *, ratio: float, threads: int) -> None:
     options.target_face_ratio = ratio
     options.num_threads = threads
     try:
-        pycolmap.simplify_mesh(source, target, options)
+        with quiet_colmap():
+            pycolmap.simplify_mesh(source, target, options)
     except (RuntimeError, ValueError) as error:
         raise NoResultError(
             f"The mesh cannot be simplified ({reason_of(error)}); leave out --simplify."
