@@ -467,6 +467,7 @@ def test_a_run_matches_photographs_once(courtyard):
     assert len(report.coverage) == 18
     assert np.mean([*report.coverage.values()]) > 0.3  # much of them is sky
     assert report.overall_agreement > 0.85
+    assert report.detail == 1.3  # so small they are taken for sharp, and as cut views for more than that
     files = sorted(path.name for path in (root / "dense" / "colmap_sph" / "pairs").rglob("*-*"))
     assert len(files) == 6  # both ways
     again = run(root / "sparse" / "0", output=root / "dense")
