@@ -120,6 +120,11 @@ def test_partners_are_photographs():
     assert len(select_pairs(scene, PairOptions(num_pairs=3)).unique_pairs()) == 6
 
 
+def test_one_panorama_alone_is_told():
+    with pytest.raises(NoResultError, match=r"one image only, p0; depth needs others"):
+        select_pairs(panoramas((0, 0, 0)), PairOptions())
+
+
 def test_shared_points_of_all_views_together_count():
     """Twelve points, two before each view of a panorama: no two views share more than these few."""
     points = 10 * np.concatenate([np.eye(3), -np.eye(3), np.eye(3) + 0.03, -np.eye(3) - 0.03])
@@ -462,6 +467,7 @@ def test_a_run_matches_photographs_once(courtyard):
     assert len(report.coverage) == 18
     assert np.mean([*report.coverage.values()]) > 0.3  # much of them is sky
     assert report.overall_agreement > 0.85
+    assert report.detail == 1.3  # so small they are taken for sharp, and as cut views for more than that
     files = sorted(path.name for path in (root / "dense" / "colmap_sph" / "pairs").rglob("*-*"))
     assert len(files) == 6  # both ways
     again = run(root / "sparse" / "0", output=root / "dense")

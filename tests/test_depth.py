@@ -624,6 +624,31 @@ def test_a_view_takes_depth_from_pairs_in_which_it_is_left_or_right():
     np.testing.assert_array_equal(stricter.depth > 0, found & (result.support == 2))
 
 
+@pytest.mark.parametrize(("disparity", "pairs", "is_known"), [(2, 1, False), (2, 2, True), (3, 1, True)])
+def test_depths_are_known_to_a_tenth_or_not_at_all(disparity, pairs, is_known):
+    # A standard deviation of .25 pixels, of d pixels, is a share of 1 / 4 d; by n pairs that over √n.
+    K = np.array([[100.0, 0, 32], [0, 100, 24], [0, 0, 1]])
+    view = View(1, "a", 64, 48, K, np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    geometry = RectifiedPair(
+        surface="frame",
+        rectified_from_world=np.eye(3),
+        baseline=1.0,
+        columns_per_radian=100.0,
+        rows_per_radian=100.0,
+        row_origin=-24.0,
+        left_origin=-32.0,
+        right_origin=-32.0,
+        height=48,
+        left_width=64,
+        right_width=64,
+        min_disparity=0.0,
+        max_disparity=20.0,
+    )
+    pair = PairDisparity("a", "b", geometry, np.full((48, 64), disparity, np.float32))
+    depth = vote_depth(view, [pair] * pairs, VoteOptions()).depth[8:40, 8:56]
+    np.testing.assert_allclose(depth, 100 / disparity if is_known else 0)
+
+
 def test_a_view_without_pairs_has_no_depth():
     view = wall_views(1)[0][0]
     result = vote_depth(view, [], VOTE)

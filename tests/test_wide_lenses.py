@@ -322,6 +322,23 @@ def test_observations_beyond_the_lens_are_refused() -> None:
 
 
 @pytest.mark.parametrize(
+    "params", [(240.0, 1.0), (100.0, 120.0), (120.0, 240.0), (math.inf, 120.0), (240.0, -1.0)]
+)
+def test_spheres_smaller_than_their_images_are_refused(params: tuple[float, ...]) -> None:
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=240, height=120, params=params)
+    with pytest.raises(InputError, match=r"Camera 1.* in here .*"):
+        wide_lenses(model_of(camera, np.empty((0, 2))), "here")
+
+
+@pytest.mark.parametrize(
+    ("size", "params"), [((240, 80), (240.0, 80.0)), ((240, 60), (240.0, 120.0)), ((240, 120), (239.6, 119.8))]
+)
+def test_spheres_of_any_shape_are_panoramas(size: tuple[int, int], params: tuple[float, ...]) -> None:
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=size[0], height=size[1], params=params)
+    assert set(wide_lenses(model_of(camera, np.empty((0, 2))), "here")) == {1}
+
+
+@pytest.mark.parametrize(
     "params", [(130.0, 130.0, 240.0, 240.0, *([math.nan] * 4)), (-1.0, -1.0, 240.0, 240.0, 0.0, 0.0, 0.0, 0.0)]
 )
 def test_no_lens_is_refused(params: tuple[float, ...]) -> None:

@@ -320,6 +320,22 @@ def test_a_damaged_image_is_left_out_by_its_own_name(project: Path, capsys: pyte
     assert "Traceback" not in capsys.readouterr().err
 
 
+def test_an_image_without_any_depth_is_told_by_its_own_name(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cv2.imwrite(str(project / "images" / "C_0_00.png"), np.full((120, 120, 3), 90, np.uint8))
+    cli.main(["run", "--model", str(model_in(project)), "--threads", "1"])
+    report = json.loads((project / "dense" / "colmap_sph" / "report.json").read_text())
+    views = report["views"]["C_0_00.png"]
+    assert sorted(views) == [f"{face}/C_0_00.png" for face in ("down", "left", "right", "up")]
+    assert set(views) <= set(report["skipped_images"])
+    assert report["originals"]["C_0_00.png"] == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "image skipped" in line]
+    assert [line.split(": ")[1] for line in told if line.split(": ")[1].endswith("C_0_00.png")] == ["C_0_00.png"]
+    page = (project / "dense" / "colmap_sph" / "report.html").read_text()
+    assert "<li>C_0_00.png: " in page.replace("<b>", "").replace("</b>", "")
+
+
 @pytest.mark.parametrize(
     "text", ["", "{}", '{"version": 9}', '{"version":1,"lenses":[],"faces":[],"views":{"a":{}}}']
 )

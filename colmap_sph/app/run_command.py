@@ -33,6 +33,7 @@ from colmap_sph.pipeline.reconstruct import check_input, run_project
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.shards.part import StageName
 from colmap_sph.project.project import Project
+from colmap_sph.project.wide.naming import by_originals
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -289,10 +290,11 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
             ("look at", f"{workspace.page_path}, in a browser: colmap_sph view {shell_word(str(workspace.root))}")
         )
     terminal.facts(facts)
-    for what, skipped in (("image", report.skipped_images), ("pair", report.skipped_pairs)):
+    images = by_originals(report.skipped_images, report.views)
+    for what, skipped in (("image", images), ("pair", report.skipped_pairs)):
         for name, reason in skipped.items():
             terminal.say(f"{name}: {reason}", label=f"{what} skipped:", style="yellow")
-    for name, reason in report.incomplete.items():
+    for name, reason in by_originals(report.incomplete, report.views).items():
         terminal.say(f"{name}: {reason}", label="incomplete:", style="yellow")
     if report.imprecision:
         terminal.say(report.imprecision, label="imprecise:", style="yellow")

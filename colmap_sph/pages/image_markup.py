@@ -11,6 +11,7 @@ from colmap_sph.pages.pictures import colour_of
 from colmap_sph.pages.reasons import WORDS, Reason
 from colmap_sph.pages.run_facts import RunFacts
 from colmap_sph.pages.words import cell, number, percent, plain
+from colmap_sph.project.wide.naming import by_originals
 from colmap_sph.scene import Photograph
 
 MOST_LINES = 100
@@ -36,9 +37,9 @@ def image_values(content: Content, run: RunFacts) -> dict[str, Any]:
         for place in (pair.left, pair.right):
             partners[place].append(pair)
     left_out = [
-        *run.skipped_images.items(),
-        *((name, f"incomplete: {why}") for name, why in run.incomplete.items()),
-        *run.out_of_region.items(),
+        *by_originals(run.skipped_images, run.views).items(),
+        *((name, f"incomplete: {why}") for name, why in by_originals(run.incomplete, run.views).items()),
+        *by_originals(run.out_of_region, run.views).items(),
     ]
     shown = sum(bool(image.pictures) for image in content.images)
     words = ""

@@ -65,6 +65,7 @@ class RunFacts(msgspec.Struct, frozen=True):
     out_of_region: dict[str, str] = {}
     coverage: dict[str, Share] = {}
     originals: dict[str, Share] = {}
+    views: dict[str, list[str]] = {}
     agreement: dict[str, Share | None] = {}
     overall_agreement: Share | None = None
     doubts: str = ""

@@ -125,6 +125,8 @@ class RunReport:
         those that show the region, where one is asked for.
     originals : dict
         Fisheye image or panorama → share of what its lens shows that has a range; empty without any.
+    views : dict
+        Fisheye image or panorama → names of the views that were cut from it, by which it is called elsewhere.
     agreement : dict
         Image name → share of the sparse points it observes that agree with its geometric depth map; None where
         fewer than ten tell.
@@ -177,6 +179,7 @@ class RunReport:
     out_of_region: dict[str, str] = field(default_factory=dict)
     coverage: dict[str, float] = field(default_factory=dict)
     originals: dict[str, float] = field(default_factory=dict)
+    views: dict[str, list[str]] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None
     sparse_points: Agreement = field(default_factory=Agreement)

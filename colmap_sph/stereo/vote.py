@@ -25,6 +25,9 @@ _LEAST_SOFTNESS = 0.8
 _MOST_SOFTNESS = 2.0
 # A pair whose rows disagree by more rectified pixels is wrong rather than imprecise, and agrees with nothing more.
 _MOST_RESIDUAL = 1.0
+# Depths are known to a tenth at least: those that are not lie nearly at infinity, as skies and glare do, which
+# match anywhere near the far end of what is searched.
+_LEAST_PRECISION = 10.0
 # Candidates of all pairs are voted on in bands of rows of about this size.
 _BAND_BYTES = 8 << 20
 
@@ -213,5 +216,6 @@ def vote_depth(
             voted.sigma[rows],
             voted.support[rows],
         )
+        voted.depth[rows][voted.depth[rows] < _LEAST_PRECISION * voted.sigma[rows]] = 0
     voted.depth[voted.support < options.min_support] = 0
     return voted

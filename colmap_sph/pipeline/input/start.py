@@ -21,6 +21,7 @@ from colmap_sph.project.polishing.polished import starting_model
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import damaged_files, named, results_of, take_places
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairs import PairSelection
 
@@ -66,6 +67,7 @@ def start(
     scene = read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir)
     # Images that this program undistorted are no larger.
     scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
+    report.views = _views_of_photographs(scene)
     context = Context(workspace, scene, options, Keys(workspace, options), progress, report).in_region()
     _report_missing(context, expected)
     context = with_good_images(context, executor, verify=verify)
@@ -83,6 +85,15 @@ def start(
         progress.foresee(foreseen_stages(context, pairs, (MatchToPolishStage(context, pairs),)))
         context = with_polished_poses(context, pairs, executor, given)
     return context, selection
+
+
+def _views_of_photographs(scene: Scene) -> dict[str, list[str]]:
+    """Names of the views that were cut from each photograph, of those that were cut."""
+    return {
+        photograph.name: [view.name for view in photograph.views]
+        for photograph in scene.photographs
+        if photograph.lead.original
+    }
 
 
 def _report_missing(context: Context, expected: Collection[str]) -> None:

@@ -339,11 +339,13 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
 
     def skip(self, item: Pair, reason: str) -> None:
         """See `Stage.skip`."""
-        self.context.report.skipped_pairs[" - ".join(item)] = reason
-        self.context.progress.leave_out("pair", " - ".join(item), reason)
-        logger.warning("%s - %s skipped: %s", *item, reason)
+        names = [self.context.scene.view(name).photograph for name in item]
+        pair = " - ".join(names)
+        self.context.report.skipped_pairs[pair] = reason
+        self.context.progress.leave_out("pair", pair, reason)
+        logger.warning("%s skipped: %s", pair, reason)
         if item not in self._unfit:  # for a reason that may pass
-            for name in item:
+            for name in names:
                 self.context.leave_incomplete(name, f"a pair of it was not matched: {reason}")
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:

@@ -18,6 +18,8 @@ logger = logging.getLogger(__name__)
 _BEYOND = np.radians(2.0)
 # Share of its observations that may lie beyond a lens: mistakes; more say that it is not this lens.
 _MOST_BEYOND = 0.01
+# A sphere may have so much of the size of its images: sizes are rounded.
+_ROUNDED = 0.99
 _HALF = 0.5
 
 
@@ -60,6 +62,12 @@ def _panorama(camera: pycolmap.Camera, name: str) -> Lens:
     width, height = camera.params
     if not (np.isfinite([width, height]).all() and min(width, height) >= 1):
         raise InputError(f"Camera {camera.camera_id} in {name} has impossible parameters; export the model again.")
+    if width < _ROUNDED * camera.width or height < _ROUNDED * camera.height:
+        raise InputError(
+            f"Camera {camera.camera_id} ({PANORAMA}) in {name} describes a whole sphere of {width:g} x {height:g} "
+            f"pixels, less than its images have ({camera.width} x {camera.height}); its parameters are the width "
+            "and height of whole panoramas."
+        )
     return _lens(camera)
 
 

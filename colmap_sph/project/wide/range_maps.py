@@ -69,40 +69,54 @@ def range_and_normals(lens: Lens, views: Sequence[ViewMaps]) -> tuple[Pixels, Pi
     found = np.zeros((lens.height, lens.width), np.float32)
     normals = np.zeros((lens.height, lens.width, 3), np.float32)
     for rows in _bands(lens):
-        rays = _rays(lens)[rows].reshape(-1, 3).astype(np.float64)
-        distance, normal = np.zeros(len(rays)), np.zeros((len(rays), 3))
-        nearest = np.full(len(rays), -np.inf)
+        rays = np.ascontiguousarray(_rays(lens)[rows].reshape(-1, 3).T, np.float64)
+        distance = found[rows].reshape(-1)
+        normal = normals[rows].reshape(-1, 3)
+        nearest = np.zeros(rays.shape[1])
         for view in views:
-            local = rays @ view.R.T
-            seen = np.flatnonzero((local[:, 2] > nearest) & (local[:, 2] > 0))
-            here, normal_here = _looked_up(view, local[seen])
-            has_depth = here > 0
-            chosen = seen[has_depth]
-            distance[chosen] = here[has_depth]
-            normal[chosen] = normal_here[has_depth] @ view.R
-            nearest[chosen] = local[chosen, 2]
-        found[rows] = distance.reshape(-1, lens.width)
-        normals[rows] = normal.reshape(-1, lens.width, 3)
+            cosine = _along(view.R[2], rays)
+            nearer = np.flatnonzero(cosine > nearest)
+            seen, here, normal_here = _looked_up(view, rays, nearer)
+            distance[seen] = here
+            normal[seen] = normal_here @ view.R
+            nearest[seen] = cosine[seen]
     return found, normals
 
 
-def _looked_up(view: ViewMaps, rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distances (n,) along unit rays in the view's frame with z > 0, 0 where there is none, and normals (n, 3)."""
+def _along(row: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Products (n,) of a vector with (3, n) rays; for three numbers each this is quicker than BLAS."""
+    return np.asarray(row[0] * rays[0] + row[1] * rays[1] + row[2] * rays[2])
+
+
+def _looked_up(
+    view: ViewMaps, rays: NDArray[np.float64], which: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """What a view knows along `which` of (3, n) unit rays before it, in the frame of the image's camera.
+
+    Returns the numbers (m,) of those along which it has a depth, the distances (m,) there, and normals (m, 3) in
+    the view's frame.
+    """
     height, width = view.depth.shape
-    places = (rays @ view.K.T)[:, :2] / rays[:, 2:]
+    before = rays[:, which]
+    local = [_along(row, before) for row in view.R]
+    (fx, skew, cx), (_, fy, cy), _ = view.K
     # A value belongs to the ray through (column, row), see COLMAP's fusion.
-    column, row = np.rint(np.clip(places, -1, 1 << 24)).astype(np.int64).T
-    inside = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    column, row = column * inside, row * inside
-    depth = view.depth[row, column].astype(np.float64) * inside
-    normals = view.normals[row, column].astype(np.float64)
-    own = np.column_stack([column, row, np.ones(len(rays))]) @ np.linalg.inv(view.K).T
-    towards = np.einsum("ni,ni->n", normals, rays)
+    column = np.rint((fx * local[0] + skew * local[1]) / local[2] + cx)
+    row = np.rint(fy * local[1] / local[2] + cy)
+    inside = np.flatnonzero((column >= 0) & (row >= 0) & (column < width) & (row < height))
+    columns, rows = column[inside].astype(np.int64), row[inside].astype(np.int64)
+    depth = view.depth[rows, columns].astype(np.float64)
+    known = np.flatnonzero(depth > 0)
+    inside, columns, rows, depth = inside[known], columns[known], rows[known], depth[known]
+    x, y, z = (part[inside] for part in local)
+    normals = view.normals[rows, columns].astype(np.float64)
+    own = np.column_stack([columns, rows, np.ones(len(known))]) @ np.linalg.inv(view.K).T
+    towards = normals[:, 0] * x + normals[:, 1] * y + normals[:, 2] * z
     with np.errstate(divide="ignore", invalid="ignore"):
         plane = depth * np.einsum("ni,ni->n", normals, own) / towards
-        distance = depth / rays[:, 2]
+        distance = depth / z
         is_plane = (towards < -_GRAZING) & (np.abs(plane / distance - 1) < _MOST_CHANGE)
-    return np.where(is_plane, plane, distance), normals
+    return which[inside], np.where(is_plane, plane, distance), normals
 
 
 def pixels_shown(lens: Lens) -> int:

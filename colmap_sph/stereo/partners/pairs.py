@@ -160,6 +160,11 @@ def select_pairs(
     [('a', 'b'), ('b', 'c')]
     """
     options.check()
+    if len(scene.photographs) == 1:
+        raise NoResultError(
+            f"No pair of images overlaps, as there is one image only, {scene.photographs[0].name}; depth needs "
+            "others that see the same from elsewhere."
+        )
     graph = find_covisibility(scene, options.min_shared_points, matches)
     if explicit is None:
         photographs = enumerate(graph.photographs)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
 # Of a pixel of the wide image, and of its views: processor seconds, bytes in use; bytes on disk.
-_SECONDS = 1.5e-6
+_SECONDS = 2e-7
 _BYTES = 60.0
 _VIEW_BYTES = 32.0
 _BAND_BYTES = 150e6
