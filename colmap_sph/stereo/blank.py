@@ -8,6 +8,7 @@ texture of surfaces is as strong or stronger. So a place is blank where at no sc
 the image's own noise would.
 """
 
+import math
 from collections.abc import Iterator
 
 import cv2
@@ -28,16 +29,21 @@ _SIDE = 7
 # Images with a shorter side than this hold no window of the coarsest scale that could be trusted.
 _LEAST_SIDE = 128
 # Noise is measured at half size, where JPEG has spared it, as what varies least: this percentile of windows, at
-# least what the rounding of JPEG may leave, at most what cameras make.
+# least what the rounding of JPEG may leave, at most what cameras make in good light.
 _NOISE_LEVEL = 1
 _QUIETEST = 5
 _LEAST_NOISE = 0.5
-_MOST_NOISE = 1.5
+_USUAL_NOISE = 1.5
+# In poor light they make more, up to this. That is no texture where it falls from full to half size by as much as
+# this: noise of single pixels falls to .5, texture stays at about 1.
+_MOST_NOISE = 5.0
+_FALL_OF_NOISE = 0.7
 # Local noise is the least of so many by so many pixels of the coarsest scale: some of them may hold an edge.
 _LOCAL_SIDE = 5
-# Pixels with so little or so much light are left out of that: their noise is cut off.
+# Windows with more than a few pixels of so little or so much light are left out of that: their noise is cut off.
 _LEAST_GREY = 5
 _MOST_GREY = 250
+_CUT_SHARE = 0.05
 # What noise may reach in a window, in that of the quietest ones. It falls by half from scale to scale, after the
 # rounding of JPEG a little less.
 _MARGIN = 1.4
@@ -147,6 +153,18 @@ def _variance(image: Float) -> Float:
     return largest
 
 
+def _variances(image: Float, step: int = 1) -> Float:
+    """`_variance` of every pixel, or of one in `step` x `step`, of which bands of rows hold a whole number."""
+    bands = [_variance(image[wide])[inner][::step, ::step] for _, wide, inner in _bands(image.shape[0], _SIDE)]
+    return np.concatenate(bands)
+
+
+def _cut_off(image: Float) -> Float:
+    """At half the size, the share of the window around each pixel with noise that is cut off at black or white."""
+    cut = (image[::2, ::2] <= _LEAST_GREY) | (image[::2, ::2] >= _MOST_GREY)
+    return np.asarray(cv2.blur(cut.astype(np.float32), (_SIDE, _SIDE)), dtype=np.float32)
+
+
 def _noise(scales: list[Float]) -> tuple[float, Float]:
     """Standard deviation of pixels, grey values, at the scale where noise is measured.
 
@@ -159,13 +177,15 @@ def _noise(scales: list[Float]) -> tuple[float, Float]:
         alone; 0 where it is much more, so that there is texture, too fine for the coarsest scale.
     """
     image = scales[_NOISE_LEVEL]
-    variance = np.empty_like(image)
-    for band, wide, inner in _bands(image.shape[0], _SIDE):
-        variance[band] = _variance(image[wide])[inner]
+    variance = _variances(image)
     some = (slice(_SIDE // 2, None, _SIDE),) * 2
-    lit = (image[some] > _LEAST_GREY) & (image[some] < _MOST_GREY)
+    lit = _cut_off(scales[0])[some] <= _CUT_SHARE
     quietest = float(np.percentile(variance[some][lit], _QUIETEST)) if lit.any() else 0.0
-    noise = float(np.clip(np.sqrt(quietest), _LEAST_NOISE, _MOST_NOISE))
+    noise = max(math.sqrt(quietest), _LEAST_NOISE)
+    if noise > _USUAL_NOISE:
+        there = lit & (variance[some] <= quietest)
+        full = math.sqrt(np.median(_variances(scales[0], 2)[some][there]))
+        noise = min(noise, max(_FALL_OF_NOISE * full, _USUAL_NOISE), _MOST_NOISE)
     mean = cv2.resize(variance, scales[-1].shape[::-1], interpolation=cv2.INTER_AREA)
     local = np.clip(np.sqrt(cv2.erode(mean, np.ones((_LOCAL_SIDE, _LOCAL_SIDE), np.uint8))), _LEAST_NOISE, noise)
     local[cv2.blur(mean, (_SIDE, _SIDE)) > (_MARGIN * noise) ** 2] = 0
