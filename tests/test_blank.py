@@ -13,7 +13,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.images.jpeg import rounding_step
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.blank import blank_pixels
+from colmap_sph.stereo.blank import blank_pixels, drop_scattered, faint_pixels
 from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.matching import MatchingOptions, match_pair
 
@@ -161,6 +161,39 @@ def test_noise_of_any_strength_is_blank_and_fine_texture_is_not():
     assert not blank_pixels(gravel.astype(np.float32)).any()
     soft = 120 + 20 * cv2.GaussianBlur(gravel - 120, (0, 0), 1.2) / 20  # weaker, as through a lens
     assert not blank_pixels(soft.astype(np.float32)).any()
+
+
+# ---- faint places ------------------------------------------------------------------------------------------
+
+
+def clouds_over_a_field(rng):
+    """(400, 600) picture: clouds with nothing finer than 100 pixels in its upper half, below them a texture."""
+    clouds = cv2.GaussianBlur(rng.standard_normal((400, 600)), (0, 0), 25)
+    field = cv2.GaussianBlur(rng.standard_normal((400, 600)), (0, 0), 3)
+    picture = 150 + 15 * clouds / clouds.std()
+    picture[200:] += 8 * (field / field.std())[200:]
+    return (picture + rng.standard_normal(picture.shape)).astype(np.float32)
+
+
+def test_clouds_are_faint_and_not_blank():
+    picture = clouds_over_a_field(np.random.default_rng(0))
+    assert not blank_pixels(picture)[:190].any()
+    assert faint_pixels(picture)[:190].mean() > 0.8
+    assert not faint_pixels(picture)[210:].any()
+
+
+def test_a_faint_place_keeps_its_depths_where_they_are_many():
+    rng = np.random.default_rng(0)
+    faint = np.zeros((600, 500), np.uint8)
+    faint[:, 100:] = 1
+    seam = np.zeros(faint.shape, np.float32)
+    seam[:, :112] = 5
+    whole = np.where(rng.random(faint.shape) < 0.8, np.float32(5), np.float32(0))
+    wall = np.where(np.arange(500) < 300, whole, 0)
+    for depth, kept in ((seam, faint == 0), (whole, True), (wall, True)):
+        found = depth.copy()
+        drop_scattered(found, faint)
+        np.testing.assert_array_equal(found, np.where(kept, depth, 0))
 
 
 # ---- what comes of it --------------------------------------------------------------------------------------

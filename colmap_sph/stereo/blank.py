@@ -1,11 +1,12 @@
-"""Which pixels of an image say nothing: clear sky, blown-out or evenly painted walls.
+"""Which pixels of an image say nothing or little: clear or cloudy sky, blown-out or evenly painted walls.
 
 What two images show of such a place is noise, or a shade that changes so slowly that it fits everywhere. What is
 matched there is made up, mostly by what stands beside it, and neighbouring images make up the same.
 
 Noise and texture differ by their scale: in an image of half the size noise is about half as strong, while the
 texture of surfaces is as strong or stronger. So a place is blank where at no scale anything varies by more than
-the image's own noise would.
+the image's own noise would. Where something varies at the coarsest scale only, as in clouds, pixels are *faint*:
+they are matched, as many walls are no different, but a depth here and there in such a place counts for nothing.
 """
 
 import math
@@ -62,6 +63,10 @@ _ALIKE = 4.0
 _EDGE_SHARE = 0.33
 # Within so many pixels around a pixel is what stands before it.
 _CONTRAST_REACH = 2
+# Of the faint pixels within so many pixels around a depth at least this share must have one: what stands before
+# faint places spreads into them by some pixels.
+_PLACE = 64
+_LEAST_FOUND = 0.3
 # Rows that are worked on at a time, to bound the memory.
 _BAND_ROWS = 256
 
@@ -93,21 +98,69 @@ def blank_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
     >>> float(blank[:96].mean()), float(blank[104:].mean())
     (1.0, 0.0)
     """
+    levels = _LEVELS + (min(image.shape) >= _FOUR_LEVELS_SIDE)
+    return _silent_pixels(image, jpeg_step, levels, is_local=True)
+
+
+def faint_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
+    """Find the pixels that show no more than noise at three scales: they hold no texture finer than 28 pixels.
+
+    Blank pixels are among them. Others may be walls that are matched rightly, by what they show more coarsely.
+
+    Parameters
+    ----------
+    image, jpeg_step
+        As for `blank_pixels`.
+
+    Returns
+    -------
+    (H, W) uint8 ndarray
+        1 where a pixel is faint, else 0.
+    """
+    return _silent_pixels(image, jpeg_step, _LEVELS, is_local=False)
+
+
+def drop_scattered(depth: Float, faint: Mask) -> None:
+    """Set depths to 0, in place, that stand for too little of a faint place.
+
+    A faint wall is found nearly whole or not at all. In a cloudy sky, only what stands before it has a depth, and
+    that reaches some pixels into the sky.
+
+    Parameters
+    ----------
+    depth : (H, W) float32 ndarray
+        0 = none.
+    faint : (H, W) uint8 ndarray
+        See `faint_pixels`.
+    """
+    if not faint.any():
+        return
+    window = (2 * _PLACE + 1,) * 2
+    is_found = (depth > 0) & (faint > 0)
+    dropped = np.empty_like(is_found)
+    for band, wide, inner in _bands(len(depth), _PLACE):
+        place = cv2.blur(faint[wide].astype(np.float32), window)
+        found = cv2.blur(is_found[wide].astype(np.float32), window)
+        dropped[band] = (is_found[wide] & (found < _LEAST_FOUND * place))[inner]
+    depth[dropped] = 0
+
+
+def _silent_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int, levels: int, *, is_local: bool) -> Mask:
+    """1 where at none of so many scales anything varies by more than noise: than that nearby, or in the image."""
     if min(image.shape) < _LEAST_SIDE:
         return np.zeros(image.shape, np.uint8)
     scales = [image.astype(np.float32, copy=False)]
-    levels = _LEVELS + (min(image.shape) >= _FOUR_LEVELS_SIDE)
     while len(scales) < levels:
         scales.append(half_size(scales[-1]))
     noise, local = _noise(scales)
     rounding = _ROUNDING * jpeg_step
     bounds = [_MARGIN * max(noise * _FALL ** (level - _NOISE_LEVEL), rounding) for level in range(levels)]
-    blank = _quiet(scales[-1], bounds[-1] / noise * local)
+    silent = _quiet(scales[-1], bounds[-1] / noise * local if is_local else bounds[-1])
     for scale, bound in zip(scales[-2::-1], bounds[-2::-1], strict=True):
-        if not blank.any():
+        if not silent.any():
             return np.zeros(image.shape, np.uint8)
-        blank = _next_finer(blank, scale.shape) & _quiet(scale, bound)
-    return _with_edges(scales[0], blank, noise)
+        silent = _next_finer(silent, scale.shape) & _quiet(scale, bound)
+    return _with_edges(scales[0], silent, noise)
 
 
 def _next_finer(blank: Mask, shape: tuple[int, ...]) -> Mask:
