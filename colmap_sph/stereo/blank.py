@@ -5,7 +5,7 @@ matched there is made up, mostly by what stands beside it, and neighbouring imag
 
 Noise and texture differ by their scale: in an image of half the size noise is about half as strong, while the
 texture of surfaces is as strong or stronger. So a place is blank where at no scale anything varies by more than
-the image's own noise would. Where something varies at the coarsest scale only, as in clouds, pixels are *faint*:
+the image's own noise would. Where something varies at coarse scales only, as in clouds, pixels are *faint*:
 they are matched, as many walls are no different, but a depth here and there in such a place counts for nothing.
 """
 
@@ -63,10 +63,12 @@ _ALIKE = 4.0
 _EDGE_SHARE = 0.33
 # Within so many pixels around a pixel is what stands before it.
 _CONTRAST_REACH = 2
+# Pixels are faint that show no more than noise at so many scales, where a window covers up to 14 pixels.
+_FAINT_LEVELS = 2
 # Of the faint pixels within so many pixels around a depth at least this share must have one: what stands before
 # faint places spreads into them by some pixels.
 _PLACE = 64
-_LEAST_FOUND = 0.3
+_LEAST_FOUND = 0.2
 # Rows that are worked on at a time, to bound the memory.
 _BAND_ROWS = 256
 
@@ -103,7 +105,7 @@ def blank_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
 
 
 def faint_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
-    """Find the pixels that show no more than noise at three scales: they hold no texture finer than 28 pixels.
+    """Find the pixels that show no more than noise at two scales: they hold no texture finer than 14 pixels.
 
     Blank pixels are among them. Others may be walls that are matched rightly, by what they show more coarsely.
 
@@ -117,7 +119,7 @@ def faint_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
     (H, W) uint8 ndarray
         1 where a pixel is faint, else 0.
     """
-    return _silent_pixels(image, jpeg_step, _LEVELS, is_local=False)
+    return _silent_pixels(image, jpeg_step, _FAINT_LEVELS, is_local=False)
 
 
 def drop_scattered(depth: Float, faint: Mask) -> None:

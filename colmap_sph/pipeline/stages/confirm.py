@@ -38,7 +38,9 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
     from colmap_sph.pipeline.memory import MemoryGate
 
-# Processor seconds per megapixel of the image: per partner, and per partner's image that is matched in.
+# Processor seconds per megapixel of the image: for its faint places, per partner, and per partner's image that is
+# matched in.
+_FAINT_SECONDS = 0.05
 _CONFIRM_SECONDS = 0.015
 _REFINE_SECONDS = 0.055
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
@@ -161,7 +163,7 @@ def _faint(file: EstimateFile, mask: NDArray[np.uint8] | None) -> NDArray[np.uin
 
 def confirm_seconds(partners: int, normals: NormalOptions, refinement: RefinementOptions) -> float:
     """Processor seconds per megapixel of an image that has so many partners."""
-    seconds = normals_seconds(normals) + _CONFIRM_SECONDS * partners
+    seconds = normals_seconds(normals) + _FAINT_SECONDS + _CONFIRM_SECONDS * partners
     return seconds + _REFINE_SECONDS * refinement.images_used(partners)
 
 
