@@ -13,7 +13,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.images.jpeg import rounding_step
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.blank import blank_pixels
+from colmap_sph.stereo.blank import blank_pixels, drop_scattered, faint_pixels
 from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.matching import MatchingOptions, match_pair
 
@@ -51,12 +51,12 @@ def cameras():
     return [syn.Camera(syn.pinhole(FOCAL, WIDTH, HEIGHT), R, t, WIDTH, HEIGHT) for R, t in poses]
 
 
-def photograph(camera, seed, quality=90):
+def photograph(camera, seed, quality=90, noise=2.0):
     """(H, W, 3) BGR picture with a sky that is brighter lower down, sensor noise and JPEG's rounding."""
     view = syn.render(scene(), camera.K, camera.R, camera.t, WIDTH, HEIGHT)
     picture = view.image.astype(np.float32)
     picture[view.surface == SKY] += np.linspace(-30, 20, HEIGHT)[np.nonzero(view.surface == SKY)[0], None]
-    picture += np.random.default_rng(seed).normal(0, 2, picture.shape)
+    picture += np.random.default_rng(seed).normal(0, noise, picture.shape)
     saved = np.clip(np.rint(picture), 0, 255).astype(np.uint8)[..., ::-1]
     return cv2.imdecode(encoded(saved, quality), cv2.IMREAD_COLOR)
 
@@ -96,11 +96,11 @@ def masks():
     ]
 
 
-def masks_of_jpeg(quality):
-    """As `masks`, of pictures saved with this quality, with what their files say of it."""
+def masks_of(quality=90, noise=2.0):
+    """As `masks`, of other pictures, with what their files say of JPEG's rounding."""
     found = []
     for k, camera in enumerate(cameras()):
-        picture = photograph(camera, k, quality)
+        picture = photograph(camera, k, quality, noise)
         step = rounding_step(bytes(encoded(picture, quality)))
         found.append((blank_pixels(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), step), surfaces_of(camera)[0]))
     return found
@@ -125,11 +125,27 @@ def test_texture_is_not_blank_however_weak(masks):
 
 @pytest.mark.parametrize("quality", [80, 70, 60, 50])
 def test_coarse_jpeg_does_not_make_texture_of_the_sky(quality):
-    masks = masks_of_jpeg(quality)
+    masks = masks_of(quality)
     assert share(masks, SKY) > 0.95
     assert share(masks, BLOWN_OUT) > 0.95
     assert share(masks, WEAK) < 0.03
     assert share(masks, GROUND) < 0.01
+
+
+@pytest.mark.parametrize("noise", [4, 8, 12])
+def test_strong_noise_does_not_make_texture_of_the_sky(noise):
+    masks = masks_of(noise=noise)
+    assert share(masks, SKY) > 0.95
+    assert share(masks, BLOWN_OUT) > 0.95  # its noise is cut off, and tells nothing of the sky's
+    assert share(masks, GROUND) < 0.015
+
+
+def test_texture_that_is_weaker_than_strong_noise_is_not_blank():
+    rng = np.random.default_rng(0)
+    texture = cv2.GaussianBlur(rng.standard_normal((400, 600)), (0, 0), 4)
+    for noise in (3, 6, 9):
+        picture = 120 + 0.5 * noise * texture / texture.std() + noise * rng.standard_normal(texture.shape)
+        assert blank_pixels(picture.astype(np.float32)).mean() < 0.01
 
 
 def test_pictures_too_small_to_tell_have_no_blank_pixels():
@@ -139,10 +155,45 @@ def test_pictures_too_small_to_tell_have_no_blank_pixels():
 
 def test_noise_of_any_strength_is_blank_and_fine_texture_is_not():
     rng = np.random.default_rng(0)
-    for strength in (0, 0.5, 1, 2):
+    for strength in (0, 0.5, 1, 2, 4, 8):
         assert blank_pixels((120 + strength * rng.standard_normal((200, 300))).astype(np.float32)).mean() > 0.99
     gravel = 120 + 20 * rng.standard_normal((200, 300))  # white as noise is, but stronger than any camera's
     assert not blank_pixels(gravel.astype(np.float32)).any()
+    soft = 120 + 20 * cv2.GaussianBlur(gravel - 120, (0, 0), 1.2) / 20  # weaker, as through a lens
+    assert not blank_pixels(soft.astype(np.float32)).any()
+
+
+# ---- faint places ------------------------------------------------------------------------------------------
+
+
+def clouds_over_a_field(rng):
+    """(400, 600) picture: clouds with nothing finer than 100 pixels in its upper half, below them a texture."""
+    clouds = cv2.GaussianBlur(rng.standard_normal((400, 600)), (0, 0), 25)
+    field = cv2.GaussianBlur(rng.standard_normal((400, 600)), (0, 0), 3)
+    picture = 150 + 15 * clouds / clouds.std()
+    picture[200:] += 8 * (field / field.std())[200:]
+    return (picture + rng.standard_normal(picture.shape)).astype(np.float32)
+
+
+def test_clouds_are_faint_and_not_blank():
+    picture = clouds_over_a_field(np.random.default_rng(0))
+    assert not blank_pixels(picture)[:190].any()
+    assert faint_pixels(picture)[:190].mean() > 0.8
+    assert not faint_pixels(picture)[210:].any()
+
+
+def test_a_faint_place_keeps_its_depths_where_they_are_many():
+    rng = np.random.default_rng(0)
+    faint = np.zeros((600, 500), np.uint8)
+    faint[:, 100:] = 1
+    seam = np.zeros(faint.shape, np.float32)
+    seam[:, :112] = 5
+    whole = np.where(rng.random(faint.shape) < 0.8, np.float32(5), np.float32(0))
+    wall = np.where(np.arange(500) < 300, whole, 0)
+    for depth, kept in ((seam, faint == 0), (whole, True), (wall, True)):
+        found = depth.copy()
+        drop_scattered(found, faint)
+        np.testing.assert_array_equal(found, np.where(kept, depth, 0))
 
 
 # ---- what comes of it --------------------------------------------------------------------------------------

@@ -12,6 +12,7 @@ from small_workspaces import write_cloud
 from colmap_sph.errors import InputError
 from colmap_sph.evaluation.ply_files import read_ply
 from colmap_sph.pages.block_map import Ground, footprint, frame_around, looks_towards, seen_from_above
+from colmap_sph.pages.image_facts import find_blank
 from colmap_sph.pages.pictures import COLOURS, depth_picture, normal_picture, picture_uri, reason_picture
 from colmap_sph.pages.reasons import Partner, Reason, find_reasons
 from colmap_sph.pages.samples import MapSamples, grid_of
@@ -19,6 +20,10 @@ from colmap_sph.pages.small_cloud import STEPS, thin_out
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.images.reading import read_small_colours
 from colmap_sph.project.map_files import read_some_pixels, write_depth_map, write_normal_map
+from colmap_sph.project.state.ownership import undistorted_place
+from colmap_sph.project.state.records import vouch
+from colmap_sph.project.undistortion.rounding import rounding_of_original
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Region, View
 from colmap_sph.stereo.region.map_axes import map_axes
 from colmap_sph.stereo.region.shown import count_shown, filled
@@ -105,6 +110,26 @@ def test_masked_and_blank_pixels_are_told_apart_from_others() -> None:
     assert (reasons[15:, 10:20] == Reason.NOT_FOUND).all()
     assert (reasons[:, 20:30] == Reason.MASKED).all()
     assert (reasons[:, 30:] == Reason.CONFIRMED).all()
+
+
+def test_what_jpeg_has_rounded_is_blank_in_undistorted_copies_too(tmp_path: Path) -> None:
+    """A sky over texture, saved as JPEG; its copy is none, and only its record knows."""
+    rng = np.random.default_rng(0)
+    light = 200 - np.linspace(0, 30, 240)[:, None] + 2 * rng.standard_normal((240, 320))
+    light[120:] += 160 * cv2.GaussianBlur(rng.standard_normal((120, 320)), (0, 0), 1.5)
+    original = tmp_path / "original.jpg"
+    cv2.imwrite(str(original), np.clip(light, 0, 255).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 50])
+    picture = np.asarray(cv2.imread(str(original)), np.uint8)
+    workspace = Workspace(tmp_path / "dense")
+    copy = workspace.image_path("a.png")
+    copy.parent.mkdir(parents=True)
+    cv2.imwrite(str(copy), picture)
+    shape = (60, 80)
+    assert find_blank(workspace, "a.png", picture, shape)[:28].mean() < 0.7
+    vouch(undistorted_place(workspace, "a.png").record, "key", {}, rounding_of_original(original))
+    blank = find_blank(workspace, "a.png", picture, shape)
+    assert blank[:28].all()
+    assert not blank[32:].any()
 
 
 def test_what_lies_outside_of_a_region_was_not_asked_for() -> None:

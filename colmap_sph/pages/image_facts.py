@@ -13,6 +13,8 @@ from colmap_sph.pages.pictures import depth_picture, normal_picture, picture_uri
 from colmap_sph.pages.reasons import Reason
 from colmap_sph.pages.samples import MapSamples, read_normals
 from colmap_sph.project.images.reading import image_problem, read_small_colours
+from colmap_sph.project.state.ownership import undistorted_place
+from colmap_sph.project.undistortion.rounding import coarsest_jpeg_step
 from colmap_sph.project.wide.projection import Lens
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
@@ -91,11 +93,14 @@ def read_picture(workspace: Workspace, view: View) -> Bytes | None:
     return None
 
 
-def find_blank(picture: Bytes | None, shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Where an image shows nothing that could be matched, at samples of its maps."""
+def find_blank(
+    workspace: Workspace, name: str, picture: Bytes | None, shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """Where an image, small as of `read_picture`, shows nothing that could be matched, at samples of its maps."""
     if picture is None:
         return np.zeros(shape, bool)
-    blank = blank_pixels(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8))
+    step = coarsest_jpeg_step(workspace.image_path(name), undistorted_place(workspace, name).record)
+    blank = blank_pixels(np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2GRAY), np.uint8), step)
     return np.asarray(cv2.resize(blank, shape[::-1], interpolation=cv2.INTER_NEAREST) > 0)
 
 

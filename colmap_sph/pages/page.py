@@ -197,7 +197,7 @@ class _Block:
             view,
             samples,
             [Partner(other, self.samples[other.name]) for other in others],
-            blank=find_blank(picture, samples.geometric.shape),
+            blank=find_blank(self.workspace, view.name, picture, samples.geometric.shape),
             min_angle=self.facts.min_angle,
             region=self._region,
         )

@@ -197,7 +197,8 @@ class Keys:
 
         `cut` says where they are cut off. The sparse points have a part in what is known of the maps.
         """
-        # The votes' keys stand for the images of the view and its partners, which refinement looks at, too.
+        # The votes' keys stand for the images of the view and its partners, which are looked at, too, and for
+        # whether blank pixels are kept.
         options = (self._options.confirm, self._options.normals, self._options.refinement, *self._depths)
         options += tuple(cut)
         return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)

@@ -1,13 +1,15 @@
-"""Which pixels of an image say nothing: clear sky, blown-out or evenly painted walls.
+"""Which pixels of an image say nothing or little: clear or cloudy sky, blown-out or evenly painted walls.
 
 What two images show of such a place is noise, or a shade that changes so slowly that it fits everywhere. What is
 matched there is made up, mostly by what stands beside it, and neighbouring images make up the same.
 
 Noise and texture differ by their scale: in an image of half the size noise is about half as strong, while the
 texture of surfaces is as strong or stronger. So a place is blank where at no scale anything varies by more than
-the image's own noise would.
+the image's own noise would. Where something varies at coarse scales only, as in clouds, pixels are *faint*:
+they are matched, as many walls are no different, but a depth here and there in such a place counts for nothing.
 """
 
+import math
 from collections.abc import Iterator
 
 import cv2
@@ -28,16 +30,21 @@ _SIDE = 7
 # Images with a shorter side than this hold no window of the coarsest scale that could be trusted.
 _LEAST_SIDE = 128
 # Noise is measured at half size, where JPEG has spared it, as what varies least: this percentile of windows, at
-# least what the rounding of JPEG may leave, at most what cameras make.
+# least what the rounding of JPEG may leave, at most what cameras make in good light.
 _NOISE_LEVEL = 1
 _QUIETEST = 5
 _LEAST_NOISE = 0.5
-_MOST_NOISE = 1.5
+_USUAL_NOISE = 1.5
+# In poor light they make more, up to this. That is no texture where it falls from full to half size by as much as
+# this: noise of single pixels falls to .5, texture stays at about 1.
+_MOST_NOISE = 5.0
+_FALL_OF_NOISE = 0.7
 # Local noise is the least of so many by so many pixels of the coarsest scale: some of them may hold an edge.
 _LOCAL_SIDE = 5
-# Pixels with so little or so much light are left out of that: their noise is cut off.
+# Windows with more than a few pixels of so little or so much light are left out of that: their noise is cut off.
 _LEAST_GREY = 5
 _MOST_GREY = 250
+_CUT_SHARE = 0.05
 # What noise may reach in a window, in that of the quietest ones. It falls by half from scale to scale, after the
 # rounding of JPEG a little less.
 _MARGIN = 1.4
@@ -56,6 +63,12 @@ _ALIKE = 4.0
 _EDGE_SHARE = 0.33
 # Within so many pixels around a pixel is what stands before it.
 _CONTRAST_REACH = 2
+# Pixels are faint that show no more than noise at so many scales, where a window covers up to 14 pixels.
+_FAINT_LEVELS = 2
+# Of the faint pixels within so many pixels around a depth at least this share must have one: what stands before
+# faint places spreads into them by some pixels.
+_PLACE = 64
+_LEAST_FOUND = 0.2
 # Rows that are worked on at a time, to bound the memory.
 _BAND_ROWS = 256
 
@@ -87,21 +100,69 @@ def blank_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
     >>> float(blank[:96].mean()), float(blank[104:].mean())
     (1.0, 0.0)
     """
+    levels = _LEVELS + (min(image.shape) >= _FOUR_LEVELS_SIDE)
+    return _silent_pixels(image, jpeg_step, levels, is_local=True)
+
+
+def faint_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
+    """Find the pixels that show no more than noise at two scales: they hold no texture finer than 14 pixels.
+
+    Blank pixels are among them. Others may be walls that are matched rightly, by what they show more coarsely.
+
+    Parameters
+    ----------
+    image, jpeg_step
+        As for `blank_pixels`.
+
+    Returns
+    -------
+    (H, W) uint8 ndarray
+        1 where a pixel is faint, else 0.
+    """
+    return _silent_pixels(image, jpeg_step, _FAINT_LEVELS, is_local=False)
+
+
+def drop_scattered(depth: Float, faint: Mask) -> None:
+    """Set depths to 0, in place, that stand for too little of a faint place.
+
+    A faint wall is found nearly whole or not at all. In a cloudy sky, only what stands before it has a depth, and
+    that reaches some pixels into the sky.
+
+    Parameters
+    ----------
+    depth : (H, W) float32 ndarray
+        0 = none.
+    faint : (H, W) uint8 ndarray
+        See `faint_pixels`.
+    """
+    if not faint.any():
+        return
+    window = (2 * _PLACE + 1,) * 2
+    is_found = (depth > 0) & (faint > 0)
+    dropped = np.empty_like(is_found)
+    for band, wide, inner in _bands(len(depth), _PLACE):
+        place = cv2.blur(faint[wide].astype(np.float32), window)
+        found = cv2.blur(is_found[wide].astype(np.float32), window)
+        dropped[band] = (is_found[wide] & (found < _LEAST_FOUND * place))[inner]
+    depth[dropped] = 0
+
+
+def _silent_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int, levels: int, *, is_local: bool) -> Mask:
+    """1 where at none of so many scales anything varies by more than noise: than that nearby, or in the image."""
     if min(image.shape) < _LEAST_SIDE:
         return np.zeros(image.shape, np.uint8)
     scales = [image.astype(np.float32, copy=False)]
-    levels = _LEVELS + (min(image.shape) >= _FOUR_LEVELS_SIDE)
     while len(scales) < levels:
         scales.append(half_size(scales[-1]))
     noise, local = _noise(scales)
     rounding = _ROUNDING * jpeg_step
     bounds = [_MARGIN * max(noise * _FALL ** (level - _NOISE_LEVEL), rounding) for level in range(levels)]
-    blank = _quiet(scales[-1], bounds[-1] / noise * local)
+    silent = _quiet(scales[-1], bounds[-1] / noise * local if is_local else bounds[-1])
     for scale, bound in zip(scales[-2::-1], bounds[-2::-1], strict=True):
-        if not blank.any():
+        if not silent.any():
             return np.zeros(image.shape, np.uint8)
-        blank = _next_finer(blank, scale.shape) & _quiet(scale, bound)
-    return _with_edges(scales[0], blank, noise)
+        silent = _next_finer(silent, scale.shape) & _quiet(scale, bound)
+    return _with_edges(scales[0], silent, noise)
 
 
 def _next_finer(blank: Mask, shape: tuple[int, ...]) -> Mask:
@@ -147,6 +208,18 @@ def _variance(image: Float) -> Float:
     return largest
 
 
+def _variances(image: Float, step: int = 1) -> Float:
+    """`_variance` of every pixel, or of one in `step` x `step`, of which bands of rows hold a whole number."""
+    bands = [_variance(image[wide])[inner][::step, ::step] for _, wide, inner in _bands(image.shape[0], _SIDE)]
+    return np.concatenate(bands)
+
+
+def _cut_off(image: Float) -> Float:
+    """At half the size, the share of the window around each pixel with noise that is cut off at black or white."""
+    cut = (image[::2, ::2] <= _LEAST_GREY) | (image[::2, ::2] >= _MOST_GREY)
+    return np.asarray(cv2.blur(cut.astype(np.float32), (_SIDE, _SIDE)), dtype=np.float32)
+
+
 def _noise(scales: list[Float]) -> tuple[float, Float]:
     """Standard deviation of pixels, grey values, at the scale where noise is measured.
 
@@ -159,13 +232,15 @@ def _noise(scales: list[Float]) -> tuple[float, Float]:
         alone; 0 where it is much more, so that there is texture, too fine for the coarsest scale.
     """
     image = scales[_NOISE_LEVEL]
-    variance = np.empty_like(image)
-    for band, wide, inner in _bands(image.shape[0], _SIDE):
-        variance[band] = _variance(image[wide])[inner]
+    variance = _variances(image)
     some = (slice(_SIDE // 2, None, _SIDE),) * 2
-    lit = (image[some] > _LEAST_GREY) & (image[some] < _MOST_GREY)
+    lit = _cut_off(scales[0])[some] <= _CUT_SHARE
     quietest = float(np.percentile(variance[some][lit], _QUIETEST)) if lit.any() else 0.0
-    noise = float(np.clip(np.sqrt(quietest), _LEAST_NOISE, _MOST_NOISE))
+    noise = max(math.sqrt(quietest), _LEAST_NOISE)
+    if noise > _USUAL_NOISE:
+        there = lit & (variance[some] <= quietest)
+        full = math.sqrt(np.median(_variances(scales[0], 2)[some][there]))
+        noise = min(noise, max(_FALL_OF_NOISE * full, _USUAL_NOISE), _MOST_NOISE)
     mean = cv2.resize(variance, scales[-1].shape[::-1], interpolation=cv2.INTER_AREA)
     local = np.clip(np.sqrt(cv2.erode(mean, np.ones((_LOCAL_SIDE, _LOCAL_SIDE), np.uint8))), _LEAST_NOISE, noise)
     local[cv2.blur(mean, (_SIDE, _SIDE)) > (_MARGIN * noise) ** 2] = 0

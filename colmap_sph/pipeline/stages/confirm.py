@@ -18,8 +18,11 @@ from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, keys_of
 from colmap_sph.pipeline.stages.vote import normals_seconds
 from colmap_sph.project.images.reading import bytes_to_reduce, read_whole_grey
 from colmap_sph.project.masks import read_view_mask
+from colmap_sph.project.state.ownership import undistorted_place
+from colmap_sph.project.undistortion.rounding import coarsest_jpeg_step
 from colmap_sph.scene import View
 from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
+from colmap_sph.stereo.blank import drop_scattered, faint_pixels
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
@@ -35,7 +38,9 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
     from colmap_sph.pipeline.memory import MemoryGate
 
-# Processor seconds per megapixel of the image: per partner, and per partner's image that is matched in.
+# Processor seconds per megapixel of the image: for its faint places, per partner, and per partner's image that is
+# matched in.
+_FAINT_SECONDS = 0.05
 _CONFIRM_SECONDS = 0.015
 _REFINE_SECONDS = 0.055
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
@@ -56,11 +61,14 @@ _loaded: LoadCache[NDArray[np.uint8] | DepthEstimate] = LoadCache(
 
 @dataclass(frozen=True, eq=False)
 class EstimateFile:
-    """A view without its sparse points, its image, its photometric depth and the key of that, and its window."""
+    """A view without its sparse points, its image, what tells how that was made, its photometric depth and the key
+    of that, and its window.
+    """
 
     whole: View
     window: Window
     image: Path
+    record: Path
     estimate: Path
     key: str
 
@@ -74,7 +82,8 @@ class EstimateFile:
 class ConfirmTask:
     """A view and its partners, its sparse points and mask, and where its geometric maps go.
 
-    `matched` are the images that it was matched with, also where these tell nothing of it.
+    `matched` are the images that it was matched with, also where these tell nothing of it. With `keep_blank` no
+    depth is doubted for what the image shows.
     """
 
     reference: EstimateFile
@@ -83,6 +92,7 @@ class ConfirmTask:
     residuals: tuple[float, ...]
     sights: SparseSights
     mask: Path
+    keep_blank: bool
     confirm_options: ConfirmOptions
     normal_options: NormalOptions
     refinement_options: RefinementOptions
@@ -96,9 +106,13 @@ class ConfirmTask:
 def make_geometric_maps(task: ConfirmTask) -> Facts:
     """Confirm a view's depth by its partners' and refine it on their images; writes its geometric maps."""
     view = task.reference.view
+    whole = task.reference.whole
+    mask = read_view_mask(task.mask, whole)
     others = ((partner.view, _estimate(partner)) for partner in task.partners)
     estimate = _estimate(task.reference)
     confirmed = confirm_depth(view, estimate, others, task.confirm_options, task.stations, task.residuals)
+    if not task.keep_blank and confirmed.depth.any():
+        drop_scattered(confirmed.depth, _faint(task.reference, mask))
     planes = fit_normals(view, confirmed, task.normal_options)
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
@@ -114,9 +128,7 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     drop_other_depths(planes[1], task.depths)
     drop_outside(view, planes[1], region_of(task.focus))
     shown = None if task.focus is None else count_shown(view, estimate.depth, planes[1], task.focus.near)
-    whole = task.reference.whole
     normals, depth = (task.reference.window.padded(pixels, whole) for pixels in planes)
-    mask = read_view_mask(task.mask, whole)
     agreement = Agreement(*compare_with_sparse(whole, depth, task.sights, mask))
     return task.maps.write(normals, depth, task.key, agreement, partners=task.matched, shown=shown)
 
@@ -140,9 +152,18 @@ def _image(file: EstimateFile) -> NDArray[np.uint8]:
     return image
 
 
+def _faint(file: EstimateFile, mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
+    """See `faint_pixels`; found in the whole image, so that a region has no part in it."""
+    image = read_whole_grey(file.image, (file.whole.width, file.whole.height))
+    faint = faint_pixels(image, coarsest_jpeg_step(file.image, file.record))
+    if mask is not None:
+        faint[mask == 0] = 0
+    return file.window.part(faint)
+
+
 def confirm_seconds(partners: int, normals: NormalOptions, refinement: RefinementOptions) -> float:
     """Processor seconds per megapixel of an image that has so many partners."""
-    seconds = normals_seconds(normals) + _CONFIRM_SECONDS * partners
+    seconds = normals_seconds(normals) + _FAINT_SECONDS + _CONFIRM_SECONDS * partners
     return seconds + _REFINE_SECONDS * refinement.images_used(partners)
 
 
@@ -200,6 +221,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
             tuple(residuals),
             sights,
             self.context.workspace.mask_path(item),
+            options.matching.keep_blank,
             options.confirm,
             options.normals,
             options.refinement,
@@ -225,6 +247,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
             view,
             context.window(name),
             context.workspace.image_path(name),
+            undistorted_place(context.workspace, name).record,
             context.estimate_path(name),
             self._vote_keys[name],
         )

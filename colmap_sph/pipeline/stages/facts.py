@@ -88,10 +88,3 @@ class Facts:
     unread: Mapping[str, str] = field(default_factory=dict)
     row_residual: float | None = None
     polish: Polish | None = None
-
-
-@dataclass(frozen=True)
-class UndistortedFacts(Facts):
-    """Of an undistorted image: how coarsely JPEG has rounded its original, see `rounding_step`."""
-
-    jpeg_step: int = 1

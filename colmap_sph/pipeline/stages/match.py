@@ -14,17 +14,16 @@ from numpy.typing import NDArray
 from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
-from colmap_sph.pipeline.stages.facts import Facts, UndistortedFacts
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
 from colmap_sph.pipeline.stages.photo import Grey, Photo
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result
 from colmap_sph.project.files import make_dir
-from colmap_sph.project.images.decoding import jpeg_step
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
 from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs, undistorted_place
-from colmap_sph.project.state.records import recorded_facts
+from colmap_sph.project.undistortion.rounding import coarsest_jpeg_step
 from colmap_sph.project.workspace import Known
 from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.blank import blank_pixels
@@ -83,8 +82,7 @@ class PhotoFile:
     @property
     def jpeg_step(self) -> int:
         """How coarsely the image was rounded, or the original that it was made of; see `blank_pixels`."""
-        made = recorded_facts(self.record, UndistortedFacts)
-        return max(jpeg_step(self.image), made.jpeg_step if made is not None else 1)
+        return coarsest_jpeg_step(self.image, self.record)
 
 
 @dataclass(frozen=True, eq=False)

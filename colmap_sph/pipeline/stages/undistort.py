@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.pipeline.stages.facts import Facts, UndistortedFacts
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.platforms.files import move_into_place
 from colmap_sph.project.cameras import plain_camera
@@ -23,7 +23,6 @@ from colmap_sph.project.files import (
     set_aside,
     whole_digest,
 )
-from colmap_sph.project.images.decoding import jpeg_step
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.sparse_model import cameras_of_images
@@ -39,6 +38,7 @@ from colmap_sph.project.state.records import (
 from colmap_sph.project.undistortion.image import ImageToUndistort, undistort
 from colmap_sph.project.undistortion.originals import Originals
 from colmap_sph.project.undistortion.process import ChildProcess
+from colmap_sph.project.undistortion.rounding import rounding_of_original
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -112,7 +112,7 @@ def make_undistorted_image(task: UndistortTask) -> Facts:
 
 def _publish(task: UndistortTask) -> None:
     """Move what was made into its place, and keep how coarsely the original was rounded: the copy does not say."""
-    facts = UndistortedFacts(jpeg_step=jpeg_step(task.image.source))
+    rounding = rounding_of_original(task.image.source)
     moves = {task.target: task.image.image_path}
     if task.image.has_mask:
         moves[task.mask_target] = task.image.mask_path
@@ -123,7 +123,7 @@ def _publish(task: UndistortTask) -> None:
     for target, made in moves.items():
         make_dir(target.parent)
         move_into_place(made, target)
-    vouch_when_on_disk(task.record, task.key, digests, facts)
+    vouch_when_on_disk(task.record, task.key, digests, rounding)
 
 
 def _withdraw_mask(task: UndistortTask) -> None:
