@@ -4,6 +4,7 @@ The frame and the layout are those of `rectified_pair` (Elhashash & Qin, §3.1, 
 baseline and the viewing directions, the rows from what both images see, the columns from the disparity range.
 """
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -52,10 +53,11 @@ _MOST_SAMPLING = 1.3
 _DEPTH_SAMPLES = 17
 _DEPTH_STEP = 1.1
 _MOST_DEPTHS = 400
-# Columns near an epipole are flattened no farther than tangents of this angle.
-_FLATTENED = float(np.radians(75))
-# Rows that are as far apart as .8 columns find more, at the same number of pixels (measured).
-_ROWS_PER_COLUMN = 1.25
+# Of flat columns. With 1 the ground below a flight line looks alike in both images of a pair, and walls do not;
+# with this one what faces both images alike does, and pixels are about square wherever they are.
+_FLATNESS = math.sqrt(0.5)
+# Rows to a column of these amid the points: with 1.25 more is found, and more is wrong, with 1 less (measured).
+_ROWS_PER_COLUMN = 1.12
 # Fewer rows or columns than this are not worth matching.
 _MIN_SIDE = 16
 
@@ -70,8 +72,8 @@ class RectificationOptions:
     """Rectified pixels, as a factor on what the images' detail asks for: 1.3 per pixel where they are sharp, 0.5
     where they are soft."""
     columns: Literal["flat", "angles"] = "flat"
-    """How the sphere's columns are spaced: so that surfaces parallel to the baseline look the same in both images
-    of a pair, as far as that can be, or by equal angles, as in the paper."""
+    """How the sphere's columns are spaced: so that surfaces which face both images of a pair alike look the same
+    in them, or by equal angles, as in the paper."""
     min_cosine: float = 0.1
     """Rays whose angle with the baseline has a smaller sine than this are left out: at 0.1, within 5.7° of the
     epipole."""
@@ -181,10 +183,9 @@ def rectify_pair(
     points = _points_in_both(scene, left, right)
     extent = _extent(rotation, left, right, options, outlines)
     is_sphere = options.surface == "spherical"
-    flatness = 0.0
     # A whole sphere goes from epipole to epipole, and without points nobody knows what lies where.
-    if is_sphere and options.columns == "flat" and not _is_cut(left, right) and len(points) >= MIN_POINTS:
-        flatness = _FLATTENED / max(_FLATTENED, float(np.abs(extent.columns).max()))
+    is_flat = is_sphere and options.columns == "flat" and not _is_cut(left, right) and len(points) >= MIN_POINTS
+    flatness = _FLATNESS if is_flat else 0.0
 
     def parallaxes(of: Float) -> Float:
         if is_sphere:
@@ -319,11 +320,10 @@ def _scales_on_sphere(
     if flatness == 0:
         return scale, scale * widest
     seen = ray_angles(rays)[1]
-    # Rows per column where pixels are square in the middle of the left image's points, and a little more.
     rows = _ROWS_PER_COLUMN * float(np.median(np.cos(seen) / np.cos(flatness * seen) ** 2))
     rows = few_digits(rows, np.round)
-    # As many pixels as by equal angles.
-    shrunk = float(np.ptp(angles, axis=1).sum() / np.ptp(ends, axis=1).sum())
+    # As many pixels of the left image, whose matches are searched, as by equal angles.
+    shrunk = float(np.ptp(angles[0]) / np.ptp(ends[0]))
     columns = scale * few_digits(float(np.sqrt(widest * shrunk / rows)), np.round)
     return columns, columns * rows
 
