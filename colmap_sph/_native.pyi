@@ -36,6 +36,17 @@ def census(
     census : (H, W) uint64, written
     """
 
+def weigh_census(
+    census: NDArray[np.uint64],
+    weighed: NDArray[np.uint64],
+    /,
+) -> None:
+    """Census words in which near neighbours count twice, and the most distant ones not.
+
+    census : (H, W) uint64
+    weighed : (H, W) uint64, written
+    """
+
 def matching_cost(
     backend: str,
     reference: NDArray[np.uint64],

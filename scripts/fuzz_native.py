@@ -61,6 +61,11 @@ def census(rng: Random) -> Arguments:
     return [backend(rng), padded, filled(rng, (h, w), np.uint8), np.zeros((h, w), np.uint64)]
 
 
+def weigh_census(rng: Random) -> Arguments:
+    shape = size(rng)
+    return [filled(rng, shape, np.uint64), np.zeros(shape, np.uint64)]
+
+
 def matching_cost(rng: Random) -> Arguments:
     h, w = size(rng)
     target = int(rng.integers(0, 70))
@@ -470,6 +475,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
     function.__name__: function
     for function in (
         census,
+        weigh_census,
         matching_cost,
         aggregation,
         selection,

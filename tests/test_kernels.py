@@ -163,6 +163,25 @@ def test_census_leaves_out_half_a_grey_value(backend, centre, darker):
     np.testing.assert_array_equal(census, darker * 0b111111111)
 
 
+@property_test
+@given(size=sizes, invalid=shares, seed=seeds)
+def test_weighed_census_counts_near_neighbours_twice(size, invalid, seed):
+    """Of what differs: neighbours within two pixels twice, others within the root of 10 once; content always."""
+    rng = np.random.default_rng(seed)
+    first, second = (words(rng, size, invalid) for _ in range(2))
+    weighed = np.zeros((2, *size), np.uint64)
+    for word, out in zip((first, second), weighed, strict=True):
+        _native.weigh_census(word, out)
+    neighbours = [(y, x) for y in range(-3, 4) for x in range(-4, 5) if (y, x) != (0, 0)]
+    times = [2 if max(abs(y), abs(x)) <= 2 else int(y * y + x * x <= 10) for y, x in neighbours]
+    assert sum(times) == 60
+    differing = first ^ second
+    expected = differing >> np.uint64(63)
+    for bit, number in enumerate(times):
+        expected += np.uint64(number) * ((differing >> np.uint64(bit)) & np.uint64(1))
+    np.testing.assert_array_equal(np.bitwise_count(weighed[0] ^ weighed[1]), expected)
+
+
 # ---- matching cost -----------------------------------------------------------------------------------------
 
 

@@ -178,6 +178,24 @@ def test_fractions_of_a_grey_value_are_matched():
     assert right[1].mean() < 0.99
 
 
+def test_edges_of_fine_images_are_wider_by_less():
+    """Beside edges, fewer pixels that both images see are wrong, and fewer get what stands before them."""
+    matched = matched_scene("convergent")
+    truth = np.where(matched.seen, matched.truth, 0)
+    step = ndimage.maximum_filter(matched.truth, 9) - ndimage.minimum_filter(matched.truth, 9)
+    left, right = matched.images
+    low, high = matched.pair.min_disparity, matched.pair.max_disparity
+    wrong, nearer = [], []
+    for fine in (False, True):
+        disparity = match_pair(left, right, low, high, OPTIONS, fine=fine)
+        error = (disparity - truth)[matched.seen & (step > 4) & ~np.isnan(disparity)]
+        assert len(error) > 5000
+        wrong.append((np.abs(error) > 1).mean())
+        nearer.append((error > 1).mean())
+    assert wrong[1] < min(0.9 * wrong[0], 0.1)
+    assert nearer[1] < min(0.9 * nearer[0], 0.07)
+
+
 def test_what_a_step_hides_is_left_out():
     """A board floats before a wall: a stripe beside it is seen by the left camera alone."""
     wall = syn.slanted_plane_pair(0, depth=10.0, focal_length=FOCAL, size=SIZE)
@@ -463,12 +481,13 @@ def test_scratch_memory_is_what_a_plan_says(most):
     assert scratch._memory.size == pytest.approx(scratch_bytes(320 * 480, MatchingOptions()), rel=0.1)
 
 
-def test_memory_is_what_a_plan_says():
+@pytest.mark.parametrize("fine", [False, True])
+def test_memory_is_what_a_plan_says(fine):
     """Of arrays, beside the scratch memory; the rest of what a plan takes is for OpenCV's own."""
     shape = (480, 640)
     scratch = Scratch(max_bytes=0)
     tracemalloc.start()
-    match_pair(random_image(shape), random_image(shape, 1), -200, 200, OPTIONS, scratch)
+    match_pair(random_image(shape), random_image(shape, 1), -200, 200, OPTIONS, scratch, fine=fine)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert 0.7 * _MATCH_BYTES < peak / (shape[0] * shape[1]) < 0.9 * _MATCH_BYTES

@@ -30,6 +30,7 @@ def arguments(function):
             "valid": np.ones((H, W), u8),
             "out census": np.zeros((H, W), np.uint64),
         },
+        "weigh_census": {"census": np.zeros((H, W), np.uint64), "out weighed": np.zeros((H, W), np.uint64)},
         "matching_cost": {
             "backend": "scalar",
             **census_pair,
@@ -468,6 +469,7 @@ FUNCTIONS = [
     "refine_planes",
     "source_pixels",
     "sharpen",
+    "weigh_census",
     *offsets_arguments(),
     *ties_arguments(),
 ]

@@ -22,7 +22,12 @@ from colmap_sph import synthetic as syn
 from colmap_sph.errors import RectificationError
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
-from colmap_sph.stereo.rectified_pair import RectifiedPair, pixel_from_rectified_ray, rectified_ray_from_pixel
+from colmap_sph.stereo.rectified_pair import (
+    RectifiedPair,
+    is_fine,
+    pixel_from_rectified_ray,
+    rectified_ray_from_pixel,
+)
 from colmap_sph.stereo.resampling import resample
 
 SPHERE = RectificationOptions()
@@ -252,6 +257,19 @@ def test_flat_columns_cost_no_left_pixels(name):
     rows = (pair.height - 1) / pair.rows_per_radian * scale * np.cos(min(nearest))
     columns = np.ptp(angles[0]) * scale
     assert pair.height * pair.left_width == pytest.approx(rows * columns, rel=0.05)
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_pairs_are_fine_where_they_are_sampled_so_and_no_epipole_is_near(name):
+    left, right, pair, _ = rectified(name, "spherical")
+    borders = []
+    for view in (left, right):
+        x, y = np.meshgrid(np.linspace(0, view.width, 50), np.linspace(0, view.height, 50))
+        rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1) @ np.linalg.inv(view.K).T @ view.R
+        borders.append(np.abs(rays @ (right.center - left.center)) / np.linalg.norm(rays, axis=1))
+    farthest = np.degrees(np.arcsin(np.max(borders) / np.linalg.norm(right.center - left.center)))
+    assert is_fine(left, pair) == (farthest < 75)
+    assert not is_fine(left, pair.resampled(0.3))
 
 
 def test_columns_go_by_angles_where_points_do_not_tell():

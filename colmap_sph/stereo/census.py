@@ -47,11 +47,19 @@ def pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
     return images
 
 
-def census(image: RectifiedImage) -> NDArray[np.uint64]:
-    """(H, W) uint64: a bit for each neighbour, set where it is darker, and `CENSUS_INVALID` without content."""
+def census(image: RectifiedImage, *, fine: bool = False) -> NDArray[np.uint64]:
+    """(H, W) uint64: a bit for each neighbour, set where it is darker, and `CENSUS_INVALID` without content.
+
+    Of a `fine` image, neighbours within 5 x 5 pixels have two bits, and distant ones none.
+    """
     height, width = image.image.shape
     padded = np.empty((height + 2 * _BORDER[0], width + 2 * _BORDER[1]), dtype=np.int16)
     _native.sharpen(np.ascontiguousarray(image.image), _SHARPENING, padded)
     words = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), words)
-    return words
+    if not fine:
+        return words
+    del padded
+    weighed = np.empty_like(words)
+    _native.weigh_census(words, weighed)
+    return weighed

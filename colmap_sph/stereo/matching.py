@@ -160,6 +160,7 @@ def match_pair(
     *,
     infinity: float | None = None,
     seeds: Seeds | None = None,
+    fine: bool = False,
 ) -> NDArray[np.float32]:
     """Match the left image of a rectified pair in the right one.
 
@@ -178,6 +179,9 @@ def match_pair(
         them in the range.
     seeds : (n, 3) float32 ndarray, optional
         Left column, left row and disparity, pixels, of what is known to match, see `seeds_of_points`.
+    fine : bool
+        The images hold as much as their pixels can: at full resolution, near neighbours count more in census
+        windows. Where the texture is coarser, or weak, less is found so. See `is_fine`.
 
     Returns
     -------
@@ -227,8 +231,10 @@ def match_pair(
         unseeded: Matches | None = None
         if offset is None and level > 0 and seeds is not None and len(seeds):
             whole_range = from_seeds(None, shape, level, low, high)
-            unseeded = _match_level(lefts[-1], rights[-1], whole_range, options, scratch, finest=False)
-        matches = _match_level(lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0)
+            unseeded = _match_level(lefts[-1], rights[-1], whole_range, options, scratch, finest=False, fine=False)
+        matches = _match_level(
+            lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0, fine=fine
+        )
         offset = matches.offset if unseeded is None else matches.or_better(unseeded)
         del matches, unseeded
         # Windows about predictions reach further.
@@ -272,11 +278,12 @@ def _match_level(
     scratch: Scratch,
     *,
     finest: bool,
+    fine: bool,
 ) -> Matches:
     """Matches of one level; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
-    target = make_target(right, prediction)
-    left_census = census(left)
+    target = make_target(right, prediction, fine=fine and finest)
+    left_census = census(left, fine=fine and finest)
     image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
     del left, right
     offset = np.empty(image.shape, dtype=np.int32)

@@ -26,6 +26,10 @@ Surface = Literal["spherical", "frame"]
 Side = Literal["left", "right"]
 
 Float = NDArray[np.float64]
+# Sharp images are sampled with about a column per pixel or more, soft ones with fewer.
+_FINE = 0.7
+# Farther from the perpendicular to the baseline, surfaces are stretched, and windows on them do not look alike.
+_FARTHEST = math.radians(75)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,6 +98,20 @@ class RectifiedPair:
         return columns, self.rows_per_radian / math.cos(angle)
 
     @property
+    def farthest_angle(self) -> float:
+        """Largest angle between a ray of either image and the perpendicular to the baseline, radians.
+
+        On the plane, which has no epipoles, zero.
+        """
+        if self.surface == "frame":
+            return 0.0
+        ends = [
+            self.column_origin(side) + column for side in ("left", "right") for column in (0, self.width(side) - 1)
+        ]
+        angles = angles_of_columns(np.array(ends) / self.columns_per_radian, self.flatness)
+        return float(np.abs(angles).max())
+
+    @property
     def disparity_origin(self) -> float:
         """Parallax in pixels at disparity 0."""
         return self.left_origin - self.right_origin
@@ -135,6 +153,12 @@ def pixel_from_rectified_ray(view: View, pair: RectifiedPair) -> Float:
 def rectified_ray_from_pixel(view: View, pair: RectifiedPair) -> Float:
     """(3, 3) matrix from (col, row, 1) of `view` to the ray of depth 1 in the rectified frame."""
     return np.asarray(pair.rectified_from_world @ view.R.T @ np.linalg.inv(view.K))
+
+
+def is_fine(view: View, pair: RectifiedPair) -> bool:
+    """Whether both images show fine texture alike: sampled about as finely as the left one, far from epipoles."""
+    columns, _ = pair.scales
+    return columns >= _FINE * float(view.K[0, 0]) and pair.farthest_angle <= _FARTHEST
 
 
 def coordinates_of_rays(pair: RectifiedPair, side: Side, rays: Float) -> Float:

@@ -76,6 +76,20 @@ static int run_census(void *arguments) {
 FUNCTION(census, CENSUS, any,
          "Census words: a bit for each neighbour that is darker, bit 63 where a pixel is not valid.");
 
+#define WEIGH_CENSUS(X) \
+    X(IN, uint64, census, H, W) \
+    X(OUT, uint64, weighed, H, W)
+ARGUMENTS(weigh_census, WEIGH_CENSUS);
+
+static int run_weigh_census(void *arguments) {
+    const weigh_census_arguments *a = arguments;
+    weigh_census(a->census, a->size.H * a->size.W, a->weighed);
+    return 0;
+}
+
+FUNCTION(weigh_census, WEIGH_CENSUS, any,
+         "Census words in which near neighbours count twice, and the most distant ones not.");
+
 #define MATCHING_COST(X) \
     X(VALUE, backend, backend) \
     X(IN, uint64, reference, H, W) \
@@ -356,16 +370,10 @@ static int run_to_disparity(void *arguments) {
 FUNCTION(to_disparity, TO_DISPARITY, any,
          "Disparities, pixels, of offsets, less the shift of their fraction; NaN where there is no offset.");
 
-native_function *const matching_functions[] = {&census_function,
-                                               &matching_cost_function,
-                                               &aggregation_function,
-                                               &selection_function,
-                                               &match_function,
-                                               &fit_offsets_function,
-                                               &warp_function,
-                                               &unwarp_offsets_function,
-                                               &mean_offsets_function,
-                                               &upsample_offsets_function,
-                                               &search_windows_function,
-                                               &to_disparity_function,
-                                               NULL};
+native_function *const matching_functions[] = {&census_function,           &weigh_census_function,
+                                               &matching_cost_function,    &aggregation_function,
+                                               &selection_function,        &match_function,
+                                               &fit_offsets_function,      &warp_function,
+                                               &unwarp_offsets_function,   &mean_offsets_function,
+                                               &upsample_offsets_function, &search_windows_function,
+                                               &to_disparity_function,     NULL};

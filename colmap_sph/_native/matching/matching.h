@@ -90,6 +90,10 @@ typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint8_t *scr
 typedef int fit_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
                            match_size size, int32_t *fitted);
 
+/* Census words in which the neighbours within 5 x 5 pixels count twice, the 12 next ones once and others not: 60
+ * bits. */
+void weigh_census(const uint64_t *census, ptrdiff_t pixels, uint64_t *weighed);
+
 /* A source image as the reference is expected to see it: target pixel w shows what lies `prediction` (1/256 pixel)
  * from reference column w - margin; beyond the reference's sides the outermost predictions count, and beyond those
  * of the source its outermost pixels. `columns` are the nearest ones of the source, -1 outside. Content is what

@@ -34,7 +34,7 @@ from colmap_sph.stereo.photographs.resampling import resample_photograph
 from colmap_sph.stereo.photographs.ties import find_ties_of_photographs
 from colmap_sph.stereo.poses.ties import Ties, find_ties, row_residual, tolerable_sampling
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
-from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side
+from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, is_fine
 from colmap_sph.stereo.resampling import resample
 from colmap_sph.stereo.search.seeds import Seeds, finer_first, seeds_of_points, shared_points
 
@@ -149,6 +149,7 @@ def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32
         _thread.scratch,
         infinity=-geometry.disparity_origin,
         seeds=task.seeds * (geometry.columns_per_radian / task.geometry.columns_per_radian),
+        fine=is_fine(task.left[0].view, geometry),
     )
     return disparity, _ties(task, geometry, disparity)
 

@@ -108,7 +108,7 @@ class Matches:
         return np.asarray(sums / np.maximum(numbers, 1), dtype=np.float32)
 
 
-def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
+def make_target(right: RectifiedImage, prediction: Prediction, *, fine: bool = False) -> Target:
     """Warp a level's right image as predicted.
 
     Parameters
@@ -117,6 +117,8 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
         (H, W_right).
     prediction : Prediction
         Of the left image's (H, W) pixels.
+    fine : bool
+        As of `census`.
 
     Returns
     -------
@@ -126,9 +128,9 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     if not prediction.warps:
         own_columns = np.broadcast_to(np.arange(right_width, dtype=np.int32), (height, right_width))
         columns = np.ascontiguousarray(own_columns)
-        return Target(census(right), columns, prediction.base, right_width, 0, prediction)
+        return Target(census(right, fine=fine), columns, prediction.base, right_width, 0, prediction)
     warped, columns = _warped(right, prediction)
-    words = census(warped)
+    words = census(warped, fine=fine)
     del warped
     if prediction.torn is None:
         base = prediction.base + np.int32(prediction.margin)
@@ -138,7 +140,7 @@ def make_target(right: RectifiedImage, prediction: Prediction) -> Target:
     as_it_is = words.shape[1] + gap
     both = np.empty((height, as_it_is + right_width), dtype=np.uint64)
     both_columns = np.empty(both.shape, dtype=np.int32)
-    _native.join_targets(words, columns, census(right), both, both_columns)
+    _native.join_targets(words, columns, census(right, fine=fine), both, both_columns)
     del words, columns
     base = np.empty_like(prediction.base)
     _native.target_bases(prediction.base, prediction.torn_bytes, prediction.margin, as_it_is, gap, base)
