@@ -33,7 +33,8 @@ void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, c
     memset(best, UINT8_MAX, (size_t)source_width * sizeof *best);
     for (int32_t w = 0; w < target_width; w++) {
         const int32_t first = columns[w];
-        if (first < 0 || first >= source_width) {
+        /* Those that nothing points at have no say. */
+        if (best_sum[w] == UINT8_MAX || first < 0 || first >= source_width) {
             continue;
         }
         const uint32_t own = (uint32_t)best_sum[w] << 24 | (uint32_t)w;
