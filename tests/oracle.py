@@ -45,9 +45,17 @@ def _slots(costs, indices):
     return np.where(inside, costs[np.clip(indices, 0, len(costs) - 1)], NO_SLOT)
 
 
-def path_costs(cost, base, image, p1, p2, max_slant, direction):
-    """L (H, W, D) int64 along one path direction, without any narrowing."""
+def spans(reference):
+    """(H, W) bool: from the first pixel of a row with content to the last."""
+    content = reference & CENSUS_INVALID == 0
+    from_left, from_right = (np.logical_or.accumulate(each, axis=1) for each in (content, content[:, ::-1]))
+    return from_left & from_right[:, ::-1]
+
+
+def path_costs(cost, base, image, p1, p2, max_slant, direction, inside=None):
+    """L (H, W, D) int64 along one path direction, without any narrowing; paths are cut off outside of `inside`."""
     height, width, depth = cost.shape
+    inside = np.ones((height, width), dtype=bool) if inside is None else inside
     rows = range(height) if direction[0] >= 0 else range(height - 1, -1, -1)
     columns = range(width) if direction[1] >= 0 else range(width - 1, -1, -1)
     path = cost.astype(np.int64)
@@ -55,7 +63,7 @@ def path_costs(cost, base, image, p1, p2, max_slant, direction):
     for y in rows:
         for x in columns:
             y0, x0 = y - direction[0], x - direction[1]
-            if not (0 <= y0 < height and 0 <= x0 < width):
+            if not (0 <= y0 < height and 0 <= x0 < width and inside[y0, x0]):
                 continue
             before = path[y0, x0] - path[y0, x0].min()
             difference = int(base[y, x]) - int(base[y0, x0])
@@ -66,9 +74,10 @@ def path_costs(cost, base, image, p1, p2, max_slant, direction):
     return path
 
 
-def aggregation(cost, base, image, p1, p2, max_slant):
+def aggregation(cost, base, image, p1, p2, max_slant, inside=None):
     """Half of the sum of the 8 paths, rounded up, (H, W, D) int64; it and what four paths add end at 255."""
-    detours = [path_costs(cost, base, image, p1, p2, max_slant, direction) - cost for direction in DIRECTIONS]
+    given = cost, base, image, p1, p2, max_slant
+    detours = [path_costs(*given, direction, inside) - cost for direction in DIRECTIONS]
     forward, backward = (np.minimum(sum(half), 255) for half in (detours[:4], detours[4:]))
     return np.minimum((forward + backward + 1) // 2 + 4 * cost.astype(np.int64), 255)
 

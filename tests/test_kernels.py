@@ -748,13 +748,19 @@ def run_match(backend, images, bases_, image, p1, p2, max_slant, check: tuple[in
     ("depth", "columns"), [*((depth, "same") for depth in DEPTHS), (32, "torn"), (64, "stretched")]
 )
 @pytest.mark.parametrize("kind", ["smooth", "rough", "jumps"])
-def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind):
+@pytest.mark.parametrize("content", ["all over", "from side to side"])
+def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind, content):
     rng = np.random.default_rng(depth + size[1])
     left, right = (
         rng.choice(np.array(GREYS["full"], np.int16), (size[0] + 6, width + 8)) for width in (size[1], size[1] + 5)
     )
     base = bases(rng, size, kind)
     valid = [np.where(rng.random(shape) < 0.1, 0, 1).astype(np.uint8) for shape in (size, (size[0], size[1] + 5))]
+    if content == "from side to side":
+        # Rows with content on other sides than the next, and some without.
+        first, end = np.sort(rng.integers(0, size[1] + 1, (2, size[0], 1)), axis=0)
+        column = np.arange(size[1])
+        valid[0][(column < first) | (column >= end)] = 0
     reference, target = oracle.census(left, valid[0]), oracle.census(right, valid[1])
     np.testing.assert_array_equal(run_census(backend, right, valid[1]), target)
     image = (left[3:-3, 4:-4] // 64).astype(np.uint8)
@@ -763,7 +769,8 @@ def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind
     if columns != "same":
         surface = base + rng.integers(-3, 4, size).cumsum(axis=1).astype(np.int32)
         shown = source_columns(rng, target.shape, columns, 2 * size[1]), 2 * size[1]
-    sums = oracle.aggregation(oracle.matching_cost(reference, target, base, depth), surface, image, 10, p2, 2)
+    cost = oracle.matching_cost(reference, target, base, depth)
+    sums = oracle.aggregation(cost, surface, image, 10, p2, 2, oracle.spans(reference))
     expected = oracle.selection(sums, base, reference, target, *shown, 2, 5)
     # In one piece, and in bands of rows: to the bit the same.
     for rows in {1, 2, 3, size[0], size[0] + 1}:

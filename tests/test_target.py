@@ -12,7 +12,7 @@ from colmap_sph.stereo.matching import MatchingOptions, match_pair
 from colmap_sph.stereo.search import prediction as prediction_module
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
 from colmap_sph.stereo.search.prediction import Prediction, torn_by
-from colmap_sph.stereo.search.target import Matches, Target, make_target
+from colmap_sph.stereo.search.target import Matches, Target, TargetRoom, make_target
 
 
 def predicted(offset: np.ndarray, base: np.ndarray | int = -16) -> Prediction:
@@ -79,6 +79,18 @@ def torn_target(base: int) -> tuple[RectifiedImage, Target]:
     offset = np.zeros((20, 40))
     offset[:, 20:] = 9
     return right, make_target(right, with_tears(predicted(offset), unwarped(base, offset.shape)))
+
+
+@pytest.mark.parametrize("max_bytes", [0, 1 << 20])
+def test_a_target_is_the_same_where_others_were(max_bytes: int) -> None:
+    room = TargetRoom(max_bytes)
+    for base in (3, -20):
+        right, target = torn_target(base)
+        again = make_target(right, target.prediction, room)
+        np.testing.assert_array_equal(again.census, target.census)
+        np.testing.assert_array_equal(again.columns, target.columns)
+        last = make_target(right, target.prediction, room)
+        assert np.shares_memory(last.census, again.census) == (max_bytes > 0)
 
 
 @pytest.mark.parametrize("base", [-20, 3, 30])

@@ -53,7 +53,6 @@ static const kernel_table avx2_kernels = TABLE(avx2);
 #endif
 
 #ifdef COLMAP_SPH_HAVE_AVX512
-#define census_avx512 census_avx2
 WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
 #endif

@@ -5,6 +5,7 @@
 #ifdef __x86_64__
 
 #include <cpuid.h>
+#include <stdatomic.h>
 #include <stdint.h>
 
 typedef struct {
@@ -42,16 +43,41 @@ enum {
 #endif
 };
 
-int processor_has_avx2(void) {
+static int runs_avx2(void) {
     return has_bits(read_leaf(1).ecx, bit_AVX | bit_POPCNT) && has_bits(read_leaf(7).ebx, bit_AVX2) &&
            system_keeps(XMM_AND_YMM);
 }
 
-int processor_has_avx512(void) {
+static int runs_avx512(void) {
     const cpuid_leaf leaf = read_leaf(7);
-    return processor_has_avx2() && system_keeps(AVX512_STATE) &&
+    return runs_avx2() && system_keeps(AVX512_STATE) &&
            has_bits(leaf.ebx, bit_AVX512F | bit_AVX512DQ | bit_AVX512IFMA | bit_AVX512BW | bit_AVX512VL) &&
            has_bits(leaf.ecx, bit_AVX512VBMI | bit_AVX512VPOPCNTDQ);
+}
+
+/* What was found is kept: on a virtual machine CPUID takes tens of microseconds, and every call of a kernel asks.
+ * Threads that ask at the same time find the same. */
+typedef _Atomic int answer;
+
+enum { UNKNOWN, NO, YES };
+
+static int kept(answer *known, int (*ask)(void)) {
+    int found = atomic_load_explicit(known, memory_order_relaxed);
+    if (found == UNKNOWN) {
+        found = ask() ? YES : NO;
+        atomic_store_explicit(known, found, memory_order_relaxed);
+    }
+    return found == YES;
+}
+
+int processor_has_avx2(void) {
+    static answer known;
+    return kept(&known, runs_avx2);
+}
+
+int processor_has_avx512(void) {
+    static answer known;
+    return kept(&known, runs_avx512);
 }
 
 #endif

@@ -14,6 +14,7 @@ from colmap_sph.platforms.unix import resource
 _UNKNOWN_USED = 200 << 20
 # Of glibc's mallopt: its parameters' numbers, and the largest threshold that it comes to by itself.
 _TRIM_THRESHOLD = -1
+_TOP_PAD = -2
 _MMAP_THRESHOLD = -3
 _MMAP_BYTES = 32 << 20
 
@@ -55,13 +56,15 @@ def free_under_limits() -> Iterator[int]:
 def keep_freed_memory() -> None:
     """Have arrays of an image's size come from what others have left, not from the system's cleared pages.
 
-    By itself glibc does so only for sizes that it has seen, and gives back what lies at the end of its heaps. Dask
+    By itself glibc does so only for sizes that it has seen, and gives back what lies at the end of its heaps; of
+    threads, whole heaps (64 MiB), unless padding fills what is free in the heap before them. Dask
     has its workers give all freed memory back at once, which made matching take half as long again. Other C
     libraries do as they do.
     """
     with suppress(OSError, AttributeError, TypeError):
         mallopt = ctypes.CDLL(None).mallopt
         mallopt(_TRIM_THRESHOLD, 2 * _MMAP_BYTES)
+        mallopt(_TOP_PAD, 2 * _MMAP_BYTES)
         mallopt(_MMAP_THRESHOLD, _MMAP_BYTES)
 
 

@@ -27,9 +27,11 @@ from colmap_sph.stereo.search.prediction import (
 )
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
 from colmap_sph.stereo.search.seeds import Seeds
-from colmap_sph.stereo.search.target import Matches, make_target
+from colmap_sph.stereo.search.target import Matches, TargetRoom, make_target
 
 _BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
+# Beside these, one part in so many of scratch memory is for what they are compared with.
+_TARGETS_SHARE = 4
 # Segments of fewer pixels than this are removed at every level, however coarse.
 _LEAST_SEGMENT = 4
 # Sky is searched for where what is infinitely far away is no farther from the range than this share of its width:
@@ -129,6 +131,7 @@ class Scratch:
 
     def __init__(self, max_bytes: int = 1 << 30) -> None:
         self.max_bytes = max_bytes
+        self.targets = TargetRoom(max_bytes // _TARGETS_SHARE)
         self._memory = np.empty(0, dtype=np.uint8)
 
     def volume(self, shape: tuple[int, ...], depth: int) -> NDArray[np.uint8]:
@@ -282,7 +285,7 @@ def _match_level(
 ) -> Matches:
     """Matches of one level; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
-    target = make_target(right, prediction, fine=fine and finest)
+    target = make_target(right, prediction, scratch.targets, fine=fine and finest)
     left_census = census(left, fine=fine and finest)
     image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
     del left, right

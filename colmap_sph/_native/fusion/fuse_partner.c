@@ -4,8 +4,8 @@
  * image, and more out of a slanted one. */
 static inline float surface_area(const double *m, double column, double row, float depth, direction normal) {
     const double x = m[0] * column + m[1] * row + m[2], y = m[3] * column + m[4] * row + m[5];
-    const double facing = fabs(normal.x * x + normal.y * y + normal.z);
-    return (float)(m[0] * m[4] * depth * depth / fmax(facing, 1e-3));
+    const double facing = fabs(normal.x * x + normal.y * y + normal.z), least = 1e-3;
+    return (float)(m[0] * m[4] * depth * depth / (facing > least ? facing : least));
 }
 
 /* Pixels that are sighted together, so that compilers work on several at once. */

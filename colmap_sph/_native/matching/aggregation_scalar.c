@@ -24,8 +24,8 @@ static uint8_t slot_or_max(const uint8_t *slots, ptrdiff_t depth, ptrdiff_t i) {
 
 static uint8_t min_u8(int a, int b) { return (uint8_t)(a < b ? a : b); }
 
-/* One step of one path: from `before` (NULL at the image's edge, where L = C) to `path`; the detours are added to
- * those of other paths. */
+/* One step of one path: from `before` (NULL where the path begins, where L = C) to `path`; the detours are added
+ * to those of other paths. */
 static void path_step(const uint8_t *cost, const uint8_t *before, ptrdiff_t depth, int64_t shift, uint8_t p1,
                       uint8_t p2, uint8_t *path, uint8_t *detours) {
     uint8_t least = 255;
@@ -63,14 +63,16 @@ static void sweep_row(sweep_state *s, ptrdiff_t y, const uint8_t *cost, uint8_t 
         rows[(k / 4 + s->done) & 1][k % 4] = s->memory + k * width * depth;
     }
     uint8_t *sum = s->memory + 8 * width * depth;
-    for (ptrdiff_t m = 0; m < width; m++) {
-        const ptrdiff_t x = s->backward ? width - 1 - m : m;
+    const row_span own = span_of(s, y), none = {0, 0}, above = s->done > 0 ? span_of(s, y - step) : none;
+    for (ptrdiff_t m = own.first; m < own.end; m++) {
+        const ptrdiff_t x = s->backward ? own.end - 1 - (m - own.first) : m;
         const ptrdiff_t p = y * width + x;
         memset(sum, 0, (size_t)depth);
         for (int path = 0; path < 4; path++) {
             /* Path 0 comes along the row, 1 to 3 from the three neighbours in the row before. */
             const ptrdiff_t before_x = path == 0 ? x - step : x + (path - 2) * step;
-            const int inside = before_x >= 0 && before_x < width && (path == 0 || s->done > 0);
+            const row_span span = path == 0 ? own : above;
+            const int inside = before_x >= span.first && before_x < span.end;
             const ptrdiff_t q = (path == 0 ? y : y - step) * width + before_x;
             const uint8_t *before = inside ? rows[path > 0][path] + before_x * depth : NULL;
             const int64_t difference = inside ? (int64_t)s->base[p] - s->base[q] : 0;

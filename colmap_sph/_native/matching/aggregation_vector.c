@@ -2,8 +2,8 @@
  *
  * The path along the row stays in registers. The three paths from the row before keep one row each, in place: row
  * n stores pixel x where its predecessor on the path was, which nothing needs any more. Between the pixels lies a
- * gap, so that a load one slot beside a pixel's own reads NO_SLOT. What a path meets at the image's edge are
- * zeros: they make L = C.
+ * gap, so that a load one slot beside a pixel's own reads NO_SLOT. What a path meets at the edge of the
+ * image, or of its content, are zeros: they make L = C.
  *
  * Rows go in groups, each LAG pixels behind the one before: what they leave to each other is still in the nearest
  * cache, and none need wait for its own pixel before. */
@@ -116,29 +116,36 @@ static void compare_bases(const sweep_state *s, ptrdiff_t p, ptrdiff_t offset, p
     }
 }
 
+/* Those of a span's pixels whose predecessors lie `column` columns from them in another span. */
+static row_span followers(row_span own, row_span before, ptrdiff_t column) {
+    const ptrdiff_t first = before.first - column > own.first ? before.first - column : own.first;
+    const ptrdiff_t end = before.end - column < own.end ? before.end - column : own.end;
+    return first < end ? (row_span){first, end} : (row_span){own.end, own.end};
+}
+
 /* Path k < 3 comes from the row before: from column x - 1, x or x + 1 in the direction of the sweep; path 3 along
  * the row. */
 static void prepare_row(const sweep_state *s, ptrdiff_t y, ptrdiff_t done, row_notes notes) {
-    const ptrdiff_t direction = s->backward ? -1 : 1, width = s->size.width;
-    const ptrdiff_t start = s->backward ? width - 1 : 0, before = done > 0 ? y - direction : y;
+    const ptrdiff_t direction = s->backward ? -1 : 1, width = s->size.width, before = done > 0 ? y - direction : y;
+    const row_span own = span_of(s, y), above = done > 0 ? span_of(s, before) : (row_span){0, 0};
     memcpy(notes.grey, s->image + y * width, (size_t)width);
     memcpy(notes.grey_before, s->image + before * width, (size_t)width);
     notes.grey[-1] = notes.grey_before[-1] = notes.grey[width] = notes.grey_before[width] = 0;
     memset(notes.far, 0, (size_t)width);
     for (int k = 0; k < 4; k++) {
-        const ptrdiff_t column = k == 3 ? -direction : (k - 1) * direction, first = column < 0;
-        if (k == 3 || done > 0) {
-            compare_bases(s, y * width + first, (k == 3 ? 0 : -direction * width) + column, width - (column != 0),
-                          k, notes.far + first);
+        const ptrdiff_t column = k == 3 ? -direction : (k - 1) * direction;
+        const row_span follow = followers(own, k == 3 ? own : above, column);
+        compare_bases(s, y * width + follow.first, (k == 3 ? 0 : -direction * width) + column,
+                      follow.end - follow.first, k, notes.far + follow.first);
+        for (ptrdiff_t x = own.first; x < own.end && k < VERTICAL_PATHS; x++) {
+            if (x == follow.first) {
+                x = follow.end;
+            }
+            if (x < own.end) {
+                clear_place(s, place_of(s, done, x, k), k);
+            }
         }
     }
-    for (int k = 0; k < VERTICAL_PATHS && done == 0; k++) {
-        for (ptrdiff_t place = 0; place < places_of(s->size); place++) {
-            clear_place(s, place, k);
-        }
-    }
-    clear_place(s, place_of(s, done, start, 0), 0);
-    clear_place(s, place_of(s, done, width - 1 - start, 2), 2);
 }
 
 /* ---- one pixel --------------------------------------------------------------------------------------------- */
@@ -276,11 +283,12 @@ ALWAYS_INLINE void sweep_pixel(const sweep_state *s, moving_row *row, along_row 
 
 ALWAYS_INLINE void sweep_group(sweep_state *s, ptrdiff_t y, const uint8_t *cost, uint8_t *detours, uint8_t *sums,
                                const ptrdiff_t rows, const ptrdiff_t depth, const int backward) {
-    const ptrdiff_t direction = backward ? -1 : 1, width = s->size.width, start = backward ? width - 1 : 0;
+    const ptrdiff_t direction = backward ? -1 : 1, width = s->size.width;
     const vector p1 = repeat_byte(s->penalties.p1);
     const uint32_t *p2 = penalties_of(s);
     along_row along[ROWS];
     moving_row moving[ROWS];
+    row_span spans[ROWS], both = {width, 0};
     for (ptrdiff_t r = 0; r < rows; r++) {
         const ptrdiff_t step_to = r * direction * width * depth;
         moving[r] = (moving_row){.cost = cost + step_to,
@@ -288,6 +296,10 @@ ALWAYS_INLINE void sweep_group(sweep_state *s, ptrdiff_t y, const uint8_t *cost,
                                  .sums = backward ? sums + step_to : NULL,
                                  .notes = notes_of(s, r),
                                  .y = y + r * direction};
+        spans[r] = span_of(s, moving[r].y);
+        both.first = spans[r].first < both.first ? spans[r].first : both.first;
+        both.end = spans[r].end > both.end ? spans[r].end : both.end;
+        const ptrdiff_t start = backward ? spans[r].end - 1 : spans[r].first;
         prepare_row(s, moving[r].y, s->done + r, moving[r].notes);
         for (int k = 0; k < VERTICAL_PATHS; k++) {
             moving[r].slots[k] = slots_of(s, place_of(s, s->done + r, start, k), k);
@@ -297,12 +309,13 @@ ALWAYS_INLINE void sweep_group(sweep_state *s, ptrdiff_t y, const uint8_t *cost,
             along[r].slots[i] = repeat_byte(0);
         }
     }
-    for (ptrdiff_t m = 0; m < width + (rows - 1) * LAG; m++) {
+    const ptrdiff_t start = backward ? both.end - 1 : both.first;
+    for (ptrdiff_t m = 0; m < both.end - both.first + (rows - 1) * LAG; m++) {
 #pragma GCC unroll 4
         for (ptrdiff_t r = 0; r < rows; r++) {
-            const ptrdiff_t n = m - r * LAG;
-            if (rows == 1 || (size_t)n < (size_t)width) {
-                sweep_pixel(s, &moving[r], &along[r], p2, p1, start + n * direction, depth, backward);
+            const ptrdiff_t x = start + (m - r * LAG) * direction;
+            if (rows == 1 || (x >= spans[r].first && x < spans[r].end)) {
+                sweep_pixel(s, &moving[r], &along[r], p2, p1, x, depth, backward);
             }
         }
     }

@@ -40,7 +40,10 @@ static inline void census_32_pixels(const int16_t *window, ptrdiff_t stride, uin
     for (int k = 0; k < 8; k++) {
         bytes[k] = _mm256_setzero_si256();
     }
+    /* Unrolled, as gcc keeps `bytes` in memory else. */
+#pragma GCC unroll 7
     for (int dy = 0; dy <= 2 * CENSUS_RADIUS_Y; dy++) {
+#pragma GCC unroll 9
         for (int dx = 0; dx <= 2 * CENSUS_RADIUS_X; dx++) {
             if (dy == CENSUS_RADIUS_Y && dx == CENSUS_RADIUS_X) {
                 continue;

@@ -20,6 +20,13 @@ ALWAYS_INLINE void census_in_blocks(census_block_fn *block, ptrdiff_t lanes, con
         for (ptrdiff_t x = 0; x < width; x += lanes) {
             /* The last block overlaps the one before it. */
             const ptrdiff_t start = x + lanes <= width ? x : width - lanes;
+            uint8_t any = 0;
+            for (ptrdiff_t i = 0; i < lanes; i++) {
+                any |= valid[y * width + start + i];
+            }
+            if (!any) {
+                continue;
+            }
             block(padded + y * stride + start, stride, row + start);
         }
         for (ptrdiff_t x = 0; x < width; x++) {

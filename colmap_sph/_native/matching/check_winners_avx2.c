@@ -67,6 +67,10 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
     const __m256i content =
         _mm256_mask_i32gather_epi32(minus_one, (const int *)(const void *)target + 1, r, found, 8);
     found = _mm256_andnot_si256(_mm256_cmpgt_epi32(zero, content), found);
+    if (_mm256_testz_si256(found, found)) {
+        _mm256_maskstore_epi32(offset + x, there, _mm256_set1_epi32(OFFSET_INVALID));
+        return;
+    }
 
     /* The winner's sum between those beside it, with one byte more behind them or, at the row's end, before them.
      */

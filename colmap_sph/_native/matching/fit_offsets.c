@@ -49,6 +49,14 @@ static inline lanes absolute(lanes v) { return (v ^ (v >> 31)) - (v >> 31); }
 
 static inline lanes choose(lanes condition, lanes yes, lanes no) { return (condition & yes) | (~condition & no); }
 
+static inline int any(lanes condition) {
+    int32_t found = 0;
+    for (int l = 0; l < LANES; l++) {
+        found |= condition[l];
+    }
+    return found != 0;
+}
+
 /* Whole quotients of numbers below 2^24 with few digits before the point: rounding lifts none to the next. */
 static inline lanes quotient(lanes a, lanes b) {
     return __builtin_convertvector(
@@ -191,9 +199,13 @@ int VERSION_OF(fit_offsets)(const int32_t *offset, const uint64_t *reference, co
     for (ptrdiff_t y = 0; y < size.height && !failed; y++) {
         for (ptrdiff_t x = 0; x < size.width; x += LANES) {
             const lanes centre = load_lanes(rows[RADIUS].offset + x), none = centre == NONE;
+            const ptrdiff_t p = y * size.width + x, left = size.width - x, count = left < LANES ? left : LANES;
+            if (!any(~none)) {
+                memcpy(fitted + p, offset + p, (size_t)count * sizeof *fitted);
+                continue;
+            }
             const lanes result = fit_pixels(rows, x, centre & ~none);
-            const ptrdiff_t p = y * size.width + x, left = size.width - x;
-            for (ptrdiff_t l = 0; l < (left < LANES ? left : LANES); l++) {
+            for (ptrdiff_t l = 0; l < count; l++) {
                 fitted[p + l] = none[l] ? offset[p + l] : result[l];
             }
         }

@@ -133,7 +133,7 @@ void search_windows(const int32_t *predicted, const float *least, const float *m
 /* Disparities in pixels, minus the offsets and what `shifts` says by their fraction; NaN where there is none. */
 void to_disparity(const int32_t *offset, ptrdiff_t pixels, const float *shifts, float *disparity);
 
-census_fn census_scalar, census_avx2, census_neon;
+census_fn census_scalar, census_avx2, census_avx512, census_neon;
 fit_offsets_fn fit_offsets_scalar, fit_offsets_avx2, fit_offsets_avx512;
 mean_offsets_fn mean_offsets_scalar, mean_offsets_avx2, mean_offsets_avx512;
 

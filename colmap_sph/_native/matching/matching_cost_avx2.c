@@ -94,10 +94,10 @@ ALWAYS_INLINE void look_up(uint64_t reference, const uint8_t *planes, ptrdiff_t 
 }
 
 /* `vectors` are looked up at once; they divide a pixel's. */
-ALWAYS_INLINE void costs_of_row(const uint64_t *reference, const int32_t *base, match_size size,
+ALWAYS_INLINE void costs_of_row(const uint64_t *reference, const int32_t *base, match_size size, row_span span,
                                 const uint8_t *planes, uint8_t *cost, const ptrdiff_t vectors) {
     const ptrdiff_t stride = plane_stride(size), last = size.target_width + size.depth;
-    for (ptrdiff_t x = 0; x < size.width; x++) {
+    for (ptrdiff_t x = span.first; x < span.end; x++) {
         uint8_t *slots = cost + x * size.depth;
         if (reference[x] & CENSUS_INVALID) {
             memset(slots, 0, (size_t)size.depth);
@@ -111,14 +111,14 @@ ALWAYS_INLINE void costs_of_row(const uint64_t *reference, const int32_t *base, 
 }
 
 void cost_row_avx2(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-                   uint64_t *buffer, uint8_t *cost) {
+                   row_span span, uint64_t *buffer, uint8_t *cost) {
     uint8_t *planes = (uint8_t *)buffer;
     make_planes(target, size, planes);
     if (size.depth % 128 == 0) {
-        costs_of_row(reference, base, size, planes, cost, 4);
+        costs_of_row(reference, base, size, span, planes, cost, 4);
     } else if (size.depth % 64 == 0) {
-        costs_of_row(reference, base, size, planes, cost, 2);
+        costs_of_row(reference, base, size, span, planes, cost, 2);
     } else {
-        costs_of_row(reference, base, size, planes, cost, 1);
+        costs_of_row(reference, base, size, span, planes, cost, 1);
     }
 }

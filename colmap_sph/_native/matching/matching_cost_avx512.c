@@ -55,11 +55,11 @@ static inline uint64_t bits_from(const uint8_t *bytes, unsigned shift) {
 }
 
 static inline __attribute__((always_inline)) void costs_of_row(const uint64_t *reference, const int32_t *base,
-                                                               match_size size, const uint64_t *targets,
-                                                               const uint8_t *all_seen, uint8_t *cost,
-                                                               const ptrdiff_t depth) {
+                                                               match_size size, row_span span,
+                                                               const uint64_t *targets, const uint8_t *all_seen,
+                                                               uint8_t *cost, const ptrdiff_t depth) {
     const ptrdiff_t last = size.target_width + depth;
-    for (ptrdiff_t x = 0; x < size.width; x++) {
+    for (ptrdiff_t x = span.first; x < span.end; x++) {
         uint8_t *slots = cost + x * depth;
         if (reference[x] & CENSUS_INVALID) {
             memset(slots, 0, (size_t)depth);
@@ -84,21 +84,21 @@ static inline __attribute__((always_inline)) void costs_of_row(const uint64_t *r
 }
 
 void cost_row_avx512(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-                     uint64_t *buffer, uint8_t *cost) {
+                     row_span span, uint64_t *buffer, uint8_t *cost) {
     uint8_t *seen = (uint8_t *)(buffer + size.target_width + 2 * size.depth);
     copy_row(target, size, buffer, seen);
     /* The usual numbers of disparities as constants, for which the compiler unrolls loops. */
     switch (size.depth) {
     case 32:
-        costs_of_row(reference, base, size, buffer, seen, cost, 32);
+        costs_of_row(reference, base, size, span, buffer, seen, cost, 32);
         break;
     case 64:
-        costs_of_row(reference, base, size, buffer, seen, cost, 64);
+        costs_of_row(reference, base, size, span, buffer, seen, cost, 64);
         break;
     case 128:
-        costs_of_row(reference, base, size, buffer, seen, cost, 128);
+        costs_of_row(reference, base, size, span, buffer, seen, cost, 128);
         break;
     default:
-        costs_of_row(reference, base, size, buffer, seen, cost, size.depth);
+        costs_of_row(reference, base, size, span, buffer, seen, cost, size.depth);
     }
 }

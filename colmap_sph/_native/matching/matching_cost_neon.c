@@ -32,12 +32,12 @@ static void copy_row(const uint64_t *target, match_size size, uint64_t *words, u
     }
 }
 
-ALWAYS_INLINE void costs_of_row(const uint64_t *reference, const int32_t *base, match_size size,
+ALWAYS_INLINE void costs_of_row(const uint64_t *reference, const int32_t *base, match_size size, row_span span,
                                 const uint64_t *words, const uint8_t *all_seen, uint8_t *cost,
                                 const ptrdiff_t depth) {
     const ptrdiff_t last = size.target_width + depth;
     const uint8x16_t unseen = vdupq_n_u8(COST_UNSEEN);
-    for (ptrdiff_t x = 0; x < size.width; x++) {
+    for (ptrdiff_t x = span.first; x < span.end; x++) {
         uint8_t *slots = cost + x * depth;
         if (reference[x] & CENSUS_INVALID) {
             memset(slots, 0, (size_t)depth);
@@ -53,12 +53,12 @@ ALWAYS_INLINE void costs_of_row(const uint64_t *reference, const int32_t *base, 
 }
 
 void cost_row_neon(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-                   uint64_t *buffer, uint8_t *cost) {
+                   row_span span, uint64_t *buffer, uint8_t *cost) {
     uint8_t *seen = (uint8_t *)(buffer + size.target_width + 2 * size.depth);
     copy_row(target, size, buffer, seen);
     if (size.depth == 64) { /* the usual number, for which the compiler unrolls the loop */
-        costs_of_row(reference, base, size, buffer, seen, cost, 64);
+        costs_of_row(reference, base, size, span, buffer, seen, cost, 64);
     } else {
-        costs_of_row(reference, base, size, buffer, seen, cost, size.depth);
+        costs_of_row(reference, base, size, span, buffer, seen, cost, size.depth);
     }
 }

@@ -12,9 +12,9 @@ static uint8_t hamming(uint64_t a, uint64_t b) {
 }
 
 void cost_row_scalar(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-                     uint64_t *buffer, uint8_t *cost) {
+                     row_span span, uint64_t *buffer, uint8_t *cost) {
     (void)buffer;
-    for (ptrdiff_t x = 0; x < size.width; x++) {
+    for (ptrdiff_t x = span.first; x < span.end; x++) {
         uint8_t *slots = cost + x * size.depth;
         if (reference[x] & CENSUS_INVALID) {
             memset(slots, 0, (size_t)size.depth);

@@ -9,6 +9,7 @@ _Static_assert((2 * MAX_MEAN_RADIUS + 1) * (2 * MAX_MEAN_RADIUS + 1) * (int64_t)
 
 typedef int32_t lanes __attribute__((vector_size(4 * LANES)));
 typedef uint32_t unsigned_lanes __attribute__((vector_size(4 * LANES)));
+typedef double double_lanes __attribute__((vector_size(8 * LANES)));
 
 static inline lanes load_lanes(const int32_t *p) {
     lanes v;
@@ -37,9 +38,11 @@ static inline void mean_of_lanes(const int32_t *own, ptrdiff_t width, row_range 
             count -= kept;
         }
     }
-    for (int l = 0; l < LANES; l++) {
-        mean[l] = middle[l] + sum[l] / count[l];
-    }
+    /* Whole quotients of 32-bit numbers: doubles are fine enough that rounding lifts none to the next. */
+    const double_lanes quotient =
+        __builtin_convertvector(sum, double_lanes) / __builtin_convertvector(count, double_lanes);
+    const lanes means = middle + __builtin_convertvector(quotient, lanes);
+    memcpy(mean, &means, sizeof means);
 }
 
 static inline int32_t mean_at(const int32_t *row, ptrdiff_t width, row_range rows, ptrdiff_t x, int radius,

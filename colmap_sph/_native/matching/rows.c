@@ -33,7 +33,8 @@ void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, c
     memset(best, UINT8_MAX, (size_t)source_width * sizeof *best);
     for (int32_t w = 0; w < target_width; w++) {
         const int32_t first = columns[w];
-        if (first < 0 || first >= source_width) {
+        /* Those that nothing points at have no say. */
+        if (best_sum[w] == UINT8_MAX || first < 0 || first >= source_width) {
             continue;
         }
         const uint32_t own = (uint32_t)best_sum[w] << 24 | (uint32_t)w;
@@ -59,7 +60,7 @@ int cost_of_rows(const row_kernels *kernels, const uint64_t *reference, const ui
     const int status = buffer ? 0 : -1;
     for (ptrdiff_t y = 0; !status && y < size.height; y++) {
         kernels->cost_row(reference + y * size.width, target + y * size.target_width, base + y * size.width, size,
-                          buffer, cost + y * size.width * size.depth);
+                          (row_span){0, size.width}, buffer, cost + y * size.width * size.depth);
     }
     free(buffer);
     return status;
@@ -105,6 +106,7 @@ typedef struct {
     const row_kernels *kernels;
     const match_input *input;
     ptrdiff_t row_size, band_rows;
+    row_span *spans;
     uint64_t *cost_buffer;
     uint8_t *row_sums;
     selection_buffers selection;
@@ -119,7 +121,7 @@ static void forward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost,
     const match_input *in = m->input;
     for (ptrdiff_t r = y; r < y + rows; r++) {
         m->kernels->cost_row(in->reference + r * in->size.width, in->target + r * in->size.target_width,
-                             in->base + r * in->size.width, in->size, m->cost_buffer,
+                             in->base + r * in->size.width, in->size, m->spans[r], m->cost_buffer,
                              cost + (r - y) * m->row_size);
     }
     m->kernels->sweep_rows(&m->forward, y, rows, cost, detours, NULL);
@@ -171,6 +173,19 @@ static void match_bands(matcher *m, ptrdiff_t bands, uint8_t *cost, int32_t *off
     }
 }
 
+static void find_spans(const uint64_t *reference, match_size size, row_span *spans) {
+    for (ptrdiff_t y = 0; y < size.height; y++, reference += size.width) {
+        ptrdiff_t first = 0, end = size.width;
+        while (first < end && reference[first] & CENSUS_INVALID) {
+            first++;
+        }
+        while (end > first && reference[end - 1] & CENSUS_INVALID) {
+            end--;
+        }
+        spans[y] = (row_span){first, end};
+    }
+}
+
 int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band_rows, uint8_t *scratch,
                int32_t *offset) {
     const ptrdiff_t bands = in->size.height > 0 ? (in->size.height + band_rows - 1) / band_rows : 0;
@@ -183,11 +198,15 @@ int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band
         m.cost_buffer = cost_row_buffer(in->size);
         m.row_sums = malloc(((size_t)(m.row_size * GROUP) + 1) * sizeof *m.row_sums);
         m.checkpoints = malloc((size_t)(bands > 1 ? bands - 1 : 1) * m.forward.memory_size);
-        if (m.cost_buffer && m.row_sums && m.checkpoints) {
+        m.spans = malloc(((size_t)in->size.height + 1) * sizeof *m.spans);
+        if (m.cost_buffer && m.row_sums && m.checkpoints && m.spans) {
+            find_spans(in->reference, in->size, m.spans);
+            m.forward.spans = m.backward.spans = m.spans;
             match_bands(&m, bands, scratch, offset);
             status = 0;
         }
     }
+    free(m.spans);
     free(m.checkpoints);
     free(m.row_sums);
     free(m.cost_buffer);

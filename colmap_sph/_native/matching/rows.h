@@ -10,11 +10,17 @@ ALWAYS_INLINE void prefetch(const void *row, ptrdiff_t offset) {
     __builtin_prefetch((const void *)((uintptr_t)row + (uintptr_t)offset));
 }
 
+/* From the first pixel of a row with content to behind the last: what lies outside is not worked on. */
+typedef struct {
+    ptrdiff_t first, end;
+} row_span;
+
 /* ---- matching cost ----------------------------------------------------------------------------------------- */
 
-/* Costs of one row, `size.width * size.depth` of them; `buffer` is one of cost_row_buffer. */
+/* Costs of one row, `size.depth` for each pixel of the span, in their places among `size.width`; `buffer` is one
+ * of cost_row_buffer. */
 typedef void cost_row_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
-                         uint64_t *buffer, uint8_t *cost);
+                         row_span span, uint64_t *buffer, uint8_t *cost);
 /* Room for one target row with `depth` unseen pixels on both sides, in three words each; NULL without memory. */
 uint64_t *cost_row_buffer(match_size size);
 
@@ -23,8 +29,9 @@ uint64_t *cost_row_buffer(match_size size);
 /* One sweep over the image, four paths at once, forward (from the top left) or backward. `memory` holds all that a
  * row leaves to the next. */
 typedef struct {
-    const int32_t *base;  /* of the whole image, */
-    const uint8_t *image; /* as this one */
+    const int32_t *base;   /* of the whole image, */
+    const uint8_t *image;  /* as this one */
+    const row_span *spans; /* of each row, outside of which paths begin and end; NULL: all pixels */
     match_size size;
     path_penalties penalties;
     int backward;
@@ -33,7 +40,11 @@ typedef struct {
     size_t memory_size;
 } sweep_state;
 
-/* 0, or -1 without memory; ended by free_aligned(state->memory). */
+ALWAYS_INLINE row_span span_of(const sweep_state *s, ptrdiff_t y) {
+    return s->spans ? s->spans[y] : (row_span){0, s->size.width};
+}
+
+/* 0, or -1 without memory; ended by free_aligned(state->memory). Without spans, at first. */
 typedef int sweep_begin_fn(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
                            path_penalties penalties, int backward);
 /* The next `rows` rows, from y on. A forward sweep writes `detours`; a backward one, whose rows lie before the one

@@ -25,6 +25,33 @@ _WINDOW = 7
 _BETTER = 1
 
 
+class TargetRoom:
+    """Memory for the largest targets, those that are joined, kept from level to level and from pair to pair.
+
+    One is in use at a time. Fresh memory of that size would come from the system each time, which clears it.
+
+    Parameters
+    ----------
+    max_bytes : int
+        Targets that need more are not kept.
+    """
+
+    def __init__(self, max_bytes: int = 0) -> None:
+        self.max_bytes = max_bytes
+        self._words = np.empty(0, dtype=np.uint64)
+        self._columns = np.empty(0, dtype=np.int32)
+
+    def arrays(self, height: int, width: int) -> tuple[NDArray[np.uint64], NDArray[np.int32]]:
+        """Census and columns of a target, not set."""
+        size = height * width
+        if size * (self._words.itemsize + self._columns.itemsize) > self.max_bytes:
+            return np.empty((height, width), np.uint64), np.empty((height, width), np.int32)
+        if size > self._words.size:
+            self._words = np.empty(size, dtype=np.uint64)
+            self._columns = np.empty(size, dtype=np.int32)
+        return self._words[:size].reshape(height, width), self._columns[:size].reshape(height, width)
+
+
 @dataclass(frozen=True, eq=False)
 class Target:
     """What the left image of a level is compared with.
@@ -108,7 +135,9 @@ class Matches:
         return np.asarray(sums / np.maximum(numbers, 1), dtype=np.float32)
 
 
-def make_target(right: RectifiedImage, prediction: Prediction, *, fine: bool = False) -> Target:
+def make_target(
+    right: RectifiedImage, prediction: Prediction, room: TargetRoom | None = None, *, fine: bool = False
+) -> Target:
     """Warp a level's right image as predicted.
 
     Parameters
@@ -117,6 +146,8 @@ def make_target(right: RectifiedImage, prediction: Prediction, *, fine: bool = F
         (H, W_right).
     prediction : Prediction
         Of the left image's (H, W) pixels.
+    room : TargetRoom, optional
+        What the target may be in until the next one is made.
     fine : bool
         As of `census`.
 
@@ -138,8 +169,7 @@ def make_target(right: RectifiedImage, prediction: Prediction, *, fine: bool = F
     # Windows of torn pixels that begin left of the right image must not reach what lies before it here.
     gap = prediction.depth
     as_it_is = words.shape[1] + gap
-    both = np.empty((height, as_it_is + right_width), dtype=np.uint64)
-    both_columns = np.empty(both.shape, dtype=np.int32)
+    both, both_columns = (room or TargetRoom()).arrays(height, as_it_is + right_width)
     _native.join_targets(words, columns, census(right, fine=fine), both, both_columns)
     del words, columns
     base = np.empty_like(prediction.base)
