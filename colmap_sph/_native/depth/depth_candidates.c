@@ -3,8 +3,7 @@
  * Sphere: ray (X, Y, Z) = r (sin t, cos t sin l, cos t cos l); with parallax angle delta and baseline b the
  * distance along the left ray is b cos(t - delta) / sin(delta) = b (cos t cot(delta) + sin t), along the right
  * ray b (cos t cot(delta) - sin t). Columns are equal steps of u = tan(k t) / k, with flatness k, so that
- * tan(k delta) = k (u_l - u_r) / (1 + k u_l k u_r), or of t where k = 0. Where k = 1, as most often, cot(delta)
- * needs no angle. Plane: Z = b f / d. */
+ * tan(k delta) = k (u_l - u_r) / (1 + k u_l k u_r), or of t where k = 0. Plane: Z = b f / d. */
 #include <math.h>
 #include <string.h>
 
@@ -59,9 +58,8 @@ typedef struct {
     float centre[BLOCK];                      /* disparity of the nearest pixel, and of those ... */
     float left[BLOCK], right[BLOCK], above[BLOCK], below[BLOCK]; /* ... around it, NaN beyond the rim ... */
     float across[BLOCK];                                         /* ... and that beyond (u, v) */
-    float change[BLOCK], spread[BLOCK]; /* of the disparity from there to (u, v); its standard deviation */
-    double parallax[BLOCK]; /* the parallax angle; where columns are wholly flat, what they differ by */
-    double cotangent[BLOCK], stretch[BLOCK]; /* of the angle, NaN where it is none; its change with columns */
+    float change[BLOCK], spread[BLOCK];     /* of the disparity from there to (u, v); its standard deviation */
+    double parallax[BLOCK], stretch[BLOCK]; /* the parallax angle, and its change with that of columns */
     float depth[BLOCK], sigma[BLOCK];
 } block;
 
@@ -79,18 +77,13 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
         for (int i = 0; i < BLOCK; i++) {
             const double across = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
             k->across_axis[i] = across;
-            k->u[i] = k->x[i] / across;
+            k->u[i] = arctangent2(k->x[i], across);
             k->v[i] = arctangent2(k->y[i], k->z[i]) * rows - row_origin;
         }
         const double flatness = g->flatness;
-        if (flatness != 1) {
+        if (flatness > 0) {
             for (int i = 0; i < BLOCK; i++) {
-                k->u[i] = arctangent2(k->x[i], k->across_axis[i]);
-            }
-            if (flatness > 0) {
-                for (int i = 0; i < BLOCK; i++) {
-                    k->u[i] = tangent(flatness * k->u[i]) / flatness;
-                }
+                k->u[i] = tangent(flatness * k->u[i]) / flatness;
             }
         }
         for (int i = 0; i < BLOCK; i++) {
@@ -190,23 +183,15 @@ static inline void interpolate(double max_disparity_step, block *k) {
     }
 }
 
-/* Parallaxes and what follows from them, by the disparities and, on flat columns, where they are. */
-static inline void find_parallaxes(const pair_geometry *g, block *k) {
-    const double side = g->is_left ? 1 : -1, radians = 1 / g->columns_per_radian, flatness = g->flatness;
+/* With the ray r of depth 1, sin t = x / |r| and cos t = across / |r|: depth, the distance over |r|, has |r|^2 as
+ * its only divisor. */
+static inline void triangulate_sphere(const pair_geometry *g, block *k) {
+    const double side = g->is_left ? 1 : -1, radians = 1 / g->columns_per_radian;
     for (int i = 0; i < BLOCK; i++) {
         k->parallax[i] = ((double)k->centre[i] + k->change[i] + g->disparity_origin) * radians;
         k->stretch[i] = 1;
     }
-    if (flatness == 1) {
-        for (int i = 0; i < BLOCK; i++) {
-            const double own = radians * (k->u[i] + g->column_origin), apart = k->parallax[i];
-            const double other = own - side * apart, product = 1 + own * other;
-            /* False for NaN. */
-            k->cotangent[i] = (apart > 0) & (product > 0) ? product / apart : NAN;
-            k->stretch[i] = 1 / (1 + other * other);
-        }
-        return;
-    }
+    const double flatness = g->flatness;
     if (flatness > 0) {
         for (int i = 0; i < BLOCK; i++) {
             const double own = flatness * radians * (k->u[i] + g->column_origin);
@@ -216,22 +201,12 @@ static inline void find_parallaxes(const pair_geometry *g, block *k) {
         }
     }
     for (int i = 0; i < BLOCK; i++) {
-        const double delta = k->parallax[i], cot = cotangent(delta);
-        k->cotangent[i] = (delta > 0) & (delta < HALF_PI) ? cot : NAN;
-    }
-}
-
-/* With the ray r of depth 1, sin t = x / |r| and cos t = across / |r|: depth, the distance over |r|, has |r|^2 as
- * its only divisor. */
-static inline void triangulate_sphere(const pair_geometry *g, block *k) {
-    const double side = g->is_left ? 1 : -1, radians = 1 / g->columns_per_radian;
-    find_parallaxes(g, k);
-    for (int i = 0; i < BLOCK; i++) {
-        const double cot = k->cotangent[i], across = k->across_axis[i];
+        const double delta = k->parallax[i];
+        const double cot = cotangent(delta), across = k->across_axis[i];
         const double scale = g->baseline / (k->x[i] * k->x[i] + across * across);
         const double depth = scale * (across * cot + side * k->x[i]);
         const double slope = scale * across * (1 + cot * cot);
-        const int found = depth > 0; /* false for NaN */
+        const int found = delta > 0 && delta < HALF_PI && depth > 0; /* false for NaN */
         k->depth[i] = found ? (float)depth : 0;
         k->sigma[i] = found ? (float)(slope * k->stretch[i] * radians * k->spread[i]) : 0;
     }
