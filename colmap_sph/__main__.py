@@ -60,7 +60,6 @@ def _command() -> int:
     _load_colmap()
     from colmap_sph.app import cli
 
-    gc.freeze()  # nor to be looked through again and again
     gc.enable()
     try:
         code = cli.main()
