@@ -56,6 +56,8 @@ def _command() -> int:
     if is_handed_over(sys.argv[1:]):
         with suppress(InputError):  # said below
             hand_over(sys.argv[1:])
+    # NumPy's linear algebra, loaded below, would spin on all cores for products of a few columns.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.disable()  # what is loaded stays: nothing to be found
     _load_colmap()
     from colmap_sph.app import cli

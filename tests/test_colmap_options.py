@@ -227,6 +227,13 @@ def test_other_commands_are_colmaps_and_never_ours_in_a_circle(tmp_path):
     assert alone.returncode == 2 and "apt install colmap" in alone.stderr and "run --model" in alone.stderr
 
 
+def test_what_is_handed_over_runs_as_it_would_by_itself(tmp_path, monkeypatch):
+    """On all processors: what ours is kept to for itself is not COLMAP's."""
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    program(tmp_path / "theirs", 'echo "${OPENBLAS_NUM_THREADS-unset}"')
+    assert hand_over([tmp_path / "theirs"], "mapper").stdout == "unset\n"
+
+
 def test_no_command_of_colmap_is_one_of_ours():
     assert not {"run", "demo", "evaluate", "report", "view"} & (names.OTHERS | set(names.OWN))
 

@@ -29,7 +29,7 @@ _WANTED_OPEN_FILES = 4096
 
 
 def prepare_process() -> str | None:
-    """Make the standard streams hold, raise the limit of open files as far as allowed, and keep NumPy to a thread.
+    """Make the standard streams hold, and raise the limit of open files as far as allowed.
 
     Returns
     -------
@@ -46,8 +46,6 @@ def prepare_process() -> str | None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="backslashreplace")
     raise_open_files_limit(_WANTED_OPEN_FILES)
-    # NumPy's linear algebra, loaded later, would spin on all cores for products of a few columns.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return _missing()
 
 
