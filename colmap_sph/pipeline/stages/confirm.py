@@ -144,17 +144,22 @@ def _estimate(file: EstimateFile) -> DepthEstimate:
     return estimate
 
 
+def _whole_image(file: EstimateFile) -> NDArray[np.uint8]:
+    return read_whole_grey(file.image, (file.whole.width, file.whole.height))
+
+
 def _image(file: EstimateFile) -> NDArray[np.uint8]:
     size = (file.whole.width, file.whole.height)
     key = f"image {file_stamp(file.image)} {size} {file.window}"
-    image = _loaded.get(key, lambda: file.window.part(read_whole_grey(file.image, size)))
+    image = _loaded.get(key, lambda: file.window.part(_whole_image(file)))
     assert not isinstance(image, DepthEstimate)
     return image
 
 
 def _faint(file: EstimateFile, mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
     """See `faint_pixels`; found in the whole image, so that a region has no part in it."""
-    image = read_whole_grey(file.image, (file.whole.width, file.whole.height))
+    is_whole = file.window == Window.whole(file.whole)
+    image = _image(file) if is_whole else _whole_image(file)
     faint = faint_pixels(image, coarsest_jpeg_step(file.image, file.record))
     if mask is not None:
         faint[mask == 0] = 0
