@@ -511,9 +511,9 @@ def fuse_view(reference, partners, options, stations):
                 continue
             x, y = pixel
             other = pixel_area(partner.view, pixel, float(partner.depth[y, x]), partner.normals[:, y, x])
-            margin = min(abs(distance / options.max_reproj_error - 1), abs(other / area - 1))
+            margin = min(abs(distance / options.reprojection_error - 1), abs(other / area - 1))
             clearance[row, col] = min(clearance[row, col], margin)
-            covered |= distance <= options.max_reproj_error and other < area
+            covered |= distance <= options.reprojection_error and other < area
             views.append(partner.index)
             seen_from.add(station)
             colours.append(partner.image[y, x].astype(int))

@@ -33,6 +33,7 @@ from colmap_sph.project.pair_lists import write_fusion_cfg
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
+from colmap_sph.stereo import fusion
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions, PackedMaps
 
@@ -263,6 +264,7 @@ def test_little_memory_changes_nothing(workspace, monkeypatch):
 def test_memory_is_what_is_reserved(workspace, monkeypatch):
     """Arrays of one image at a time, without a cache: measured, against 60 bytes per pixel."""
     monkeypatch.setattr(memory, "resident", lambda: 100 << 20)
+    monkeypatch.setattr(fusion, "_BAND_PIXELS", 1 << 10)  # the image is smaller than a band otherwise
     options = {"memory": f"{(100 << 20) + NEEDED + 1000}B", "fusion": FusionOptions(min_num_pixels=1)}
     fuse(workspace, **options)
     shutil.rmtree(workspace.state_dir)

@@ -155,7 +155,8 @@ def test_no_holes(yard, least, max_reproj_error):
 
 
 @pytest.mark.parametrize(
-    ("max_reproj_error", "share"), [(0.5, 1 - np.pi / 4), (0.25, 1 - np.pi / 16), (NO_DOUBLES, 0)]
+    ("max_reproj_error", "share"),
+    [(0.5, 1 - np.pi / 4), (None, 1 - np.pi * 0.35**2), (0.25, 1 - np.pi / 16), (NO_DOUBLES, 0)],
 )
 def test_points_come_from_the_finer_image(max_reproj_error, share):
     """Of the coarse image's pixels those stay that no circle about a fine pixel holds: its share of a square."""

@@ -39,9 +39,10 @@ class FusionOptions:
     min_num_pixels: int = 2
     """Pixels, of different images, that must agree on a point (COLMAP: 5). In our own fusion images that stand
     side by side count as one."""
-    max_reproj_error: float = 0.5
+    max_reproj_error: float | None = None
     """A pixel makes no point of its own where it projects within this many pixels of the centre of a finer image's
-    pixel that agrees. COLMAP's fusion merges pixels this near (COLMAP: 2)."""
+    pixel that agrees: less makes a denser cloud. COLMAP's fusion merges pixels this near (COLMAP: 2). None: 0.35;
+    0.5 for COLMAP's."""
     max_depth_error: float = 0.01
     """Largest relative difference of depths that agree."""
     max_normal_error: float = 30.0
@@ -87,8 +88,16 @@ class FusionOptions:
                 "min_num_pixels",
             )
         for name in ("max_reproj_error", "max_depth_error", "max_normal_error", "cache_size"):
-            if not getattr(self, name) > 0:
-                raise OptionError(f"{name} must be positive, not {getattr(self, name)}.", name)
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise OptionError(f"{name} must be positive, not {value}.", name)
+
+    @property
+    def reprojection_error(self) -> float:
+        """`max_reproj_error`, or what it is by default, pixels."""
+        if self.max_reproj_error is not None:
+            return self.max_reproj_error
+        return 0.35 if self.method == "best-pixel" else 0.5
 
     def for_colmap(self) -> dict[str, Any]:
         """The options that COLMAP's fusion has, too, under its names."""
@@ -97,6 +106,7 @@ class FusionOptions:
             for field in fields(self)
             if field.name not in ("method", "input", "visibility", "max_points_per_file")
         }
+        values["max_reproj_error"] = self.reprojection_error
         return {name: value for name, value in values.items() if value is not None}
 
 
@@ -218,7 +228,7 @@ def fuse_view(
             partner.image,
             pixel_transfer(reference.view, partner.view),
             reference.view.R @ partner.view.R.T,
-            options.max_reproj_error,
+            options.reprojection_error,
             options.max_depth_error,
             np.cos(np.radians(options.max_normal_error)),
             partner.index < reference.index,

@@ -186,5 +186,5 @@ def _losses_in(
     )
     losses = _LOSS_OF_GATE[gate]
     if options.method == "colmap":  # for ours, what is farther away agrees all the same, as a point of its own
-        losses[(losses > _Loss.DEPTH) & (distance > options.max_reproj_error)] = _Loss.REPROJECTION
+        losses[(losses > _Loss.DEPTH) & (distance > options.reprojection_error)] = _Loss.REPROJECTION
     return losses

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 Partners = Mapping[str, tuple[list[str], list[int]]]
 """For each image to fuse those that it is looked up in, and their stations; see `PartnersInFusion`."""
 
-CLOUD_BYTES = 12.0
+CLOUD_BYTES = 22.0
 """Bytes on disk per pixel, of the cloud."""
 
 # Processor seconds per megapixel of the image, and per image that overlaps it.
