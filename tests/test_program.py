@@ -1,5 +1,6 @@
 """Which code a result's key holds: what its maker reaches by import, all of it, and nothing else."""
 
+import ast
 import json
 import shutil
 import subprocess
@@ -37,6 +38,26 @@ def test_no_key_holds_what_makes_nothing(maker: str) -> None:
     assert rooms.isdisjoint(ROOMS_THAT_MAKE_NOTHING)
     shared = {"context", "execute", "keys", "options", "plan", "reconstruct", "report", "workers"}
     assert {f"colmap_sph.pipeline.{name}" for name in shared}.isdisjoint(reached_modules(maker))
+
+
+def imported(node: ast.AST) -> set[str]:
+    """Full names of what code imports of the package, by Python's parser, but not for type checkers only."""
+    if isinstance(node, ast.Import):
+        names = {alias.name for alias in node.names}
+    elif isinstance(node, ast.ImportFrom) and node.module:
+        names = {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    elif isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING":
+        names = set().union(*map(imported, node.orelse))
+    else:
+        names = set().union(*map(imported, ast.iter_child_nodes(node)))
+    return {name for name in names if name.partition(".")[0] == "colmap_sph"}
+
+
+def test_imports_are_found_as_python_finds_them() -> None:
+    """In all code of the package: none is written so that a search of its text misses it."""
+    for path in sorted(PACKAGE.rglob("*.py")):
+        source = path.read_bytes()
+        assert set(program._ours_imported(source)) == imported(ast.parse(source)), path
 
 
 @pytest.fixture

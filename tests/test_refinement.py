@@ -327,6 +327,12 @@ def test_refinement_comes_nearer_to_the_truth(block, scene, name):
     np.testing.assert_allclose(np.linalg.norm(refined[found], axis=-1), 1, atol=1e-5)
 
 
+@pytest.mark.parametrize(("pixels", "rounds"), [(0.0, 1), (0.19, 1), (0.2, 2), (1.0, 2)])
+def test_precise_poses_need_one_round(pixels, rounds):
+    assert replace(OPTIONS, rounds=2).for_residual(pixels).rounds == rounds
+    assert replace(OPTIONS, rounds=0).for_residual(pixels).rounds == 0
+
+
 def test_without_partners_or_rounds_maps_stay(block, scene):
     views, images = scene
     view = views.view(NAME)

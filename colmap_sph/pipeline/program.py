@@ -5,8 +5,8 @@ package would make everything anew for the edit of a help text. What a stage say
 maker, and changes the digest, too.
 """
 
-import ast
 import platform
+import re
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -22,8 +22,11 @@ from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.project.colmap_library import COLMAP_VERSION
 
 _ROOT = Path(__file__).parents[1]
-# Where statements hold other ones: walking through their expressions as well would take ten times as long.
-_BLOCKS = ("body", "orelse", "finalbody", "handlers", "cases")
+# Import statements of formatted code, from the start of a line on: to parse all code would take ten times as long.
+_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+)?import[ \t]+(\([^)]*\)|.*)", re.MULTILINE)
+_COMMENT = re.compile(r"#.*")
+# What only type checkers import: the statement, and all lines that are further in, or empty.
+_FOR_TYPES = re.compile(rb"^([ \t]*)if TYPE_CHECKING:.*\n(?:\1[ \t]+.*\n|[ \t]*\n)*", re.MULTILINE)
 
 
 @cache
@@ -79,25 +82,10 @@ def _imported_by(module: str) -> Iterator[str]:
 def _ours_imported(source: bytes) -> tuple[str, ...]:
     """Full names of what a module's code imports of this package, of ``from a import b`` also ``a.b``."""
     names: list[str] = []
-    for statement in _running(ast.parse(source)):
-        if isinstance(statement, ast.Import):
-            names += [alias.name for alias in statement.names]
-        elif isinstance(statement, ast.ImportFrom) and statement.module:
-            names += [statement.module, *(f"{statement.module}.{alias.name}" for alias in statement.names)]
+    for package, imported in _IMPORT.findall(_FOR_TYPES.sub(b"", source).decode()):
+        modules = [name.split()[0] for name in _COMMENT.sub("", imported).strip("()").split(",") if name.strip()]
+        names += [package, *(f"{package}.{name}" for name in modules)] if package else modules
     return tuple(name for name in names if name.partition(".")[0] == _ROOT.name)
-
-
-def _running(module: ast.Module) -> Iterator[ast.AST]:
-    """All statements of a module, at any depth, but those in ``if TYPE_CHECKING:``."""
-    waiting: list[ast.AST] = [module]
-    while waiting:
-        node = waiting.pop()
-        yield node
-        is_for_types = (
-            isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
-        )
-        for field in ("orelse",) if is_for_types else _BLOCKS:
-            waiting += getattr(node, field, ())
 
 
 def _source_of(module: str) -> Path:

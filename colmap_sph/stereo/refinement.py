@@ -41,7 +41,8 @@ class RefinementOptions:
     """How depth and normals are refined on the images."""
 
     rounds: int = 2
-    """Times that all planes are refined; 0 leaves them as the disparity maps gave them."""
+    """Times that all planes are refined, at most: views with precise poses are refined once, as what comes between
+    two rounds smooths. 0 leaves planes as the disparity maps gave them."""
     max_partners: int = 8
     """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
     depth_freedom: float = 6.0
@@ -74,6 +75,13 @@ class RefinementOptions:
             raise OptionError(
                 f"smoothing_radius must lie in 1..16, not {self.smoothing_radius}.", "smoothing_radius"
             )
+
+    def for_residual(self, pixels: float) -> "RefinementOptions":
+        """The same for a view whose rows disagree with its partners' by so many pixels.
+
+        One round where that is less than matches are off by.
+        """
+        return replace(self, rounds=min(self.rounds, 1)) if pixels < _MATCH_SIGMA else self
 
     def images_used(self, partners: int) -> int:
         """How often a partner's image is matched in, all rounds together, where there are so many partners."""

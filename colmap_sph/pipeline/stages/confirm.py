@@ -116,14 +116,9 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     planes = fit_normals(view, confirmed, task.normal_options)
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
+        options = _refinement(task.refinement_options, view, task.residuals)
         planes = refine_maps(
-            view,
-            _image(task.reference),
-            confirmed,
-            *planes,
-            sources,
-            task.refinement_options,
-            _usual(task.residuals),
+            view, _image(task.reference), confirmed, *planes, sources, options, _usual(task.residuals)
         )
     drop_other_depths(planes[1], task.depths)
     drop_outside(view, planes[1], region_of(task.focus))
@@ -135,6 +130,11 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
 
 def _usual(residuals: Sequence[float]) -> float:
     return float(np.median(residuals)) if residuals else 0.0
+
+
+def _refinement(options: RefinementOptions, view: View, residuals: Sequence[float]) -> RefinementOptions:
+    """How a view is refined whose pairs have such row residuals, radians."""
+    return options.for_residual(_usual(residuals) * float(view.K[0, 0]))
 
 
 def _estimate(file: EstimateFile) -> DepthEstimate:
@@ -214,8 +214,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         partners, stations = self.context.stations.elsewhere(item, self._partners(item))
         votes = [self._vote_keys[name] for name in partners]
         sights = self.context.sparse_tracks.sights(item).between(options.rectification.depths)
-        lead_of = self.context.lead
-        residuals = [self._residuals[as_pair(lead_of(item), lead_of(name))] for name in partners]
+        residuals = self._residuals_with(item, partners)
         cut = self.context.cut(item)
         key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights, cut)
         maps = self.context.map_files(item, "geometric")
@@ -242,6 +241,11 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         facing = self.context.facing.views(name, self._matched(name))
         return [other for views in facing for other in views if other in self._vote_keys]
 
+    def _residuals_with(self, name: str, partners: Sequence[str]) -> list[float]:
+        """Row residuals of a view's pairs, radians."""
+        lead_of = self.context.lead
+        return [self._residuals[as_pair(lead_of(name), lead_of(partner))] for partner in partners]
+
     def _matched(self, name: str) -> list[str]:
         return self._all_partners.get(self.context.lead(name), [])
 
@@ -260,7 +264,8 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
     def _cost(self, name: str) -> Cost:
         pixels = self._pixels(name)
         partners = self._partners(name)
-        refinement = self.context.options.refinement
+        residuals = self._residuals_with(name, partners)
+        refinement = _refinement(self.context.options.refinement, self.context.scene.view(name), residuals)
         seconds = confirm_seconds(len(partners), self.context.options.normals, refinement)
         memory = _CONFIRM_BYTES * pixels
         if refinement.rounds:
