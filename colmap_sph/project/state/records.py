@@ -17,7 +17,7 @@ import msgspec
 import xxhash
 from msgspec import Meta
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, OutputError, reason_of, unwritable
 from colmap_sph.platforms.files import is_link, sync_file, sync_folder
 from colmap_sph.project.files import (
     atomic_file,
@@ -222,9 +222,7 @@ def _sync_and_vouch(
         for folder in {path.parent for path in written}:
             sync_folder(folder)
     except OSError as error:
-        raise OutputError(
-            f"{next(iter(files))} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
+        raise unwritable(next(iter(files)), error) from error
     vouch(record, key, files, facts, state=state)
 
 
