@@ -103,6 +103,13 @@ def reason_of(error: BaseException | None) -> str:
     return words or type(error).__name__
 
 
+def unwritable(path: object, error: OSError | RuntimeError) -> OutputError:
+    """The error of a file that cannot be written, with what may help."""
+    is_folder = isinstance(error, IsADirectoryError)
+    remedy = "remove the folder, the file goes there" if is_folder else "check space and permissions"
+    return OutputError(f"{path} cannot be written ({reason_of(error)}); {remedy}.")
+
+
 def printable(text: object) -> str:
     r"""Text for a terminal or a log: one line, without characters that steer a terminal or cannot be seen.
 

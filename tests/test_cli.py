@@ -22,9 +22,11 @@ from conftest import keep_images
 
 import colmap_sph
 from colmap_sph.app import cli, run_command, spelling
+from colmap_sph.app.cli import _parsed
 from colmap_sph.app.option_list import option_groups
+from colmap_sph.app.products.surface_command import SurfaceCommand
 from colmap_sph.app.run_command import RunCommand
-from colmap_sph.app.spelling import in_full
+from colmap_sph.app.spelling import in_full, with_dashed_values
 from colmap_sph.pipeline.options import RunOptions
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
@@ -157,6 +159,25 @@ def test_every_text_of_the_help_is_a_sentence() -> None:
 )
 def test_short_and_earlier_spellings(typed: list[str], parsed: list[str]) -> None:
     assert in_full(typed) == parsed
+
+
+@pytest.mark.parametrize(
+    ("typed", "parsed"),
+    [
+        (["surface", "dense", "--up", "-z"], ["surface", "dense", "--up=-z"]),
+        (["run", "--masks", "-m", "--dry-run"], ["run", "--masks=-m", "--dry-run"]),
+        (["run", "--masks=m", "-x"], ["run", "--masks=m", "-x"]),
+        (["run", "--dry-run", "-h"], ["run", "--dry-run", "-h"]),
+        (["--reference-shift", "-1", "-.5", "0"], ["--reference-shift", "-1", "-.5", "0"]),
+    ],
+)
+def test_values_may_begin_with_a_dash(typed: list[str], parsed: list[str]) -> None:
+    assert with_dashed_values(typed) == parsed
+
+
+def test_up_is_along_a_negative_axis() -> None:
+    command = _parsed(["surface", "dense", "--up", "-z"])
+    assert isinstance(command, SurfaceCommand) and command.options.up == "-z"
 
 
 def test_every_earlier_spelling_leads_to_an_option() -> None:

@@ -265,6 +265,15 @@ def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
         made(workspace, tmp_path, method="poisson")
 
 
+@pytest.mark.parametrize("voxel", [1e-9, 1e9])
+def test_a_voxel_that_cannot_be_had_is_refused(voxel, cloudy, tmp_path, capsys):
+    """It was made another one without a word."""
+    arguments = ["mesh", str(cloudy.root), "--output", str(tmp_path), "--method", "poisson", "--voxel", str(voxel)]
+    assert cli.main(arguments) == 2
+    assert f"error: --voxel is {voxel:g}, and " in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_the_command_says_what_it_made(cloudy, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("colmap_sph.app.products.mesh_command.num_cores", lambda: 1)
     arguments = ["mesh", str(cloudy.root), "--output", str(tmp_path), "--method", "poisson", "--voxel", "0.8"]

@@ -292,6 +292,14 @@ def test_configurations_that_make_no_sense(
     assert said.startswith("error: ") and said.count("\n") == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "text"), [("run.toml", "threads = 3"), ("run.json", '{"options": {"threads": 3}}')]
+)
+def test_a_configuration_may_begin_with_a_byte_order_mark(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8-sig")
+    assert parsed("--config", str(tmp_path / name)).options.threads == 3
+
+
 def test_a_configuration_that_is_a_pipe_is_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "run.toml")
     with pytest.raises(InputError, match="not a regular file"):

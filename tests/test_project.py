@@ -143,6 +143,17 @@ def test_a_file_is_given(here: Path) -> None:
     assert "images.bin is a file; give the folder" in sentence(Project(workspace=path))
 
 
+@pytest.mark.parametrize("more", [(), ("--dry-run",)])
+@pytest.mark.parametrize("output", ["file", "file/dense"])
+def test_the_output_would_be_a_file(
+    output: str, more: tuple[str, ...], here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("file").write_text("mine")
+    assert cli.main(["run", "--model", "sparse/0", "--output", output, *more]) == 3
+    assert capsys.readouterr().err == "error: file is no folder; choose another --output.\n"
+    assert Path("file").read_text() == "mine"
+
+
 def test_models_inside_a_folder(here: Path) -> None:
     """That of a workspace, which was made of another, comes last; what is not complete is none."""
     shutil.copytree("sparse/0", "sparse/1")

@@ -170,6 +170,13 @@ def test_what_only_some_systems_have_is_found(code: str, name: str | None) -> No
     assert {found for found in map(system_name, ast.walk(ast.parse(code))) if found} == ({name} if name else set())
 
 
+def test_types_are_read_in_one_place() -> None:
+    """Threads that ask msgspec for a new type at the same time end the process: one module lets them not."""
+    reading = re.compile(r"msgspec\.(convert|json\.decode|json\.Decoder)\(")
+    found = {path.relative_to(PACKAGE).as_posix() for path in modules() if reading.search(path.read_text("utf-8"))}
+    assert found == {"project/state/typed.py"}
+
+
 @pytest.mark.parametrize("library", ["sqlite3", "pathlib", "pycolmap", "json", "os.path", "shutil"])
 def test_the_method_knows_no_files(library: str) -> None:
     """But for the names of options: a folder of masks is one of fusion's."""

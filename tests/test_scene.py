@@ -150,6 +150,18 @@ def test_damaged_binary_model(tmp_path: Path, name: str, damage: str) -> None:
         read_scene(sparse)
 
 
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize(("there", "missing"), [("rigs", "frames"), ("frames", "rigs")])
+def test_model_with_rigs_or_frames_alone(tmp_path: Path, there: str, missing: str, text: bool) -> None:
+    sparse = write(make_model(), tmp_path / "sparse", text=text)
+    ending = "txt" if text else "bin"
+    (sparse / f"{missing}.{ending}").unlink()
+    with pytest.raises(InputError, match=rf"has {there}\.{ending} and no {missing}\.{ending}; copy both"):
+        read_scene(sparse)
+    (sparse / f"{there}.{ending}").unlink()
+    assert len(read_scene(sparse).views) == make_model().num_reg_images()
+
+
 def test_real_model(data_dir: Path, tmp_path: Path) -> None:
     source = data_dir / "fountain" / "sparse" / "0"
     scene = read_scene(source)

@@ -27,7 +27,7 @@ from colmap_sph.app.part_command import part_command
 from colmap_sph.app.products.commands import PRODUCTS
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
-from colmap_sph.app.spelling import flag_of
+from colmap_sph.app.spelling import flag_of, with_dashed_values
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError, reason_of
 from colmap_sph.evaluation import format_clouds, format_depth_maps
@@ -139,6 +139,7 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal) -> int:
 
 
 def _parsed(arguments: Sequence[str]) -> Command:
+    arguments = with_dashed_values(arguments)
     if arguments[:1] == ["run"]:
         arguments = ["run", *all_arguments(arguments[1:], RunCommand)]
     with standard_output(), short_completion(arguments):

@@ -62,7 +62,7 @@ def arguments_of_file(path: Path, known: Mapping[str, Option]) -> list[str]:
 
 def _content(path: Path) -> dict[str, Any]:
     try:
-        text = read_small(path, _MAX_BYTES).decode("utf-8")
+        text = read_small(path, _MAX_BYTES).decode("utf-8-sig")
     except OSError as error:
         raise InputError(
             f"The configuration {path} cannot be read ({reason_of(error)}); check --config."

@@ -11,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from colmap_sph.errors import ColmapSphError, OutputError, printable, reason_of
+from colmap_sph.errors import ColmapSphError, OutputError, printable, reason_of, unwritable
 from colmap_sph.platforms.files import open_descriptor
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.workspace import Workspace
@@ -96,9 +96,7 @@ class _WorkspaceLog(logging.Handler):
         try:
             file = _LogFile(path)
         except OSError as error:
-            raise OutputError(
-                f"{path} cannot be written ({reason_of(error)}); check space and permissions."
-            ) from error
+            raise unwritable(path, error) from error
         for record in self._early:
             file.emit(record)
         return file

@@ -54,6 +54,8 @@ _RENAMED = {
     "--fusion-input": "--fusion.input",
 }
 
+# What begins with one dash and is no option: a path, or an axis.
+_DASHED = re.compile(r"-(?!h$)[^-\d.]")
 # A box whose first number is negative.
 _NEGATIVE = re.compile(r"-(inf|[\d.])")
 
@@ -69,6 +71,20 @@ def full_flag(flag: str) -> str:
     """A flag in the spelling that the records give it, from a short or an earlier one."""
     flag = flag.replace("_", "-")
     return _FULL.get(flag, flag)
+
+
+def with_dashed_values(arguments: Sequence[str]) -> list[str]:
+    """The arguments with a value that begins with a dash, as in ``--up -z``, joined to its option.
+
+    Numbers stay, which the parser knows itself, and ``-h``.
+    """
+    joined: list[str] = []
+    for argument in arguments:
+        if joined and joined[-1].startswith("--") and "=" not in joined[-1] and _DASHED.match(argument):
+            joined[-1] += f"={argument}"
+        else:
+            joined.append(argument)
+    return joined
 
 
 def in_full(arguments: Sequence[str]) -> list[str]:

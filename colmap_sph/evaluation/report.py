@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.errors import NoResultError, OutputError, printable, reason_of
+from colmap_sph.errors import NoResultError, printable, unwritable
 from colmap_sph.evaluation.cloud_scores import CloudScores
 from colmap_sph.evaluation.depth_maps import DepthMapScores
 from colmap_sph.platforms.files import move_into_place, write_text
@@ -102,9 +102,7 @@ def write_json(path: Path, content: object) -> None:
         write_text(temporary, json.dumps(content, indent=2, allow_nan=False) + "\n")
         move_into_place(temporary, path)
     except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
+        raise unwritable(path, error) from error
 
 
 def _mean_of_known(values: Sequence[float | None]) -> float | None:

@@ -31,7 +31,7 @@ from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.pipeline.workers import room_for_workers
-from colmap_sph.project.claim import check_links, claimed
+from colmap_sph.project.claim import check_folder, check_links, claimed
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
@@ -151,6 +151,7 @@ def check_input(project: Project, options: RunOptions, limit: TimeLimit | None =
         if options.scheduler:
             raise OptionError("--within knows this machine alone; leave out it or --scheduler.")
     project.check()
+    check_folder(project.root)
     check_links(Workspace(project.root), is_given=project.workspace is not None)
     if project.model is None and options.undistortion.max_image_size != UndistortionOptions().max_image_size:
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")

@@ -55,6 +55,13 @@ def shared(workspace: Workspace) -> Iterator[None]:
         yield
 
 
+def check_folder(root: Path) -> None:
+    """Raise `OutputError` where something that is no folder is in a workspace's place, or above it."""
+    there = next((path for path in (root, *root.parents) if os.path.lexists(path)), None)
+    if there is not None and not there.is_dir():
+        raise OutputError(f"{there} is no folder; choose another --output.")
+
+
 def check_links(workspace: Workspace, *, is_given: bool) -> None:
     """Raise `OutputError` where a link would have a run write or delete outside of the workspace.
 

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, OutputError, reason_of, unwritable
 from colmap_sph.platforms.files import move_into_place
 from colmap_sph.project.files import make_dir, open_regular, real_path, whole_digest
 from colmap_sph.project.map_coordinates import move_cloud
@@ -109,9 +109,7 @@ class CloudOutput:
                 write(self.path)
                 vouch(record, "", {file: whole_digest(file) for file in files})
         except (OSError, RuntimeError) as error:
-            raise OutputError(
-                f"{self.path} cannot be written ({reason_of(error)}); check space and permissions."
-            ) from error
+            raise unwritable(self.path, error) from error
 
     def _move(self, made: Workspace, origin: NDArray[np.float64]) -> None:
         cloud, visible = made.cloud_paths

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import xxhash
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, OutputError, reason_of, unwritable
 from colmap_sph.platforms.files import (
     is_link,
     move_into_place,
@@ -117,9 +117,7 @@ def atomic_file(path: Path, *, sync: bool = True) -> Iterator[NewFile]:
         if sync:
             sync_folder(path.parent)
     except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
+        raise unwritable(path, error) from error
     finally:
         _open_files.number = depth
         with suppress(OSError):  # not there, or on a disk that has become read-only

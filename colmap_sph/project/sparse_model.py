@@ -88,6 +88,13 @@ def model_files(sparse_dir: Path) -> list[Path]:
         raise InputError(
             f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
         )
+    rigs = [path for path in files if path.stem in RIG_FILES]
+    if len(rigs) == 1:
+        other = rigs[0].with_stem(next(stem for stem in RIG_FILES if stem != rigs[0].stem))
+        raise InputError(
+            f"The model in {sparse_dir} has {rigs[0].name} and no {other.name}; copy both from where it was made, "
+            f"or remove {rigs[0].name} if it has no rigs."
+        )
     return files
 
 

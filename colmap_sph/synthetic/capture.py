@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from colmap_sph.errors import OptionError, OutputError, reason_of
+from colmap_sph.errors import OptionError, OutputError, unwritable
 from colmap_sph.synthetic.light import Light
 from colmap_sph.synthetic.model import (
     MAX_INCIDENCE,
@@ -278,9 +278,7 @@ def write_picture(path: Path, picture: npt.NDArray[np.uint8], *quality: int) -> 
     try:
         path.write_bytes(encoded.tobytes())
     except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
+        raise unwritable(path, error) from error
 
 
 def _point_colours(sparse: SparsePoints, pictures: list[npt.NDArray[np.uint8]]) -> npt.NDArray[np.uint8]:

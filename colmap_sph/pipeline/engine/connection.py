@@ -15,6 +15,7 @@ import msgspec
 import colmap_sph
 from colmap_sph.errors import InputError, OptionError, reason_of
 from colmap_sph.project.files import read_small
+from colmap_sph.project.state.typed import from_json
 
 logger = logging.getLogger(__name__)
 
@@ -57,7 +58,7 @@ def address_of(text: str, seconds: float) -> str:
     while not path.exists() and time.monotonic() < deadline:
         time.sleep(0.2)
     try:
-        return msgspec.json.decode(read_small(path, _FILE_BYTES), type=_SchedulerFile).address
+        return from_json(read_small(path, _FILE_BYTES), _SchedulerFile).address
     except OSError as error:
         raise OptionError(
             f"scheduler: {path} cannot be read ({reason_of(error)}); start the scheduler with dask scheduler "

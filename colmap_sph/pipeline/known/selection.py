@@ -9,6 +9,7 @@ import xxhash
 
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.state.records import read_json
+from colmap_sph.project.state.typed import from_json
 from colmap_sph.stereo.partners.pairs import PairSelection, PairSource, Partner
 
 _MAX_BYTES = 1 << 31
@@ -33,7 +34,7 @@ def read_selection(path: Path, key: str) -> PairSelection | None:
     if file is None or file.key != key or file.check != _check(key, file.content):
         return None
     try:
-        found = msgspec.json.decode(file.content, type=_Selection)
+        found = from_json(file.content, _Selection)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None
     partners = {

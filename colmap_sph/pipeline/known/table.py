@@ -18,6 +18,7 @@ import xxhash
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.files import atomic_file, folder_locked, make_dir
 from colmap_sph.project.state.records import read_json
+from colmap_sph.project.state.typed import from_json
 
 _MAX_BYTES = 1 << 31
 
@@ -59,7 +60,7 @@ class ResultTable:
         if file is None or file.key != self._key or file.check != _check(file.key, file.results):
             return {}
         try:
-            return msgspec.json.decode(file.results, type=dict[str, Known])
+            return from_json(file.results, dict[str, Known])
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return {}
 

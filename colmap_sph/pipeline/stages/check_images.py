@@ -22,6 +22,7 @@ from colmap_sph.project.images.decoding import is_jpeg
 from colmap_sph.project.images.depth import ValueSample, sample_values
 from colmap_sph.project.images.reading import image_problem, read_grey
 from colmap_sph.project.state.records import read_json
+from colmap_sph.project.state.typed import from_json
 from colmap_sph.project.workspace import checked_name
 from colmap_sph.stereo.detail import image_detail
 
@@ -101,7 +102,7 @@ def read_known(path: Path, key: str) -> dict[str, Known]:
     if file is None or file.check != _check(key, file.images):
         return {}
     try:
-        return msgspec.json.decode(file.images, type=dict[str, Known])
+        return from_json(file.images, dict[str, Known])
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return {}
 

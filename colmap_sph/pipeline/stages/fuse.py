@@ -12,7 +12,7 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
+from colmap_sph.errors import InputError, NoResultError, unwritable
 from colmap_sph.pipeline.known.remembering import done
 from colmap_sph.pipeline.memory import format_memory
 from colmap_sph.pipeline.stages.cloud import (
@@ -200,9 +200,7 @@ class FuseStage(PartsStage):
                 return self._put_together_tiles(results, most)
             self._put_together_file(self._stems(results), points)
         except (OSError, RuntimeError) as error:
-            raise OutputError(
-                f"{workspace.fused_path} cannot be written ({reason_of(error)}); check space and permissions."
-            ) from error
+            raise unwritable(workspace.fused_path, error) from error
         return 0
 
     def _put_together_file(self, stems: list[Path], points: int) -> None:

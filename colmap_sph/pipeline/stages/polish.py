@@ -27,6 +27,7 @@ from colmap_sph.project.polishing.polished import (
 )
 from colmap_sph.project.scene_reader import scene_of_model
 from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.state.typed import from_plain
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
@@ -216,6 +217,6 @@ class PolishStage(Stage[str, PolishTask]):
         if outcome is None:
             return None
         try:
-            return Facts(polish=msgspec.convert(outcome, Polish))
+            return Facts(polish=from_plain(outcome, Polish))
         except msgspec.ValidationError:
             return None

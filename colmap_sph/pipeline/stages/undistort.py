@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, unwritable
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage
 from colmap_sph.platforms.files import move_into_place
@@ -100,9 +100,7 @@ def make_undistorted_image(task: UndistortTask) -> Facts:
             undistort(image)
         _publish(replace(task, image=image))
     except OSError as error:
-        raise OutputError(
-            f"{task.target} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
+        raise unwritable(task.target, error) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         with suppress(OSError):  # another process has not ended there

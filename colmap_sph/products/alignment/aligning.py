@@ -192,7 +192,8 @@ def _matched(names: Iterable[str], known: Mapping[str, object], source: Path) ->
 
 def _few_names(source: Path, names: Iterable[str], known: Iterable[str]) -> str:
     found = len(set(names) & set(known))
+    called = f"it names {next(iter(names), 'none')}, and the model {next(iter(known), 'none')}"
     return (
-        f"{source} has positions of {found} images of the model, and three are needed; it names "
-        f"{next(iter(names), 'none')}, and the model {next(iter(known), 'none')}."
+        f"{source} has positions of {found} images of the model, and three are needed; "
+        f"{'give those of more' if found else called}."
     )

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.obj import write_obj
@@ -77,6 +77,7 @@ def make_mesh(
     check_places(request.workspace, request.folder, _names(request), overwrite=request.overwrite)
     scene, seen = seen_views(request.workspace)
     gsd = float(np.median(np.concatenate([each.footprint for each in seen])))
+    _check_voxel(options, _size(seen))
     make_dir(request.folder)
     scratch = request.folder / ".mesh.tmp"
     with scratch_folder(scratch):
@@ -95,6 +96,23 @@ def make_mesh(
             start("texture", len(seen))
             sheets = textured(mesh, request.workspace, scene, seen, _TOLERANCE * gsd, scratch, advance)
         return _written(request, mesh, sheets, scene, seen), len(mesh.faces)
+
+
+def _size(seen: list[SeenView]) -> float:
+    """Longest side of all that is seen but for what lies far off."""
+    points = np.concatenate([each.points for each in seen])
+    return float(np.max(np.percentile(points, 99.5, axis=0) - np.percentile(points, 0.5, axis=0)))
+
+
+def _check_voxel(options: MeshOptions, size: float) -> None:
+    """Raise `OptionError` for a voxel that is given and cannot be had."""
+    if options.voxel > size:
+        raise OptionError(f"voxel is {options.voxel:g}, and all that is seen {size:g}; give less.", "voxel")
+    least = size / 2 ** (_DEPTHS[1] + 0.5)
+    if options.method == "poisson" and 0 < options.voxel < least:
+        raise OptionError(
+            f"voxel is {options.voxel:g}, and must be at least {least:g} here for poisson; give more.", "voxel"
+        )
 
 
 def _names(request: MeshRequest) -> list[str]:
@@ -130,9 +148,7 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
     cloud = (workspace.local_dir / "fused.ply") if scene.origin.any() else workspace.fused_path
     if not cloud.is_file():
         raise InputError(f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run first.")
-    points = np.concatenate([each.points for each in seen])
-    size = float(np.max(np.percentile(points, 99.5, axis=0) - np.percentile(points, 0.5, axis=0)))
-    depth = int(np.clip(round(math.log2(max(size / cell, 1.0))), *_DEPTHS))
+    depth = int(np.clip(round(math.log2(max(_size(seen) / cell, 1.0))), *_DEPTHS))
     mesh = scratch / "poisson.ply"
     poisson_mesh(cloud, mesh, depth=depth, trim=request.options.trim, threads=request.threads)
     return read_ply(mesh)

@@ -15,6 +15,7 @@ from msgspec import Meta
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file, read_small
 from colmap_sph.project.lens.field import LensField
+from colmap_sph.project.state.typed import from_json
 
 LENS_FIELDS_NAME = "lens_fields.json"
 
@@ -53,7 +54,7 @@ def read_lens_fields(model_dir: Path) -> dict[int, LensField]:
         return {}
     again = "refine the cameras again, or remove the file to use the model without it"
     try:
-        read = msgspec.json.decode(read_small(path, _MAX_BYTES), type=_Fields)
+        read = from_json(read_small(path, _MAX_BYTES), _Fields)
         if read.version != _VERSION:
             raise InputError(f"{path} is of another version of the program ({read.version}); {again}.")
         fields = {camera: _field(part) for camera, part in read.cameras.items()}

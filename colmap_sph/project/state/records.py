@@ -17,7 +17,7 @@ import msgspec
 import xxhash
 from msgspec import Meta
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, OutputError, reason_of, unwritable
 from colmap_sph.platforms.files import is_link, sync_file, sync_folder
 from colmap_sph.project.files import (
     atomic_file,
@@ -28,6 +28,7 @@ from colmap_sph.project.files import (
     whole_digest,
 )
 from colmap_sph.project.state import background
+from colmap_sph.project.state.typed import from_json, from_plain
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -88,7 +89,7 @@ def read_json(path: Path, kind: type[T], *, max_bytes: int = _MAX_BYTES) -> T | 
         Of type `kind`. None where the file is missing, cannot be read, or holds anything else.
     """
     try:
-        return msgspec.json.decode(read_small(path, max_bytes, follow=False), type=kind)
+        return from_json(read_small(path, max_bytes, follow=False), kind)
     except (OSError, msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return None
 
@@ -105,7 +106,7 @@ def read_record(path: Path) -> Record | None:
         # Those of earlier versions had other checks. They vouch for nothing any more, but say what is ours.
         if "digests" in content and check != _check(content):
             return _UNREADABLE
-        return msgspec.convert(content, Record)
+        return from_plain(content, Record)
     except (msgspec.MsgspecError, RecursionError):
         return _UNREADABLE
 
@@ -221,9 +222,7 @@ def _sync_and_vouch(
         for folder in {path.parent for path in written}:
             sync_folder(folder)
     except OSError as error:
-        raise OutputError(
-            f"{next(iter(files))} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
+        raise unwritable(next(iter(files)), error) from error
     vouch(record, key, files, facts, state=state)
 
 
@@ -271,7 +270,7 @@ def recorded_facts(record: Path, kind: type[T], files: Sequence[Path] = ()) -> T
 
 def _facts_of(known: Record, kind: type[T]) -> T | None:
     try:
-        return msgspec.convert(known.facts, kind)
+        return from_plain(known.facts, kind)
     except (msgspec.MsgspecError, RecursionError):
         return None
 

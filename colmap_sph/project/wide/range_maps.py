@@ -13,7 +13,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, OutputError, unwritable
 from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.wide.projection import Lens, camera_rays
 
@@ -164,9 +164,7 @@ def write_range_map(path: Path, distance: Pixels, normals: Pixels) -> str:
                 file.write(made.read_bytes())
                 return file.digest
     except OSError as error:
-        raise OutputError(
-            f"{path} cannot be written ({reason_of(error)}); check space and permissions."
-        ) from error
+        raise unwritable(path, error) from error
 
 
 def read_range_map(path: Path) -> tuple[Pixels, Pixels]:

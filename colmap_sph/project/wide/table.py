@@ -11,6 +11,7 @@ from msgspec import Meta
 
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import atomic_file, read_small
+from colmap_sph.project.state.typed import from_json
 from colmap_sph.project.wide.cuts import Cut
 from colmap_sph.project.wide.layout import Face
 from colmap_sph.project.wide.projection import Lens, number_of_parameters
@@ -69,7 +70,7 @@ def read_cuts(model_dir: Path) -> dict[str, Cut]:
     if not path.exists():
         return {}
     try:
-        read = msgspec.json.decode(read_small(path, _MAX_BYTES), type=_Table)
+        read = from_json(read_small(path, _MAX_BYTES), _Table)
         if read.version != _VERSION:
             raise ValueError(f"it is of version {read.version}")
         lenses, faces = [_lens(each) for each in read.lenses], [_face(each) for each in read.faces]
