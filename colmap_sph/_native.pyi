@@ -981,6 +981,31 @@ def decode_disparity(
     disparity : (H, W) float32, written
     """
 
+def seed_planes(
+    columns: NDArray[np.floating[Any]],
+    rows: NDArray[np.floating[Any]],
+    values: NDArray[np.floating[Any]],
+    neighbours: int,
+    alike: float,
+    stiffness: float,
+    unknown_stiffness: float,
+    cell: int,
+    planes: NDArray[np.float32],
+    /,
+) -> None:
+    """Values, at the centres of cells of so many pixels, of planes through the seeds around them.
+
+    columns : (POINTS) float64
+    rows : (POINTS) float64
+    values : (POINTS) float64
+    neighbours : int
+    alike : float
+    stiffness : float
+    unknown_stiffness : float
+    cell : int
+    planes : (H, W) float32, written
+    """
+
 def source_pixels(
     ray_rows: NDArray[np.float32],
     ray_columns: NDArray[np.float32],

@@ -251,6 +251,12 @@ def decode_disparity(rng: Random) -> Arguments:
     return [filled(rng, shape, np.uint16), number(rng), number(rng), np.zeros(shape, np.float32)]
 
 
+def seed_planes(rng: Random) -> Arguments:
+    seeds = filled(rng, (3, int(rng.integers(0, 90))), np.float64)
+    weights = [int(rng.integers(1, 33)), number(rng), number(rng), number(rng)]
+    return [*seeds, *weights, int(rng.integers(1, 9)), np.zeros(size(rng), np.float32)]
+
+
 def fit_surfaces(rng: Random) -> Arguments:
     count = int(rng.integers(0, 9))
     inputs = [filled(rng, size(rng), np.float32), filled(rng, (count, 2), np.float64), number(rng)]
@@ -519,6 +525,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         disparity_range,
         code_disparity,
         decode_disparity,
+        seed_planes,
         fit_surfaces,
         place_windows,
         make_templates,

@@ -371,6 +371,17 @@ def offsets_arguments():
             "step": 0.5,
             "out disparity": np.zeros((H, W), np.float32),
         },
+        "seed_planes": {
+            "columns": np.zeros(9),
+            "rows": np.zeros(9),
+            "values": np.ones(9),
+            "neighbours": 5,
+            "alike": 4.0,
+            "stiffness": 0.1,
+            "unknown_stiffness": 0.1,
+            "cell": 3,
+            "out planes": np.zeros((H, W), np.float32),
+        },
     }
 
 
@@ -501,6 +512,7 @@ FREE = {
             ("bases_about", "out offset"),
             ("count_slopes", "offset"),
             ("disparity_range", "disparity"),
+            ("seed_planes", "out planes"),
             ("fit_surfaces", "disparity"),
         )
     },
@@ -847,6 +859,8 @@ def test_windows_about_numbers_out_of_this_world():
         *[("bases_about", "first", value) for value in (41, 2**31 - 1)],
         ("mark_steps", "max_step", -1),
         *[("count_slopes", name, -1) for name in ("edge", "slope")],
+        *[("seed_planes", "neighbours", value) for value in (0, 33)],
+        ("seed_planes", "cell", 0),
     ],
 )
 def test_bounds_of_the_passes_over_offsets_are_kept(function, name, wrong):
