@@ -224,6 +224,7 @@ def mean_offsets(
     """
 
 def upsample_offsets(
+    backend: str,
     offset: NDArray[np.int32],
     max_step: int,
     fine: NDArray[np.int32],
@@ -231,6 +232,7 @@ def upsample_offsets(
 ) -> None:
     """A level's offsets at the pixels of the next finer one, interpolated on surfaces, repeated at steps.
 
+    backend : str
     offset : (H, W) int32
     max_step : int
     fine : (FINE_H, FINE_W) int32, written
@@ -1007,6 +1009,7 @@ def seed_planes(
     """
 
 def source_pixels(
+    backend: str,
     ray_rows: NDArray[np.float32],
     ray_columns: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -1019,6 +1022,7 @@ def source_pixels(
 ) -> None:
     """Where rectified pixels, of rays ray_rows * weights + ray_columns, lie in an image, and 255 inside of it.
 
+    backend : str
     ray_rows : (3, H) float32
     ray_columns : (3, W) float32
     weights : (W) float32
@@ -1030,6 +1034,7 @@ def source_pixels(
     """
 
 def sharpen(
+    backend: str,
     image: NDArray[np.float32],
     sharpening: float,
     padded: NDArray[np.int16],
@@ -1037,6 +1042,7 @@ def sharpen(
 ) -> None:
     """An image plus so many times what it differs by from its mean nearby, in 1/64 grey value, with a border.
 
+    backend : str
     image : (H, W) float32
     sharpening : float
     padded : (H + 6, W + 8) int16, written

@@ -80,14 +80,16 @@ def test_planes_of_seeds_are_the_oracles(neighbours: int, count: int) -> None:
     seeds[count // 2 :, :2] = np.round(seeds[count // 2 :, :2] / 8) * 8  # some are as near as others
     planes = np.empty((9, 13), np.float32)
     weights = (neighbours, 7.5, 0.125, 0.1)
-    _native.seed_planes(*np.ascontiguousarray(seeds.T), *weights, 10, planes)
+    columns, rows, values = np.ascontiguousarray(seeds.T)
+    _native.seed_planes(columns, rows, values, *weights, 10, planes)
     np.testing.assert_allclose(planes, oracle.seed_planes(seeds, *weights, 10, planes.shape), rtol=1e-5, atol=1e-4)
 
 
 def test_seeds_out_of_this_world_harm_nobody() -> None:
     planes = np.empty((9, 13), np.float32)
     for value in (np.nan, np.inf, 1e300):
-        _native.seed_planes(*np.full((3, 5), value), 12, 7.5, 0.125, 0.1, 10, planes)
+        columns, rows, values = np.full((3, 5), value)
+        _native.seed_planes(columns, rows, values, 12, 7.5, 0.125, 0.1, 10, planes)
 
 
 def test_near_seeds_count_more_than_far_ones() -> None:
