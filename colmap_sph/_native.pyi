@@ -224,6 +224,7 @@ def mean_offsets(
     """
 
 def upsample_offsets(
+    backend: str,
     offset: NDArray[np.int32],
     max_step: int,
     fine: NDArray[np.int32],
@@ -231,6 +232,7 @@ def upsample_offsets(
 ) -> None:
     """A level's offsets at the pixels of the next finer one, interpolated on surfaces, repeated at steps.
 
+    backend : str
     offset : (H, W) int32
     max_step : int
     fine : (FINE_H, FINE_W) int32, written
@@ -981,7 +983,33 @@ def decode_disparity(
     disparity : (H, W) float32, written
     """
 
+def seed_planes(
+    columns: NDArray[np.floating[Any]],
+    rows: NDArray[np.floating[Any]],
+    values: NDArray[np.floating[Any]],
+    neighbours: int,
+    alike: float,
+    stiffness: float,
+    unknown_stiffness: float,
+    cell: int,
+    planes: NDArray[np.float32],
+    /,
+) -> None:
+    """Values, at the centres of cells of so many pixels, of planes through the seeds around them.
+
+    columns : (POINTS) float64
+    rows : (POINTS) float64
+    values : (POINTS) float64
+    neighbours : int
+    alike : float
+    stiffness : float
+    unknown_stiffness : float
+    cell : int
+    planes : (H, W) float32, written
+    """
+
 def source_pixels(
+    backend: str,
     ray_rows: NDArray[np.float32],
     ray_columns: NDArray[np.float32],
     weights: NDArray[np.float32],
@@ -994,6 +1022,7 @@ def source_pixels(
 ) -> None:
     """Where rectified pixels, of rays ray_rows * weights + ray_columns, lie in an image, and 255 inside of it.
 
+    backend : str
     ray_rows : (3, H) float32
     ray_columns : (3, W) float32
     weights : (W) float32
@@ -1005,6 +1034,7 @@ def source_pixels(
     """
 
 def sharpen(
+    backend: str,
     image: NDArray[np.float32],
     sharpening: float,
     padded: NDArray[np.int16],
@@ -1012,6 +1042,7 @@ def sharpen(
 ) -> None:
     """An image plus so many times what it differs by from its mean nearby, in 1/64 grey value, with a border.
 
+    backend : str
     image : (H, W) float32
     sharpening : float
     padded : (H + 6, W + 8) int16, written

@@ -271,8 +271,8 @@ def image_kernels(scene: Scene) -> list[Kernel]:
     half_offset = np.ascontiguousarray(offset[::2, ::2])
     near = np.asarray(half_offset / 512, dtype=np.float32)
 
-    def upsample_offsets(_: str) -> None:
-        _native.upsample_offsets(half_offset, 1024, unwarped)
+    def upsample_offsets(backend: str) -> None:
+        _native.upsample_offsets(backend, half_offset, 1024, unwarped)
 
     def search_windows(_: str) -> None:
         _native.search_windows(near, near, offset, 32, 4, 6, unwarped)

@@ -164,6 +164,7 @@ def finer(rng: Random, shape: tuple[int, int]) -> tuple[int, int]:
 def upsample_offsets(rng: Random) -> Arguments:
     shape = size(rng)
     return [
+        backend(rng),
         filled(rng, shape, np.int32),
         int(rng.choice([0, 1024, 2**31 - 1])),
         np.zeros(finer(rng, shape), np.int32),
@@ -249,6 +250,12 @@ def code_disparity(rng: Random) -> Arguments:
 def decode_disparity(rng: Random) -> Arguments:
     shape = size(rng)
     return [filled(rng, shape, np.uint16), number(rng), number(rng), np.zeros(shape, np.float32)]
+
+
+def seed_planes(rng: Random) -> Arguments:
+    seeds = filled(rng, (3, int(rng.integers(0, 90))), np.float64)
+    weights = [int(rng.integers(1, 33)), number(rng), number(rng), number(rng)]
+    return [*seeds, *weights, int(rng.integers(1, 9)), np.zeros(size(rng), np.float32)]
 
 
 def fit_surfaces(rng: Random) -> Arguments:
@@ -425,12 +432,12 @@ def source_pixels(rng: Random) -> Arguments:
     h, w = size(rng)
     tables = [filled(rng, shape, np.float32) for shape in ((3, h), (3, w), (w,))]
     places = [np.zeros((h, w), kind) for kind in (np.float32, np.float32, np.uint8)]
-    return [*tables, int(rng.integers(0, 100)), int(rng.integers(0, 100)), *places]
+    return [backend(rng), *tables, int(rng.integers(0, 100)), int(rng.integers(0, 100)), *places]
 
 
 def sharpen(rng: Random) -> Arguments:
     h, w = size(rng)
-    return [filled(rng, (h, w), np.float32), number(rng), np.zeros((h + 6, w + 8), np.int16)]
+    return [backend(rng), filled(rng, (h, w), np.float32), number(rng), np.zeros((h + 6, w + 8), np.int16)]
 
 
 def planes_of_maps(rng: Random) -> Arguments:
@@ -519,6 +526,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         disparity_range,
         code_disparity,
         decode_disparity,
+        seed_planes,
         fit_surfaces,
         place_windows,
         make_templates,

@@ -238,6 +238,21 @@ def search_windows(least, most, predicted, depth, clearance, own_clearance):
     return base
 
 
+def seed_planes(seeds, neighbours, alike, stiffness, unknown_stiffness, cell, shape):
+    """Values at the centres of cells, by planes through the seeds (column, row, value) around each."""
+    values = np.empty(shape)
+    for y, x in np.ndindex(shape):
+        beside = seeds[:, :2] - ((np.array([x, y]) + 0.5) * cell - 0.5)
+        distance = np.hypot(*beside.T)
+        near = np.argsort(distance, kind="stable")[:neighbours]
+        weight = 1 / (distance[near] ** 2 + alike**2)
+        terms = np.column_stack([np.ones(len(near)), beside[near]])
+        ridge = weight.sum() * (stiffness * alike**2 + unknown_stiffness * distance[near[0]] ** 2)
+        equations = terms.T @ (weight[:, None] * terms) + np.diag([0, ridge, ridge])
+        values[y, x] = np.linalg.solve(equations, terms.T @ (weight * seeds[near, 2]))[0]
+    return values
+
+
 def _nearest_256(value):
     return (value + 128) // 256
 

@@ -102,6 +102,7 @@ def arguments(function):
             "out mean": np.zeros((H, W), np.int32),
         },
         "upsample_offsets": {
+            "backend": "scalar",
             "offset": np.zeros((H, W), np.int32),
             "max_step": 300,
             "out fine": np.zeros((2 * H, 2 * W - 1), np.int32),
@@ -286,6 +287,7 @@ def arguments(function):
             "out equations": np.zeros((12, H, W), f32),
         },
         "source_pixels": {
+            "backend": "scalar",
             "ray_rows": np.ones((3, H), f32),
             "ray_columns": np.ones((3, W), f32),
             "weights": np.ones(W, f32),
@@ -296,6 +298,7 @@ def arguments(function):
             "out inside": np.zeros((H, W), u8),
         },
         "sharpen": {
+            "backend": "scalar",
             "image": np.zeros((H, W), f32),
             "sharpening": 0.6,
             "out padded": np.zeros((H + 6, W + 8), np.int16),
@@ -370,6 +373,17 @@ def offsets_arguments():
             "least": 0.0,
             "step": 0.5,
             "out disparity": np.zeros((H, W), np.float32),
+        },
+        "seed_planes": {
+            "columns": np.zeros(9),
+            "rows": np.zeros(9),
+            "values": np.ones(9),
+            "neighbours": 5,
+            "alike": 4.0,
+            "stiffness": 0.1,
+            "unknown_stiffness": 0.1,
+            "cell": 3,
+            "out planes": np.zeros((H, W), np.float32),
         },
     }
 
@@ -501,6 +515,7 @@ FREE = {
             ("bases_about", "out offset"),
             ("count_slopes", "offset"),
             ("disparity_range", "disparity"),
+            ("seed_planes", "out planes"),
             ("fit_surfaces", "disparity"),
         )
     },
@@ -847,6 +862,8 @@ def test_windows_about_numbers_out_of_this_world():
         *[("bases_about", "first", value) for value in (41, 2**31 - 1)],
         ("mark_steps", "max_step", -1),
         *[("count_slopes", name, -1) for name in ("edge", "slope")],
+        *[("seed_planes", "neighbours", value) for value in (0, 33)],
+        ("seed_planes", "cell", 0),
     ],
 )
 def test_bounds_of_the_passes_over_offsets_are_kept(function, name, wrong):
@@ -1030,7 +1047,7 @@ def test_empty_images_are_no_work(backend, size, target_width):
     _native.selection(backend, sums, base, words, target, *shown, 2, 0, offset)
     _native.unwarp_offsets(offset, base, 65535, offset.copy())
     _native.mean_offsets(backend, offset, 10, 1 << 20, offset.copy())
-    _native.upsample_offsets(offset, 0, np.zeros((2 * size[0], 2 * size[1]), np.int32))
+    _native.upsample_offsets(backend, offset, 0, np.zeros((2 * size[0], 2 * size[1]), np.int32))
     _native.to_disparity(offset, np.zeros(256, np.float32), np.zeros(size, np.float32))
 
 

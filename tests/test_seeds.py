@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import oracle
 import pytest
 from rendered import disparities, scene_of_pair
 
+from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
@@ -69,6 +71,25 @@ def test_disparities_add_up() -> None:
     both = seeds + others * (0, 0, 1)
     parts = [interpolated_disparity(given, (23, 31), 4.0) for given in (seeds, others)]
     np.testing.assert_allclose(interpolated_disparity(both, (23, 31), 4.0), sum(parts), atol=1e-4)
+
+
+@pytest.mark.parametrize("neighbours", [1, 3, 12, 32])
+@pytest.mark.parametrize("count", [1, 5, 64, 200])
+def test_planes_of_seeds_are_the_oracles(neighbours: int, count: int) -> None:
+    seeds = random_seeds(count)
+    seeds[count // 2 :, :2] = np.round(seeds[count // 2 :, :2] / 8) * 8  # some are as near as others
+    planes = np.empty((9, 13), np.float32)
+    weights = (neighbours, 7.5, 0.125, 0.1)
+    columns, rows, values = np.ascontiguousarray(seeds.T)
+    _native.seed_planes(columns, rows, values, *weights, 10, planes)
+    np.testing.assert_allclose(planes, oracle.seed_planes(seeds, *weights, 10, planes.shape), rtol=1e-5, atol=1e-4)
+
+
+def test_seeds_out_of_this_world_harm_nobody() -> None:
+    planes = np.empty((9, 13), np.float32)
+    for value in (np.nan, np.inf, 1e300):
+        columns, rows, values = np.full((3, 5), value)
+        _native.seed_planes(columns, rows, values, 12, 7.5, 0.125, 0.1, 10, planes)
 
 
 def test_near_seeds_count_more_than_far_ones() -> None:

@@ -38,6 +38,9 @@
      match_##version, \
      fit_offsets_##version, \
      mean_offsets_##version, \
+     upsample_offsets_##version, \
+     source_pixels_##version, \
+     sharpen_##version, \
      depth_candidates_##version, \
      vote_depth_##version, \
      compare_depths_##version, \
@@ -61,6 +64,9 @@ static const kernel_table avx512_kernels = TABLE(avx512);
 /* Every aarch64 processor has NEON, which compilers use for the scalar versions, too. */
 #define fit_offsets_neon fit_offsets_scalar
 #define mean_offsets_neon mean_offsets_scalar
+#define upsample_offsets_neon upsample_offsets_scalar
+#define source_pixels_neon source_pixels_scalar
+#define sharpen_neon sharpen_scalar
 #define depth_candidates_neon depth_candidates_scalar
 #define vote_depth_neon vote_depth_scalar
 #define compare_depths_neon compare_depths_scalar

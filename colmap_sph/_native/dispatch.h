@@ -3,6 +3,7 @@
 #define COLMAP_SPH_DISPATCH_H
 
 #include "depth/depth.h"
+#include "images/images.h"
 #include "matching/matching.h"
 
 typedef struct {
@@ -14,6 +15,9 @@ typedef struct {
     match_fn *match;
     fit_offsets_fn *fit_offsets;
     mean_offsets_fn *mean_offsets;
+    upsample_offsets_fn *upsample_offsets;
+    source_pixels_fn *source_pixels;
+    sharpen_fn *sharpen;
     depth_candidates_fn *depth_candidates;
     vote_depth_fn *vote_depth;
     compare_depths_fn *compare_depths;

@@ -54,7 +54,7 @@ def census(image: RectifiedImage, *, fine: bool = False) -> NDArray[np.uint64]:
     """
     height, width = image.image.shape
     padded = np.empty((height + 2 * _BORDER[0], width + 2 * _BORDER[1]), dtype=np.int16)
-    _native.sharpen(np.ascontiguousarray(image.image), _SHARPENING, padded)
+    _native.sharpen(backend(), np.ascontiguousarray(image.image), _SHARPENING, padded)
     words = np.empty(image.image.shape, dtype=np.uint64)
     _native.census(backend(), padded, np.ascontiguousarray(image.valid), words)
     if not fine:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.scene import View
+from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, angles_of_columns, pixel_from_rectified_ray
 
 # Images are resampled in bands of this many rows, which bounds the memory for their maps.
@@ -88,7 +89,7 @@ class RayTables:
         places = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
         inside = np.empty(shape, dtype=np.uint8)
         _native.source_pixels(
-            ray_rows, ray_columns, weights, view.width, view.height, places[0], places[1], inside
+            backend(), ray_rows, ray_columns, weights, view.width, view.height, places[0], places[1], inside
         )
         return *places, inside
 

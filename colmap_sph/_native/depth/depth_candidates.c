@@ -45,10 +45,12 @@ typedef struct {
     ptrdiff_t height, width;
 } disparity_map;
 
-enum { BLOCK = 256 };
+enum { BLOCK = 128 };
 
 /* Pixels of one row of the depth map. Fixed sizes, so that the compiler can vectorise. */
 typedef struct {
+    ptrdiff_t count;                          /* pixels that are still asked for ... */
+    int32_t place[BLOCK];                     /* ... and which they are, once some were left out */
     double x[BLOCK], y[BLOCK], z[BLOCK];      /* ray in the rectified frame, of depth 1 in the camera */
     double across_axis[BLOCK];                /* its distance from the baseline; sphere only */
     double u[BLOCK], v[BLOCK];                /* column and row in the disparity map; 0 where outside */
@@ -63,8 +65,10 @@ typedef struct {
     float depth[BLOCK], sigma[BLOCK];
 } block;
 
-static inline void locate(const pair_geometry *g, double row, double first_column, block *k) {
-    const double *m = g->rectified_from_pixel;
+/* Where the pixels' rays lie in the disparity map; false where all lie above or below it. */
+static inline int locate(const pair_geometry *g, const disparity_map *map, double row, double first_column,
+                         block *k) {
+    const double *m = g->rectified_from_pixel, end_v = (double)map->height - 0.5;
     for (int i = 0; i < BLOCK; i++) {
         const double column = first_column + i;
         k->x[i] = m[0] * column + m[1] * row + m[2];
@@ -75,19 +79,7 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
     const double rows = g->rows_per_radian, row_origin = g->row_origin;
     if (g->spherical) {
         for (int i = 0; i < BLOCK; i++) {
-            const double across = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
-            k->across_axis[i] = across;
-            k->u[i] = arctangent2(k->x[i], across);
             k->v[i] = arctangent2(k->y[i], k->z[i]) * rows - row_origin;
-        }
-        const double flatness = g->flatness;
-        if (flatness > 0) {
-            for (int i = 0; i < BLOCK; i++) {
-                k->u[i] = tangent(flatness * k->u[i]) / flatness;
-            }
-        }
-        for (int i = 0; i < BLOCK; i++) {
-            k->u[i] = k->u[i] * columns - column_origin;
         }
     } else {
         for (int i = 0; i < BLOCK; i++) {
@@ -96,6 +88,27 @@ static inline void locate(const pair_geometry *g, double row, double first_colum
             k->v[i] = k->y[i] * scale * rows - row_origin;
         }
     }
+    int any = 0;
+    for (int i = 0; i < BLOCK; i++) {
+        any |= (k->v[i] > -0.5) & (k->v[i] < end_v);
+    }
+    if (!any || !g->spherical) {
+        return any;
+    }
+    for (int i = 0; i < BLOCK; i++) {
+        k->across_axis[i] = sqrt(k->y[i] * k->y[i] + k->z[i] * k->z[i]);
+        k->u[i] = arctangent2(k->x[i], k->across_axis[i]);
+    }
+    const double flatness = g->flatness;
+    if (flatness > 0) {
+        for (int i = 0; i < BLOCK; i++) {
+            k->u[i] = tangent(flatness * k->u[i]) / flatness;
+        }
+    }
+    for (int i = 0; i < BLOCK; i++) {
+        k->u[i] = k->u[i] * columns - column_origin;
+    }
+    return 1;
 }
 
 /* Finds the nearest pixels of the disparity map; false where none is inside. */
@@ -122,40 +135,63 @@ static inline int find_nearest(const disparity_map *map, block *k) {
     return any;
 }
 
-/* Reads the disparities around the nearest pixels; false where these have none. */
-static inline int read_around(const disparity_map *map, int count, block *k) {
-    const ptrdiff_t width = map->width, last_row = map->height - 1, last_column = width - 1;
-    int any = 0;
-    for (int i = 0; i < BLOCK; i++) {
-        k->centre[i] = NAN;
+/* Leaves out the pixels whose nearest ones have no disparity. */
+static inline void keep_found(const disparity_map *map, ptrdiff_t count, block *k) {
+    ptrdiff_t n = 0;
+    for (ptrdiff_t i = 0; i < count; i++) {
+        k->place[n] = (int32_t)i;
+        n += k->inside[i] & !isnan(map->values[k->row[i] * map->width + k->column[i]]);
     }
-    for (int i = 0; i < count; i++) {
-        const ptrdiff_t x = k->column[i], y = k->row[i];
-        const float *centre = map->values + y * width + x;
-        if (!k->inside[i] || isnan(*centre)) {
-            continue;
-        }
-        const int has_left = x > 0, has_right = x < last_column, has_above = y > 0, has_below = y < last_row;
-        const int has_beside = k->to_right[i] > 0 ? has_right : has_left;
-        const int has_beyond = k->to_below[i] > 0 ? has_below : has_above;
-        k->centre[i] = *centre;
-        k->left[i] = has_left ? centre[-1] : NAN;
-        k->right[i] = has_right ? centre[1] : NAN;
-        k->above[i] = has_above ? centre[-width] : NAN;
-        k->below[i] = has_below ? centre[width] : NAN;
-        k->across[i] = has_beside && has_beyond ? centre[k->to_below[i] * width + k->to_right[i]] : NAN;
-        any = 1;
-    }
-    return any;
+    k->count = n;
 }
+
+/* Reads the disparities around the nearest pixels. */
+static inline void read_around(const disparity_map *map, block *k) {
+    const ptrdiff_t width = map->width, last_row = map->height - 1, last_column = width - 1;
+    for (ptrdiff_t n = 0; n < k->count; n++) {
+        const ptrdiff_t i = k->place[n], x = k->column[i], y = k->row[i];
+        const float *centre = map->values + y * width + x;
+        const int32_t to_right = k->to_right[i], to_below = k->to_below[i];
+        const int has_left = x > 0, has_right = x < last_column, has_above = y > 0, has_below = y < last_row;
+        if (has_left & has_right & has_above & has_below) {
+            k->left[n] = centre[-1];
+            k->right[n] = centre[1];
+            k->above[n] = centre[-width];
+            k->below[n] = centre[width];
+            k->across[n] = centre[to_below * width + to_right];
+        } else {
+            const int has_beside = to_right > 0 ? has_right : has_left;
+            const int has_beyond = to_below > 0 ? has_below : has_above;
+            k->left[n] = has_left ? centre[-1] : NAN;
+            k->right[n] = has_right ? centre[1] : NAN;
+            k->above[n] = has_above ? centre[-width] : NAN;
+            k->below[n] = has_below ? centre[width] : NAN;
+            k->across[n] = has_beside && has_beyond ? centre[to_below * width + to_right] : NAN;
+        }
+        k->centre[n] = *centre;
+        k->column[n] = (int32_t)x;
+        k->row[n] = (int32_t)y;
+        k->to_right[n] = to_right;
+        k->to_below[n] = to_below;
+        k->x[n] = k->x[i];
+        k->z[n] = k->z[i];
+        k->across_axis[n] = k->across_axis[i];
+        k->u[n] = k->u[i];
+        k->v[n] = k->v[i];
+    }
+}
+
+/* Numbers of pixels that whole registers hold. */
+static inline ptrdiff_t filled_up(const block *k) { return (k->count + 15) / 16 * 16; }
 
 /* Standard deviation of the disparities: they are rough by how far they lie from the mean of their neighbours,
  * along the axis where that is more; matches in foliage and at edges are less certain than those on smooth
  * surfaces. A missing neighbour counts as a whole pixel. */
 static inline void find_spread(const pair_geometry *g, block *k) {
+    const ptrdiff_t count = filled_up(k);
     const float most = (float)g->max_disparity_step, share = ROUGHNESS_SHARE;
     const float variance = (float)(g->disparity_sigma * g->disparity_sigma);
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < count; i++) {
         const float along_row = fabsf(k->centre[i] - 0.5f * (k->left[i] + k->right[i]));
         const float along_column = fabsf(k->centre[i] - 0.5f * (k->above[i] + k->below[i]));
         const float r = isnan(along_row) ? 1 : along_row, c = isnan(along_column) ? 1 : along_column;
@@ -167,8 +203,9 @@ static inline void find_spread(const pair_geometry *g, block *k) {
 /* Disparities at (u, v) less those of the nearest pixels: interpolated only between those of one surface; NaN
  * where there is none. */
 static inline void interpolate(double max_disparity_step, block *k) {
+    const ptrdiff_t count = filled_up(k);
     const float max_step = (float)max_disparity_step;
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < count; i++) {
         const float du = (float)(k->u[i] - k->column[i]), dv = (float)(k->v[i] - k->row[i]);
         const float fx = fabsf(du), fy = fabsf(dv), centre = k->centre[i];
         const float beside = (k->to_right[i] < 0 ? k->left[i] : k->right[i]) - centre;
@@ -186,21 +223,22 @@ static inline void interpolate(double max_disparity_step, block *k) {
 /* With the ray r of depth 1, sin t = x / |r| and cos t = across / |r|: depth, the distance over |r|, has |r|^2 as
  * its only divisor. */
 static inline void triangulate_sphere(const pair_geometry *g, block *k) {
+    const ptrdiff_t count = filled_up(k);
     const double side = g->is_left ? 1 : -1, radians = 1 / g->columns_per_radian;
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < count; i++) {
         k->parallax[i] = ((double)k->centre[i] + k->change[i] + g->disparity_origin) * radians;
         k->stretch[i] = 1;
     }
     const double flatness = g->flatness;
     if (flatness > 0) {
-        for (int i = 0; i < BLOCK; i++) {
+        for (ptrdiff_t i = 0; i < count; i++) {
             const double own = flatness * radians * (k->u[i] + g->column_origin);
             const double apart = flatness * k->parallax[i], other = own - side * apart;
             k->parallax[i] = arctangent2(apart, 1 + own * other) / flatness;
             k->stretch[i] = 1 / (1 + other * other);
         }
     }
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < count; i++) {
         const double delta = k->parallax[i];
         const double cot = cotangent(delta), across = k->across_axis[i];
         const double scale = g->baseline / (k->x[i] * k->x[i] + across * across);
@@ -213,7 +251,8 @@ static inline void triangulate_sphere(const pair_geometry *g, block *k) {
 }
 
 static inline void triangulate_plane(const pair_geometry *g, block *k) {
-    for (int i = 0; i < BLOCK; i++) {
+    const ptrdiff_t count = filled_up(k);
+    for (ptrdiff_t i = 0; i < count; i++) {
         const double d = (double)k->centre[i] + k->change[i] + g->disparity_origin;
         const double inverse = 1 / (d * k->z[i]), z = g->baseline * g->columns_per_radian * inverse;
         const int found = d > 0 && k->z[i] > 0;
@@ -230,14 +269,15 @@ void VERSION_OF(depth_candidates)(const float *disparity, ptrdiff_t map_height, 
     memset(&k, 0, sizeof k);
     for (ptrdiff_t y = 0; y < rows; y++) {
         for (ptrdiff_t start = 0; start < columns; start += BLOCK) {
-            const int count = columns - start < BLOCK ? (int)(columns - start) : BLOCK;
+            const ptrdiff_t count = columns - start < BLOCK ? columns - start : BLOCK;
             const ptrdiff_t first = y * columns + start;
-            locate(g, (double)(first_row + y), (double)start, &k);
-            if (!find_nearest(&map, &k) || !read_around(&map, count, &k)) {
-                memset(depth + first, 0, (size_t)count * sizeof *depth);
-                memset(sigma + first, 0, (size_t)count * sizeof *sigma);
+            memset(depth + first, 0, (size_t)count * sizeof *depth);
+            memset(sigma + first, 0, (size_t)count * sizeof *sigma);
+            if (!locate(g, &map, (double)(first_row + y), (double)start, &k) || !find_nearest(&map, &k)) {
                 continue;
             }
+            keep_found(&map, count, &k);
+            read_around(&map, &k);
             find_spread(g, &k);
             interpolate(g->max_disparity_step, &k);
             if (g->spherical) {
@@ -245,9 +285,9 @@ void VERSION_OF(depth_candidates)(const float *disparity, ptrdiff_t map_height, 
             } else {
                 triangulate_plane(g, &k);
             }
-            for (int i = 0; i < count; i++) {
-                depth[first + i] = k.depth[i];
-                sigma[first + i] = k.sigma[i];
+            for (ptrdiff_t i = 0; i < k.count; i++) {
+                depth[first + k.place[i]] = k.depth[i];
+                sigma[first + k.place[i]] = k.sigma[i];
             }
         }
     }

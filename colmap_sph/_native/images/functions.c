@@ -3,6 +3,7 @@
 #include "images/images.h"
 
 #define SOURCE_PIXELS(X) \
+    X(VALUE, backend, backend) \
     X(IN, float32, ray_rows, 3, H) \
     X(IN, float32, ray_columns, 3, W) \
     X(IN, float32, weights, W) \
@@ -16,7 +17,8 @@ ARGUMENTS(source_pixels, SOURCE_PIXELS);
 static int run_source_pixels(void *arguments) {
     const source_pixels_arguments *a = arguments;
     const ray_tables tables = {a->ray_rows, a->ray_columns, a->weights, a->size.H, a->size.W};
-    source_pixels(tables, (float)a->source_width, (float)a->source_height, a->columns, a->rows, a->inside);
+    a->backend->source_pixels(tables, (float)a->source_width, (float)a->source_height, a->columns, a->rows,
+                              a->inside);
     return 0;
 }
 
@@ -25,6 +27,7 @@ FUNCTION(
     "Where rectified pixels, of rays ray_rows * weights + ray_columns, lie in an image, and 255 inside of it.");
 
 #define SHARPEN(X) \
+    X(VALUE, backend, backend) \
     X(IN, float32, image, H, W) \
     X(VALUE, float, sharpening) \
     X(OUT, int16, padded, H + 6, W + 8)
@@ -32,7 +35,7 @@ ARGUMENTS(sharpen, SHARPEN);
 
 static int run_sharpen(void *arguments) {
     const sharpen_arguments *a = arguments;
-    return sharpen(a->image, a->size.H, a->size.W, a->sharpening, a->padded);
+    return a->backend->sharpen(a->image, a->size.H, a->size.W, a->sharpening, a->padded);
 }
 
 FUNCTION(

@@ -1,6 +1,5 @@
 /* Kernels of rectified images: where their pixels lie in the image that they are sampled from, and what the census
- * compares. One pass each, plain enough for compilers to work on many pixels at once, so that one version serves
- * all processors. */
+ * compares. One pass each, plain enough for compilers to work on many pixels at once. */
 #ifndef COLMAP_SPH_IMAGES_H
 #define COLMAP_SPH_IMAGES_H
 
@@ -15,12 +14,15 @@ typedef struct {
 
 /* Columns and rows in an image of so many pixels, whose centres have whole numbers; `inside` is 255 where they lie
  * in it, else 0. */
-void source_pixels(ray_tables tables, float source_width, float source_height, float *columns, float *rows,
-                   uint8_t *inside);
+typedef void source_pixels_fn(ray_tables tables, float source_width, float source_height, float *columns,
+                              float *rows, uint8_t *inside);
 
 /* An image plus `sharpening` times its difference from the binomial mean of 3 x 3 pixels, in 1/CENSUS_STEPS grey
  * value, cut to whole ones, with a border of CENSUS_RADIUS_{Y,X}: there, and beside it, the outermost pixels of
  * the image go on. -1 without memory. */
-int sharpen(const float *image, ptrdiff_t height, ptrdiff_t width, float sharpening, int16_t *padded);
+typedef int sharpen_fn(const float *image, ptrdiff_t height, ptrdiff_t width, float sharpening, int16_t *padded);
+
+source_pixels_fn source_pixels_scalar, source_pixels_avx2, source_pixels_avx512;
+sharpen_fn sharpen_scalar, sharpen_avx2, sharpen_avx512;
 
 #endif

@@ -2,6 +2,7 @@
 
 #include "images/images.h"
 #include "matching/matching.h"
+#include "version.h"
 
 /* Weights of the pixel, and of the sum of 3 x 3 pixels that weigh 1 2 1, 2 4 2, 1 2 1. */
 typedef struct {
@@ -28,7 +29,7 @@ static void sharpen_row(weights w, const float *own, const float *sums, ptrdiff_
     }
 }
 
-int sharpen(const float *image, ptrdiff_t height, ptrdiff_t width, float sharpening, int16_t *padded) {
+int VERSION_OF(sharpen)(const float *image, ptrdiff_t height, ptrdiff_t width, float sharpening, int16_t *padded) {
     const weights w = {CENSUS_STEPS * (1 + sharpening), CENSUS_STEPS * sharpening / 16};
     if (height == 0 || width == 0) {
         return 0;

@@ -1,4 +1,5 @@
 #include "images/images.h"
+#include "version.h"
 
 /* Rays of length about 1 whose depth is less lie beside the camera. */
 static const float LEAST_DEPTH = 1e-6f;
@@ -20,8 +21,8 @@ static void source_row(const float *row, const float *restrict across, const flo
     }
 }
 
-void source_pixels(ray_tables tables, float source_width, float source_height, float *columns, float *rows,
-                   uint8_t *inside) {
+void VERSION_OF(source_pixels)(ray_tables tables, float source_width, float source_height, float *columns,
+                               float *rows, uint8_t *inside) {
     const ptrdiff_t height = tables.height, width = tables.width;
     const float *across = tables.columns, *down = across + width, *away = down + width;
     const float size[2] = {source_width, source_height};

@@ -306,6 +306,7 @@ FUNCTION(mean_offsets, MEAN_OFFSETS, check_mean_offsets,
          "Of every offset the mean of those near it that differ from it by no more than `max_step`.");
 
 #define UPSAMPLE_OFFSETS(X) \
+    X(VALUE, backend, backend) \
     X(IN, int32, offset, H, W) \
     X(VALUE, int, max_step) \
     X(OUT, int32, fine, FINE_H, FINE_W)
@@ -319,7 +320,7 @@ static int check_upsample_offsets(const void *arguments) {
 
 static int run_upsample_offsets(void *arguments) {
     const upsample_offsets_arguments *a = arguments;
-    upsample_offsets(a->offset, level_sizes_of(&a->size), a->max_step, a->fine);
+    a->backend->upsample_offsets(a->offset, level_sizes_of(&a->size), a->max_step, a->fine);
     return 0;
 }
 

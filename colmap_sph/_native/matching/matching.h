@@ -117,7 +117,7 @@ typedef struct {
 
 /* Offsets of a level's pixels at those of the next finer one: interpolated where 3 x 3 of them differ by no more
  * than `max_step`, else repeated. */
-void upsample_offsets(const int32_t *offset, level_sizes size, int max_step, int32_t *fine);
+typedef void upsample_offsets_fn(const int32_t *offset, level_sizes size, int max_step, int32_t *fine);
 
 /* What the pixels of a level search about their predicted offsets (1/256 pixel), so many residuals each: the first
  * one, in pixels. It is half of them before the prediction, or as near to that as leaves `clearance` beyond the
@@ -136,5 +136,6 @@ void to_disparity(const int32_t *offset, ptrdiff_t pixels, const float *shifts, 
 census_fn census_scalar, census_avx2, census_avx512, census_neon;
 fit_offsets_fn fit_offsets_scalar, fit_offsets_avx2, fit_offsets_avx512;
 mean_offsets_fn mean_offsets_scalar, mean_offsets_avx2, mean_offsets_avx512;
+upsample_offsets_fn upsample_offsets_scalar, upsample_offsets_avx2, upsample_offsets_avx512;
 
 #endif

@@ -255,10 +255,39 @@ static int run_decode_disparity(void *arguments) {
 
 FUNCTION(decode_disparity, DECODE_DISPARITY, any, "Disparities of codes; NaN where there is none.");
 
-native_function *const offsets_functions[] = {&keep_between_function,     &remove_small_segments_function,
-                                              &count_fractions_function,  &unwarp_torn_function,
-                                              &first_offsets_function,    &target_bases_function,
-                                              &join_targets_function,     &bases_about_function,
-                                              &mark_steps_function,       &count_slopes_function,
-                                              &disparity_range_function,  &code_disparity_function,
-                                              &decode_disparity_function, NULL};
+#define SEED_PLANES(X) \
+    X(IN, float64, columns, POINTS) \
+    X(IN, float64, rows, POINTS) \
+    X(IN, float64, values, POINTS) \
+    X(VALUE, int, neighbours) \
+    X(VALUE, double, alike) \
+    X(VALUE, double, stiffness) \
+    X(VALUE, double, unknown_stiffness) \
+    X(VALUE, int, cell) \
+    X(OUT, float32, planes, H, W)
+ARGUMENTS(seed_planes, SEED_PLANES);
+
+static int check_seed_planes(const void *arguments) {
+    const seed_planes_arguments *a = arguments;
+    return check(a->size.POINTS > 0, "there must be a seed") &&
+           check(a->neighbours > 0 && a->neighbours <= MAX_NEIGHBOURS, "the neighbours must lie in 1..32") &&
+           check(a->cell > 0, "a cell must have a pixel");
+}
+
+static int run_seed_planes(void *arguments) {
+    const seed_planes_arguments *a = arguments;
+    const seed_list seeds = {a->columns, a->rows, a->values, a->size.POINTS};
+    const seed_weights weights = {a->neighbours, a->alike, a->stiffness, a->unknown_stiffness};
+    seed_planes(seeds, weights, a->cell, a->size.H, a->size.W, a->planes);
+    return 0;
+}
+
+FUNCTION(seed_planes, SEED_PLANES, check_seed_planes,
+         "Values, at the centres of cells of so many pixels, of planes through the seeds around them.");
+
+native_function *const offsets_functions[] = {
+    &keep_between_function,     &remove_small_segments_function, &count_fractions_function,
+    &unwarp_torn_function,      &first_offsets_function,         &target_bases_function,
+    &join_targets_function,     &bases_about_function,           &mark_steps_function,
+    &count_slopes_function,     &disparity_range_function,       &code_disparity_function,
+    &decode_disparity_function, &seed_planes_function,           NULL};

@@ -67,4 +67,24 @@ void disparity_range(const float *disparity, ptrdiff_t pixels, float ends[2]);
 void code_disparity(const float *disparity, ptrdiff_t pixels, float least, float step, uint16_t *codes);
 void decode_disparity(const uint16_t *codes, ptrdiff_t pixels, float least, float step, float *disparity);
 
+enum { MAX_NEIGHBOURS = 32 };
+
+/* Sparse points of a pair: what is known (`values`) at some places of an image. */
+typedef struct {
+    const double *columns, *rows, *values;
+    ptrdiff_t count;
+} seed_list;
+
+/* So many seeds around a place count, by 1 / (distance^2 + alike^2). Slopes are held back as if `stiffness` times
+ * as many seeds at the distance `alike`, and `unknown_stiffness` times as many at that of the nearest one, told of
+ * none. */
+typedef struct {
+    int neighbours;
+    double alike, stiffness, unknown_stiffness;
+} seed_weights;
+
+/* Values, at the centres of cells of so many pixels, of planes through the seeds around them. */
+void seed_planes(seed_list seeds, seed_weights weights, ptrdiff_t cell, ptrdiff_t height, ptrdiff_t width,
+                 float *values);
+
 #endif

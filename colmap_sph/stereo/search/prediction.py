@@ -255,7 +255,7 @@ def _neighbourhood(values: NDArray[np.float32], radius: int) -> tuple[NDArray[np
 def _upsampled(offset: NDArray[np.int32], shape: tuple[int, ...]) -> NDArray[np.int32]:
     """At the next finer level's pixels, of which the offsets are: interpolated on surfaces, repeated at steps."""
     fine = np.empty(shape, dtype=np.int32)
-    _native.upsample_offsets(offset, _MAX_SURFACE_STEP * SUBPIXEL, fine)
+    _native.upsample_offsets(backend(), offset, _MAX_SURFACE_STEP * SUBPIXEL, fine)
     return fine
 
 

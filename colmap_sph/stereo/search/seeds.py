@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
+from colmap_sph import _native
 from colmap_sph.scene import Photograph, Scene, View, observed_by
 from colmap_sph.stereo.rectified_pair import Float, RectifiedPair, Side, coordinates_of_rays
 
@@ -24,7 +24,6 @@ _LEAST_ALIKE = 2.0
 # told of none: beyond the outermost seeds little is known.
 _STIFFNESS = 0.125
 _UNKNOWN_STIFFNESS = 0.1
-_MOST_PLACES = 8192
 
 # Images that see their points equally fine, but for this share, stay in the order of their names.
 _EQUALLY_FINE = 1.02
@@ -111,26 +110,8 @@ def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -
     # Smooth at that distance: planes at the centres of cells half as wide, linear between these.
     cell = max(int(alike / 2), 1)
     height, width = (-(-side // cell) for side in shape)
-    across, down = np.meshgrid((np.arange(width) + 0.5) * cell - 0.5, (np.arange(height) + 0.5) * cell - 0.5)
-    places = np.column_stack([across.ravel(), down.ravel()])
-    tree = cKDTree(np.column_stack([columns, rows]))
-    # In parts, as the equations of many places take much memory.
-    parts = np.array_split(places, -(-len(places) // _MOST_PLACES))
-    values = [_planes_at(part, tree, exact[:, 2] / scale, alike) for part in parts]
-    planes = np.concatenate(values).astype(np.float32)
-    fine = cv2.resize(planes.reshape(height, width), (width * cell, height * cell))
+    planes = np.empty((height, width), dtype=np.float32)
+    weights = (_NEIGHBOURS, alike, _STIFFNESS, _UNKNOWN_STIFFNESS)
+    _native.seed_planes(columns, rows, exact[:, 2] / scale, *weights, cell, planes)
+    fine = cv2.resize(planes, (width * cell, height * cell))
     return np.asarray(fine[: shape[0], : shape[1]], dtype=np.float32)
-
-
-def _planes_at(places: Float, tree: cKDTree, disparities: Float, alike: float) -> Float:
-    """Values, at (n, 2) places, of the planes through the seeds around them."""
-    distance, near = tree.query(places, k=np.arange(1, min(_NEIGHBOURS, tree.n) + 1))
-    weight = 1 / (distance**2 + alike**2)
-    beside = np.asarray(tree.data)[near] - places[:, None]
-    terms = np.stack([np.ones_like(distance), beside[..., 0], beside[..., 1]])
-    equations = np.einsum("ipk,pk,jpk->pij", terms, weight, terms)
-    ridge = weight.sum(axis=1) * (_STIFFNESS * alike**2 + _UNKNOWN_STIFFNESS * distance[:, 0] ** 2)
-    equations[:, 1, 1] += ridge
-    equations[:, 2, 2] += ridge
-    right_sides = np.einsum("ipk,pk,pk->pi", terms, weight, disparities[near])
-    return np.asarray(np.linalg.solve(equations, right_sides[..., None])[:, 0, 0])
