@@ -109,7 +109,7 @@ def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -
     columns, rows = ((exact[:, axis] + 0.5) / scale - 0.5 for axis in (0, 1))
     alike = max(_ALIKE_SHARE * min(shape), _LEAST_ALIKE)
     # Smooth at that distance: planes at the centres of cells half as wide, linear between these.
-    cell = max(int(alike / 2), 1)
+    cell = max(round(alike / 2), 1)
     height, width = (-(-side // cell) for side in shape)
     across, down = np.meshgrid((np.arange(width) + 0.5) * cell - 0.5, (np.arange(height) + 0.5) * cell - 0.5)
     places = np.column_stack([across.ravel(), down.ravel()])
@@ -125,12 +125,24 @@ def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -
 def _planes_at(places: Float, tree: cKDTree, disparities: Float, alike: float) -> Float:
     """Values, at (n, 2) places, of the planes through the seeds around them."""
     distance, near = tree.query(places, k=np.arange(1, min(_NEIGHBOURS, tree.n) + 1))
-    weight = 1 / (distance**2 + alike**2)
-    beside = np.asarray(tree.data)[near] - places[:, None]
-    terms = np.stack([np.ones_like(distance), beside[..., 0], beside[..., 1]])
-    equations = np.einsum("ipk,pk,jpk->pij", terms, weight, terms)
-    ridge = weight.sum(axis=1) * (_STIFFNESS * alike**2 + _UNKNOWN_STIFFNESS * distance[:, 0] ** 2)
-    equations[:, 1, 1] += ridge
-    equations[:, 2, 2] += ridge
-    right_sides = np.einsum("ipk,pk,pk->pi", terms, weight, disparities[near])
-    return np.asarray(np.linalg.solve(equations, right_sides[..., None])[:, 0, 0])
+    square = distance * distance
+    weight = 1 / (square + alike**2)
+    x, y = (tree.data[:, axis][near] - places[:, axis : axis + 1] for axis in (0, 1))
+    value = disparities[near]
+    across, down = weight * x, weight * y
+    total = weight.sum(axis=1)
+    ridge = total * (_STIFFNESS * alike**2 + _UNKNOWN_STIFFNESS * square[:, 0])
+    mean_x, mean_y, mean = across.sum(axis=1) / total, down.sum(axis=1) / total, _sums(weight, value) / total
+    # Normal equations of the two slopes, about the means.
+    xx = _sums(across, x) - total * mean_x**2 + ridge
+    yy = _sums(down, y) - total * mean_y**2 + ridge
+    xy = _sums(across, y) - total * mean_x * mean_y
+    xv = _sums(across, value) - total * mean_x * mean
+    yv = _sums(down, value) - total * mean_y * mean
+    slope_x, slope_y = yy * xv - xy * yv, xx * yv - xy * xv
+    return np.asarray(mean - (slope_x * mean_x + slope_y * mean_y) / (xx * yy - xy * xy))
+
+
+def _sums(left: Float, right: Float) -> Float:
+    """(n,) sums of the products of the rows of (n, k) arrays."""
+    return np.asarray(np.einsum("nk,nk->n", left, right))
