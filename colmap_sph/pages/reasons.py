@@ -145,28 +145,27 @@ def _look_from(
         transfer = pixel_transfer(view, partner.view)
         moved = transfer[:, :3] @ points + transfer[:, 3:]
         in_view, places = _in_view(partner, moved, known)
-        seen |= in_view
-        apart |= in_view & (_angles(rays, partner.view.center - view.center) >= min_angle)
+        seen[in_view] = True
+        angles = _angles(rays[:, in_view], partner.view.center - view.center)
+        apart[in_view] |= angles >= min_angle
         # What lies behind the surface that the partner sees is hidden from it.
         most = _depths_around(partner.samples)[places]
-        met |= in_view & (most > 0) & (moved[2] <= (1 + _SLACK) * most)
+        met[in_view] |= (most > 0) & (moved[2, in_view] <= (1 + _SLACK) * most)
     shape = depth.shape
     return seen.reshape(shape), apart.reshape(shape), met.reshape(shape)
 
 
 def _in_view(
     partner: Partner, moved: NDArray[np.float64], known: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], tuple[NDArray[np.int64], NDArray[np.int64]]]:
-    """Which homogeneous pixels (3, n) lie in a partner's image; and row and column of the sample next to each."""
-    in_front = known & (moved[2] > 0)
-    scale = np.where(in_front, moved[2], 1)
-    x = np.where(in_front, moved[0] / scale, -1)
-    y = np.where(in_front, moved[1] / scale, -1)
+) -> tuple[NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """(m,) homogeneous pixels, of (3, n), that lie in a partner's image; row and column of the sample there."""
+    x, y, depth = moved
     view = partner.view
-    in_view = (x >= 0) & (x <= view.width - 1) & (y >= 0) & (y <= view.height - 1)
-    rows = nearest_in(partner.samples.rows, np.where(in_view, y, 0))
-    columns = nearest_in(partner.samples.columns, np.where(in_view, x, 0))
-    return in_view, (rows, columns)
+    inside = known & (x >= 0) & (y >= 0) & (x <= (view.width - 1) * depth) & (y <= (view.height - 1) * depth)
+    which = np.flatnonzero(inside & (depth > 0))
+    rows = nearest_in(partner.samples.rows, y[which] / depth[which])
+    columns = nearest_in(partner.samples.columns, x[which] / depth[which])
+    return which, (rows, columns)
 
 
 def _depths_around(samples: MapSamples) -> NDArray[np.float32]:
@@ -177,6 +176,11 @@ def _depths_around(samples: MapSamples) -> NDArray[np.float32]:
 
 def _angles(rays: NDArray[np.float64], baseline: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n,) degrees at the points (3, n), relative to the view's centre, between it and one `baseline` away."""
-    others = rays - baseline[:, None]
-    sines = np.linalg.norm(np.cross(rays.T, others.T), axis=1)
-    return np.asarray(np.degrees(np.arctan2(sines, np.einsum("in,in->n", rays, others))))
+    sines = np.linalg.norm(_cross(rays, baseline), axis=0)
+    return np.asarray(np.degrees(np.arctan2(sines, (rays**2).sum(axis=0) - baseline @ rays)))
+
+
+def _cross(rays: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, n) products of the vectors (3, n) with another."""
+    (x, y, z), (a, b, c) = rays, other
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a])

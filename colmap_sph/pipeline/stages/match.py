@@ -91,7 +91,8 @@ class MatchTask:
 
     Each side is one view, or all that were cut from one photograph. `seeds` are those of its sparse points, see
     `seeds_of_points`. Where poses may be imprecise, the pair is matched at the share `trial` of its rows and
-    columns first. `back` is the same pair the other way round, where it is matched both ways, with the same key.
+    columns first. `back` is the same pair the other way round, where it is matched both ways, with the same key
+    and at the same share, so that it is not tried.
     """
 
     left: tuple[PhotoFile, ...]
@@ -113,7 +114,18 @@ class MatchTask:
 
 def make_disparity_maps(task: MatchTask) -> Facts:
     """Rectify and match a pair; writes its disparity map and ties, both where it is matched both ways."""
-    return _facts_of(make_disparity_map(way) for way in task.ways)
+    if getattr(_thread, "scratch", None) is None or _thread.scratch.max_bytes != task.scratch_bytes:
+        _thread.scratch = Scratch(task.scratch_bytes)
+    share = _tolerable_share(task)
+    return _facts_of(make_disparity_map(way, share) for way in task.ways)
+
+
+def _tolerable_share(task: MatchTask) -> float:
+    """Share of its rows and columns at which to match a pair, both ways."""
+    if task.trial >= 1:
+        return 1.0
+    residual = row_residual(_match(task, task.geometry.resampled(task.trial))[1])
+    return tolerable_sampling(residual or 0.0, task.trial)
 
 
 def _facts_of(ways: Iterable[Facts]) -> Facts:
@@ -125,14 +137,8 @@ def _facts_of(ways: Iterable[Facts]) -> Facts:
     return Facts(row_residual=float(np.mean(known)) if known else None)
 
 
-def make_disparity_map(task: MatchTask) -> Facts:
-    """Rectify and match a pair one way."""
-    if getattr(_thread, "scratch", None) is None or _thread.scratch.max_bytes != task.scratch_bytes:
-        _thread.scratch = Scratch(task.scratch_bytes)
-    share = 1.0
-    if task.trial < 1:
-        residual = row_residual(_match(task, task.geometry.resampled(task.trial))[1])
-        share = tolerable_sampling(residual or 0.0, task.trial)
+def make_disparity_map(task: MatchTask, share: float) -> Facts:
+    """Rectify and match a pair one way, at a share of its rows and columns."""
     geometry = task.geometry.resampled(share)
     disparity, ties = _match(task, geometry)
     pair = PairDisparity(task.left[0].view.name, task.right[0].view.name, geometry, disparity)
@@ -252,7 +258,8 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         left, right = (context.scene.photograph(lead.name) for lead in leads)
         ways = [(left, right), (right, left)]
         asked = [
-            self._ask(*way, points, target) for way, target in zip(ways, context.pair_paths(*item), strict=False)
+            self._ask(*way, points, target, is_first=not number)
+            for number, (way, target) in enumerate(zip(ways, context.pair_paths(*item), strict=False))
         ]
         (task, cost), *backs = asked
         for back, other_cost in backs:
@@ -262,13 +269,13 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         return Job(task.key, self.found(task), cost, task)
 
     def _ask(
-        self, left: Photograph, right: Photograph, points: NDArray[np.float64], target: Path
+        self, left: Photograph, right: Photograph, points: NDArray[np.float64], target: Path, *, is_first: bool
     ) -> tuple[MatchTask, Cost]:
         """What is to be done one way, and what it costs."""
         context = self.context
         geometry = self._geometry(left, right)
         seeds = seeds_of_points(left.lead, right.lead, geometry, points)
-        trial = self._trial(left, right, geometry)
+        trial = self._trial(left, right, geometry) if is_first else 1.0
         key = context.keys.pair(left, right, geometry, seeds, trial)
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)

@@ -87,9 +87,9 @@ def _fisheye(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str)
     beyond = np.isnan(rays[:, 2])
     if beyond.mean() > _MOST_BEYOND:
         raise InputError(
-            f"Camera {camera.camera_id} ({camera.model_name}) in {name} shows nothing beyond "
-            f"{np.degrees(turn):.0f} degrees off its axis by its parameters, but {100 * beyond.mean():.0f} % of "
-            "what it observes lies beyond; calibrate it again, or choose another camera model."
+            f"Camera {camera.camera_id} ({camera.model_name}) in {name} cannot have seen "
+            f"{100 * beyond.mean():.0f} % of what it observes: by its parameters it shows nothing beyond "
+            f"{np.degrees(turn):.0f} degrees off its axis; calibrate it again, or choose another camera model."
         )
     reach = float(np.arccos(np.clip(rays[~beyond, 2].min(), -1, 1)))
     return replace(lens, limit=min(turn, reach + _BEYOND))

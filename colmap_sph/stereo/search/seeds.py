@@ -108,7 +108,7 @@ def interpolated_disparity(seeds: Seeds, shape: tuple[int, ...], scale: float) -
     columns, rows = ((exact[:, axis] + 0.5) / scale - 0.5 for axis in (0, 1))
     alike = max(_ALIKE_SHARE * min(shape), _LEAST_ALIKE)
     # Smooth at that distance: planes at the centres of cells half as wide, linear between these.
-    cell = max(int(alike / 2), 1)
+    cell = max(round(alike / 2), 1)
     height, width = (-(-side // cell) for side in shape)
     planes = np.empty((height, width), dtype=np.float32)
     weights = (_NEIGHBOURS, alike, _STIFFNESS, _UNKNOWN_STIFFNESS)
