@@ -13,7 +13,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.images.jpeg import rounding_step
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.stereo.blank import blank_pixels, drop_scattered, faint_pixels
+from colmap_sph.stereo.blank import blank_pixels, drop_scattered, faint_pixels, faint_rays
 from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.matching import MatchingOptions, match_pair
 
@@ -194,6 +194,18 @@ def test_a_faint_place_keeps_its_depths_where_they_are_many():
         found = depth.copy()
         drop_scattered(found, faint)
         np.testing.assert_array_equal(found, np.where(kept, depth, 0))
+
+
+def test_rays_of_a_faint_sky_are_found_along_silhouettes():
+    """Depth maps are of pixels' corners: many of the sky's rays pass a pixel of what stands before it."""
+    for camera in cameras():
+        is_sky = surfaces_of(camera)[0] == SKY
+        of_pixels = syn.exact_geometry(scene(), camera, origin=0.5)[2] == SKY
+        edge = is_sky & ~of_pixels
+        assert edge.sum() > 50
+        found = faint_rays(of_pixels.astype(np.uint8)) > 0
+        assert found[edge].mean() > 0.98  # all but tips
+        assert (found & ~is_sky).sum() < 0.01 * (~is_sky).sum()
 
 
 # ---- what comes of it --------------------------------------------------------------------------------------

@@ -205,20 +205,24 @@ def test_depths_off_their_plane_are_dropped():
     size = plane.depth / VIEW.K[0, 0]
     depth[30, 30] += 5 * plane.sigma[30, 30] + 3 * size[30, 30]
     depth[60, 60] += 0.5 * size[60, 60]
-    noisy = DepthEstimate(depth, plane.sigma, plane.support)
+    two = np.full(depth.shape, 2, np.uint8)
+    noisy = DepthEstimate(depth, plane.sigma, two)
     normals, fitted = fit_normals(VIEW, noisy, OPTIONS)
     assert fitted[30, 30] == 0 and not normals[30, 30].any()
     assert (fitted > 0).sum() == fitted.size - 1
     assert (fit_normals(VIEW, noisy, replace(OPTIONS, max_shift=100.0))[1] > 0).all()
     # Where depths are uncertain, the same step is noise.
-    uncertain = DepthEstimate(depth, 5 * plane.sigma, plane.support)
+    uncertain = DepthEstimate(depth, 5 * plane.sigma, two)
     assert (fit_normals(VIEW, uncertain, OPTIONS)[1] > 0).all()
+    # What three or more support is a rough surface; it is put onto the plane.
+    _, smooth = fit_normals(VIEW, replace(noisy, support=two + 1), OPTIONS)
+    np.testing.assert_allclose(smooth[30, 30], plane.depth[30, 30], atol=size[30, 30])
 
 
 def test_what_may_be_missing_to_a_plane_grows_with_its_slope():
     """On a plane at 72 degrees depth changes by about three pixel sizes from one pixel to the next."""
     exact = inverse_depth(plane_normal(72, 90))
-    plane = DepthEstimate((1 / exact).astype(np.float32), np.zeros_like(exact), np.full(exact.shape, 9, np.uint8))
+    plane = DepthEstimate((1 / exact).astype(np.float32), np.zeros_like(exact), np.full(exact.shape, 2, np.uint8))
     size = plane.depth / VIEW.K[0, 0]
     change = np.abs(np.gradient(plane.depth, axis=0))
     depth = plane.depth.copy()

@@ -122,6 +122,34 @@ def faint_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int = 1) -> Mask:
     return _silent_pixels(image, jpeg_step, _FAINT_LEVELS, is_local=False)
 
 
+def faint_rays(faint: Mask) -> Mask:
+    """Which rays of a depth map meet a faint pixel.
+
+    They pass through the upper left corners of pixels (see `pixel origin` in docs/algorithm.md), where four meet:
+    along silhouettes, the ray of a pixel that shows what stands in front may well belong to what is behind it.
+
+    Parameters
+    ----------
+    faint : (H, W) uint8 ndarray
+        Faint pixels of an image, see `faint_pixels`.
+
+    Returns
+    -------
+    (H, W) uint8 ndarray
+        1 where any of the four pixels is faint, else 0.
+
+    Examples
+    --------
+    >>> pixels = np.zeros((3, 4), np.uint8)
+    >>> pixels[1, 1] = 1
+    >>> faint_rays(pixels)
+    array([[0, 0, 0, 0],
+           [0, 1, 1, 0],
+           [0, 1, 1, 0]], dtype=uint8)
+    """
+    return np.asarray(cv2.dilate(faint, np.ones((2, 2), np.uint8), anchor=(1, 1)), dtype=np.uint8)
+
+
 def drop_scattered(depth: Float, faint: Mask) -> None:
     """Set depths to 0, in place, that stand for too little of a faint place.
 
@@ -133,7 +161,7 @@ def drop_scattered(depth: Float, faint: Mask) -> None:
     depth : (H, W) float32 ndarray
         0 = none.
     faint : (H, W) uint8 ndarray
-        See `faint_pixels`.
+        See `faint_rays`.
     """
     if not faint.any():
         return

@@ -19,7 +19,7 @@ from colmap_sph.stereo.kernels import backend
 _BAND_ROWS = 256
 # Depths that differ from their plane's by less are noise.
 _SHIFT_SIGMAS = 2
-# What so many support may be seen under any angle.
+# What so many support may be seen under any angle, and lie off its neighbours' plane.
 _WELL_SUPPORTED = 3
 
 
@@ -32,8 +32,10 @@ class NormalOptions:
     tolerance: float = 3.0
     """Neighbours further from the plane than this many standard deviations hardly count."""
     max_shift: float = 2.0
-    """A depth that differs from its plane's by more than this many times the size of its pixel, or the plane's
-    change of depth to the next pixel where that is more, and by more than two standard deviations, is dropped."""
+    """A depth that fewer than three others support is dropped where it differs from its plane's by more than this
+    many times the size of its pixel, or the plane's change of depth to the next pixel where that is more, and by
+    more than two standard deviations. What more support is rough, as foliage is, or has poses that are not exact:
+    it gets its plane's depth."""
     max_incidence: float = 80.0
     """Largest angle, degrees, between the ray and the normal of a pixel whose depth fewer than three others
     support: what few see at a glance is rarely right."""

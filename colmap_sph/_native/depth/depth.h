@@ -38,8 +38,8 @@ typedef struct {
     float max_shift;   /* most that a depth may differ from its plane's: pixel sizes, or its changes per pixel
                           where these are more, and ... */
     float shift_sigma; /* ... standard deviations; both must be exceeded to drop it */
-    float min_cosine;  /* of the angle between ray and normal, where ... */
-    int supported;     /* ... less than this support the depth */
+    float min_cosine;  /* of the angle between ray and normal */
+    int supported;     /* all three only where less than this support the depth */
 } plane_fit;
 
 /* Normals (camera frame, unit, towards the camera; interleaved x, y, z) from robust local planes in inverse

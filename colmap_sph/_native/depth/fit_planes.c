@@ -115,7 +115,7 @@ static inline int begin(const float *centre, const float *sigma, ptrdiff_t count
     return any;
 }
 
-/* Whether the pixel is off its plane, or glances at it with little support. `value` is the plane's inverse depth
+/* Whether a pixel with little support is off its plane, or glances at it. `value` is the plane's inverse depth
  * over the pixel's, `facing` the cosine at which its ray meets the plane. */
 static inline int is_doubtful(const plane_fit *fit, const block *k, int l, double value, double relative_sigma,
                               double focal_length, double facing, int support) {
@@ -123,7 +123,7 @@ static inline int is_doubtful(const plane_fit *fit, const block *k, int l, doubl
     const double slope = sqrt((double)(k->du[l] * k->du[l] + k->dv[l] * k->dv[l]));
     const double size = slope * focal_length > 1 ? slope : 1 / focal_length;
     const int is_off = shift > fit->max_shift * size && shift > fit->shift_sigma * relative_sigma * value;
-    return is_off || (support < fit->supported && facing < fit->min_cosine);
+    return support < fit->supported && (is_off || facing < fit->min_cosine);
 }
 
 static inline void store_plane(const plane_fit *fit, const block *k, int l, double column, double row,

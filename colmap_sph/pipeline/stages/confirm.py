@@ -22,7 +22,7 @@ from colmap_sph.project.state.ownership import undistorted_place
 from colmap_sph.project.undistortion.rounding import coarsest_jpeg_step
 from colmap_sph.scene import View
 from colmap_sph.stereo.agreement import SparseSights, compare_with_sparse
-from colmap_sph.stereo.blank import drop_scattered, faint_pixels
+from colmap_sph.stereo.blank import drop_scattered, faint_pixels, faint_rays
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth
 from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
@@ -157,13 +157,13 @@ def _image(file: EstimateFile) -> NDArray[np.uint8]:
 
 
 def _faint(file: EstimateFile, mask: NDArray[np.uint8] | None) -> NDArray[np.uint8]:
-    """See `faint_pixels`; found in the whole image, so that a region has no part in it."""
+    """See `faint_rays`; found in the whole image, so that a region has no part in it."""
     is_whole = file.window == Window.whole(file.whole)
     image = _image(file) if is_whole else _whole_image(file)
     faint = faint_pixels(image, coarsest_jpeg_step(file.image, file.record))
     if mask is not None:
         faint[mask == 0] = 0
-    return file.window.part(faint)
+    return file.window.part(faint_rays(faint))
 
 
 def confirm_seconds(partners: int, normals: NormalOptions, refinement: RefinementOptions) -> float:
