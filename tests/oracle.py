@@ -401,8 +401,8 @@ def _read_depth(depth, u, v):
 
 
 def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_support):
-    """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner sees the point or would if it had a depth
-    there, the partner's depth and sigma, clearance.
+    """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner has a depth there that does not hide the
+    point, the partner's depth and sigma, clearance.
 
     `maps` are the partner's depth, sigma and support.
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
@@ -424,7 +424,6 @@ def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_
         u, v = pixel[:2] / pixel[2]
         border = np.subtract(partner_depth.shape[::-1], 1)
         clearance[row, col] = np.abs([u, v, *(border - (u, v))]).min()
-        observing[row, col] = (np.array([u, v]) >= 0).all() and ([u, v] <= border).all()
         found = _read_depth(partner_depth.astype(float), u, v)
         if not found > 0:
             continue

@@ -506,25 +506,31 @@ def in_view(reference, other, depth):
     return ((uv >= 0) & (uv <= [other.width - 1, other.height - 1])).all(axis=1).reshape(column.shape)
 
 
-def test_one_view_is_enough_where_no_other_has_the_point_in_view():
+UNSURE = replace(CONFIRM, min_contradicting_support=255)
+
+
+def test_one_view_is_enough_where_no_other_has_a_depth():
     views, maps = wall_views(3)
-    maps[2][:] = 0
     first, second = (in_view(views[0], view, 10.0) for view in views[1:])
     assert 0.01 < (first & ~second).mean() < 0.5 < (first & second).mean()
-    # Where the second has the point in view it could have confirmed it and did not.
-    np.testing.assert_array_equal(confirm(views, maps).depth > 0, first & ~second)
-    # Unless its sight is blocked by something nearer.
+    # Where the second has another depth it could have confirmed it and did not.
+    maps[2] = plane_depth(views[2], 14.0)
+    np.testing.assert_array_equal(confirm(views, maps, UNSURE).depth > 0, first & ~second)
+    # Unless that is nearer and blocks its sight, or there is none.
     maps[2] = plane_depth(views[2], 4.0)
-    np.testing.assert_array_equal(confirm(views, maps).depth > 0, first)
+    np.testing.assert_array_equal(confirm(views, maps, UNSURE).depth > 0, first)
+    maps[2][:] = 0
+    np.testing.assert_array_equal(confirm(views, maps, UNSURE).depth > 0, first)
 
 
 def test_what_too_few_views_confirm_is_dropped():
     views, maps = wall_views(4)
-    maps[2][:] = maps[3][:] = 0
+    for k in (2, 3):
+        maps[k] = plane_depth(views[k], 14.0)
     seen = in_view(views[0], views[2], 10.0)
-    assert not confirm(views, maps).depth[seen].any()
-    assert confirm(views, maps, replace(CONFIRM, min_consistent=1)).depth[seen].any()
-    assert (confirm(views, maps, replace(CONFIRM, min_consistent=0)).depth > 0).all()
+    assert not confirm(views, maps, UNSURE).depth[seen].any()
+    assert confirm(views, maps, replace(UNSURE, min_consistent=1)).depth[seen].any()
+    assert (confirm(views, maps, replace(UNSURE, min_consistent=0)).depth > 0).all()
 
 
 def test_what_one_view_confirms_in_passing_is_dropped():

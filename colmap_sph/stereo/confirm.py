@@ -31,8 +31,7 @@ class ConfirmOptions:
     """Two views' depths agree when they also differ by less than this many standard deviations."""
     min_consistent: int = 2
     """Views, of those that share a pair with the image, that must confirm a geometric depth; those that stand side
-    by side count as one. One is enough for a point that no other has in view. 0: none need, but none may look
-    through it."""
+    by side count as one. One is enough where no other has a depth. 0: none need, but none may look through it."""
     max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
     min_contradicting_support: int = 2

@@ -108,8 +108,9 @@ typedef struct {
     int min_support;              /* pairs behind a depth that contradicts */
 } consistency_gates;
 
-/* Of the partners so far, per pixel: how many have the point in view and see nothing in front of it, agree, and
- * contradict; and the running weighted sums of their depths, carried to the pixel's ray, less its own. */
+/* Of the partners so far, per pixel: how many have a depth where the point is and see nothing in front of it,
+ * agree, and contradict; and the running weighted sums of their depths, carried to the pixel's ray, less its own.
+ */
 typedef struct {
     uint8_t *observing, *agreeing, *contradicting;
     float *weighted_depth, *weight;
