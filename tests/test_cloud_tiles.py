@@ -22,7 +22,7 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import damaged_files, remove_recorded, tiles_place
 from colmap_sph.stereo.fusion import FusionOptions
 
-MOST = 8000
+MOST = 9000
 TILED = {"fusion": FusionOptions(max_points_per_file=MOST)}
 
 

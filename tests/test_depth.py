@@ -519,8 +519,19 @@ def test_one_view_is_enough_where_no_other_has_a_depth():
     # Unless that is nearer and blocks its sight, or there is none.
     maps[2] = plane_depth(views[2], 4.0)
     np.testing.assert_array_equal(confirm(views, maps, UNSURE).depth > 0, first)
-    maps[2][:] = 0
+    maps[2][:, maps[2].shape[1] // 8 :] = 0
     np.testing.assert_array_equal(confirm(views, maps, UNSURE).depth > 0, first)
+
+
+def test_an_image_with_hardly_any_depth_does_not_confirm():
+    """It may be of another place: two images that fit each other would pass by its silence."""
+    views, maps = wall_views(3)
+    first, second = (in_view(views[0], view, 10.0) for view in views[1:])
+    maps[2][:, maps[2].shape[1] // 16 :] = 0
+    confirmed = confirm(views, maps, UNSURE)
+    np.testing.assert_array_equal(confirmed.depth[~second] > 0, first[~second])
+    with_depth = confirm([views[0], views[2]], [maps[0], maps[2]], replace(UNSURE, min_surface=0)).depth > 0
+    np.testing.assert_array_equal(confirmed.depth[second] > 0, (first & with_depth)[second])
 
 
 def test_what_too_few_views_confirm_is_dropped():

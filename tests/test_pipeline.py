@@ -396,7 +396,7 @@ def test_fusion_without_a_point_names_the_gate(project: Path) -> None:
 
 def test_few_points_are_explained(project: Path) -> None:
     keep_images(project, NADIR)
-    options = replace(FEW_PAIRS, fusion=FusionOptions(min_num_pixels=3, max_normal_error=0.5))
+    options = replace(FEW_PAIRS, fusion=FusionOptions(min_num_pixels=3, max_normal_error=0.2))
     report = colmap_sph.run(project / "sparse/0", options=options)
     assert report.points > 0
     assert "loosen --fusion.max-normal-error" in report.advice

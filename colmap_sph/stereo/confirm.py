@@ -31,7 +31,8 @@ class ConfirmOptions:
     """Two views' depths agree when they also differ by less than this many standard deviations."""
     min_consistent: int = 2
     """Views, of those that share a pair with the image, that must confirm a geometric depth; those that stand side
-    by side count as one. One is enough where no other has a depth. 0: none need, but none may look through it."""
+    by side count as one. One is enough where no other has a depth; but an image with hardly any is one that does
+    not confirm. 0: none need, but none may look through it."""
     max_contradiction: float = 0.5
     """A depth is dropped when more views look through it than this share of those that confirm it."""
     min_contradicting_support: int = 2
@@ -62,6 +63,10 @@ _RESIDUALS = 2.0
 _MOST_RESIDUAL = 1.5
 # Slope of the steepest surface that is looked for around a pixel, as depth over width.
 _STEEPEST = 4.0
+# A partner with depth on less of its image than this fits no other: turned, mirrored or another place's, it would let
+# what any two images make of each other pass. So it counts as one that has a point in view and does not confirm it.
+_LEAST_COVERED = 0.1
+_MOST_COUNTED = np.iinfo(np.uint8).max
 
 
 def confirm_depth(
@@ -158,6 +163,28 @@ def _compare(
         options.min_contradicting_support,
         *sums,
     )
+    if np.count_nonzero(partner_estimate.depth) < _LEAST_COVERED * partner_estimate.depth.size:
+        silent = _in_view_without_depth(view, estimate.depth, partner, partner_estimate.depth)
+        np.add(sums.observing, 1, out=sums.observing, where=silent & (sums.observing < _MOST_COUNTED))
+
+
+def _in_view_without_depth(
+    view: View, depth: NDArray[np.float32], partner: View, partner_depth: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """(H, W): which points of a view project to pixels of the partner's that have no depth."""
+    rows, columns = np.nonzero(depth > 0)
+    transfer = pixel_transfer(view, partner)
+    pixels = np.stack([columns, rows, np.ones(len(rows))]) * depth[rows, columns]
+    seen = transfer[:, :3] @ pixels + transfer[:, 3:]
+    in_front = seen[2] > 0
+    places = np.full((2, len(rows)), -1.0)
+    np.divide(seen[:2], seen[2], out=places, where=in_front)
+    height, width = partner_depth.shape
+    inside = (places >= 0).all(axis=0) & (places[0] <= width - 1) & (places[1] <= height - 1)
+    x, y = (places[:, inside] + 0.5).astype(np.int64)
+    silent = np.zeros(depth.shape, dtype=bool)
+    silent[rows[inside], columns[inside]] = partner_depth[y, x] <= 0
+    return silent
 
 
 def _add_as_one(station: _Sums, sums: _Sums) -> None:
@@ -171,7 +198,7 @@ def _add_as_one(station: _Sums, sums: _Sums) -> None:
         (agrees, sums.agreeing),
         (contradicts, sums.contradicting),
     ):
-        np.add(counts, 1, out=counts, where=verdict & (counts < np.iinfo(counts.dtype).max))
+        np.add(counts, 1, out=counts, where=verdict & (counts < _MOST_COUNTED))
     for depths, total in ((station.weighted, sums.weighted), (station.weight, sums.weight)):
         np.divide(depths, station.agreeing, out=depths, where=agrees)
         np.add(total, depths, out=total, where=agrees)

@@ -93,7 +93,7 @@ STEREO_FUSION = (
     ColmapOption(
         "max_reproj_error",
         2.0,
-        "how near to a finer image's pixel a pixel makes no point of its own; 0.5 where it is not given",
+        "how near to a finer image's pixel a pixel makes no point of its own; 0.35 where it is not given",
         "fusion.",
     ),
     ColmapOption("max_depth_error", 0.01, "largest relative difference of depths that agree", "fusion."),
