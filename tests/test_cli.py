@@ -563,6 +563,23 @@ def test_dry_run_finds_the_same_mistakes(case: str, small: Path, capsys: pytest.
     assert tree(small) == before
 
 
+@pytest.mark.parametrize("memory", ["1", "1MiB"])
+def test_a_dry_run_refuses_too_little_memory_as_the_run_does(
+    memory: str, small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the same words, but for the image that comes first."""
+    said = []
+    for more in (["--dry-run"], []):
+        code, output = command(capsys, *RUN, *FAST, "--memory", memory, *more)
+        assert code == 2
+        said.append(" ".join(error_sentence(code, output).split()))
+    pattern = re.compile(
+        r"of memory \(--memory, or a share of what is free\) is too little for (\S+); \w+ would do"
+    )
+    assert all(pattern.search(words) for words in said)
+    assert command(capsys, *RUN, *FAST, "--memory", "1GiB", "--dry-run")[0] == 0
+
+
 def test_a_second_run_says_what_was_up_to_date(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = command(capsys, *RUN, *FAST)[1]
     assert "up to date" not in first

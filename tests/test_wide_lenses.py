@@ -344,3 +344,34 @@ def test_spheres_of_any_shape_are_panoramas(size: tuple[int, int], params: tuple
 def test_no_lens_is_refused(params: tuple[float, ...]) -> None:
     with pytest.raises(InputError, match="describes no lens"):
         wide_lenses(model_of(fisheye("OPENCV_FISHEYE", params), np.empty((0, 2))), "here")
+
+
+@pytest.mark.parametrize(
+    ("model", "extra", "said"),
+    [
+        ("EUCM", (-0.01, 1.1), r"alpha = -0\.01"),
+        ("EUCM", (1.01, 1.1), r"alpha = 1\.01"),
+        ("EUCM", (math.nan, 1.1), "alpha = nan"),
+        ("EUCM", (0.6, 0.0), "beta = 0"),
+        ("EUCM", (5.0, -3.0), "alpha = 5"),
+        ("EUCM", (0.6, -3.0), "beta = -3"),
+        ("FOV", (math.pi,), r"omega = 3\.14159"),
+        ("FOV", (-7.0,), "omega = -7"),
+        ("FOV", (math.inf,), "omega = inf"),
+    ],
+)
+@pytest.mark.parametrize("focal", [140.0, 1400.0])
+def test_parameters_outside_of_a_formula_are_refused(
+    model: str, extra: tuple[float, ...], said: str, focal: float
+) -> None:
+    camera = fisheye(model, (focal, focal, 240.0, 240.0, *extra))
+    with pytest.raises(InputError, match=rf"^Camera 1 \({model}\) in here has {said}, which must be .*calibrate"):
+        wide_lenses(model_of(camera, np.empty((0, 2))), "here")
+
+
+@pytest.mark.parametrize(
+    ("model", "extra"), [("EUCM", (0.0, 1.0)), ("EUCM", (1.0, 1.0)), ("FOV", (0.0,)), ("FOV", (-0.9,))]
+)
+def test_parameters_at_the_ends_of_a_formula_are_lenses(model: str, extra: tuple[float, ...]) -> None:
+    camera = fisheye(model, (1400.0, 1400.0, 240.0, 240.0, *extra))
+    assert wide_lenses(model_of(camera, np.empty((0, 2))), "here") == {}

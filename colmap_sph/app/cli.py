@@ -91,7 +91,7 @@ def _answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int
         print_result(f"colmap_sph {colmap_sph.__version__}")
         return 0
     if arguments and is_colmap_command(arguments[0]):
-        return _answer_as_colmap(arguments, terminal)
+        return _answer_as_colmap(arguments, terminal, started)
     asks_for_all = not {"--help-all", "--help_all"}.isdisjoint(arguments)
     if arguments[:1] == ["run"] and (asks_for_all or not {"-h", "--help"}.isdisjoint(arguments)):
         print_result(help_text(everything=asks_for_all))
@@ -124,7 +124,7 @@ def _events_of(command: Command) -> Events:
     return Events(sys.stdout if is_wanted else None)
 
 
-def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal) -> int:
+def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal, started: float) -> int:
     def last_words(_: Interrupted) -> None:
         logger.info("Interrupted")
         _print_interrupted(None, terminal)
@@ -132,7 +132,7 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal) -> int:
     terminal.spell = spelling_of(arguments[0])
     try:
         with stop_on_signals(last_words):
-            return colmap_answer(arguments, terminal)
+            return colmap_answer(arguments, terminal, started)
     except Interrupted as stop:
         _print_interrupted(None, terminal)
         return stop.exit_code
@@ -172,7 +172,7 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
             return part_command(command, terminal, arguments, events)
         return run_command(command, terminal, arguments, events, started)
     if isinstance(command, DemoCommand):
-        return demo_command(command, terminal, arguments)
+        return demo_command(command, terminal, arguments, started)
     if isinstance(command, ReportCommand):
         return report_command(command, terminal)
     if isinstance(command, ViewCommand):
@@ -182,14 +182,14 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
     return next(answer for options, answer in PRODUCTS.values() if isinstance(command, options))(command, terminal)
 
 
-def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str]) -> int:
+def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str], started: float) -> int:
     """`colmap_sph demo`."""
     options = RunOptions(threads=command.threads)
     options.check()
     log = workspace_log(Workspace(command.output / "dense"), header(arguments))
     with log, Display(terminal, options.num_threads) as display:
         result = run_demo(command.output, options=options, progress=display)
-    print_summary(result.report, result.workspace, terminal)
+    print_summary(result.report, result.workspace, terminal, started)
     terminal.say("")
     terminal.say("in pixels on the ground (GSD)", label="Against exact depth,", style="bold")
     terminal.say_lines(format_depth_maps(result.depth_maps, terminal.width))

@@ -96,6 +96,7 @@ def run_command(
     project = command.project
     options = command.options
     events.begin(arguments, project.root if project.is_named else None, options.num_threads)
+    started = time.monotonic() if started is None else started
     limit = _limit(command, arguments, started)
     check_input(project, options, limit)
     workspace = Workspace(project.root)
@@ -115,13 +116,13 @@ def run_command(
             limit=limit,
         )
     events.note(report)
-    print_summary(report, workspace, terminal)
+    print_summary(report, workspace, terminal, started)
     if limit is not None:
         _print_arrival(limit, terminal)
     return PARTIAL_EXIT_CODE if report.skipped_images or report.incomplete else 0
 
 
-def _limit(command: RunCommand, arguments: Sequence[str], started: float | None) -> TimeLimit | None:
+def _limit(command: RunCommand, arguments: Sequence[str], started: float) -> TimeLimit | None:
     """The time limit, if there is one; what was typed stays, also where it is the default."""
     if not command.within:
         return None
@@ -129,7 +130,7 @@ def _limit(command: RunCommand, arguments: Sequence[str], started: float | None)
     return TimeLimit(
         parse_time(command.within),
         changed_dials(command.options) | typed.intersection(DIALS),
-        time.monotonic() if started is None else started,
+        started,
     )
 
 
@@ -241,7 +242,7 @@ def _agreement(report: RunReport) -> str:
     return f"{report.overall_agreement:.1%} of the sparse points agree with the depth maps"
 
 
-def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
+def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, started: float) -> None:
     """Print the closing summary of a run.
 
     Parameters
@@ -250,6 +251,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     workspace : Workspace
         With the results.
     terminal : Terminal
+    started : float
+        When the command began, as `time.monotonic` tells.
     """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
     rows = [
@@ -282,8 +285,9 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     if any(report.reused.values()):
         kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
         facts.append(("up to date", kept))
+    # More than the stages: what is found out between them, the page, and the start of the program.
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
-    facts.append(("seconds", f"{sum(report.seconds.values()):.1f} ({times})"))
+    facts.append(("seconds", f"{time.monotonic() - started:.1f} ({times})"))
     facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
     if workspace.page_path.is_file():
         facts.append(

@@ -111,15 +111,20 @@ class MemoryGate:
         finally:
             self._outside -= amount
 
-    @contextmanager
-    def reserve(self, amount: float, what: str) -> Iterator[None]:
-        """Wait until `amount` bytes of arrays fit, and hold them; `OptionError` where they never can."""
+    def check(self, amount: float, what: str) -> int:
+        """Bytes to reserve for `amount` bytes of arrays; `OptionError` where they never fit."""
         needed = int(_SLACK * amount)
         if needed > self.free:
             raise OptionError(
                 f"{format_memory(self._total)} of memory ({self._source}) is too little for "
                 f"{what}; {format_memory((self._outside + needed) * 1.05)} would do."
             )
+        return needed
+
+    @contextmanager
+    def reserve(self, amount: float, what: str) -> Iterator[None]:
+        """Wait until `amount` bytes of arrays fit, and hold them; `OptionError` where they never can."""
+        needed = self.check(amount, what)
         with self._changed:
             self._changed.wait_for(lambda: self._reserved + needed <= self.free)
             self._reserved += needed

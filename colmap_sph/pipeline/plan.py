@@ -90,7 +90,7 @@ def make_plan(
     Plan
     """
     check_input(project, options, limit)
-    survey = Survey()
+    survey = Survey(is_bounded=not options.scheduler)  # a cluster's workers have limits of their own
     report = RunReport()
     choice = ""
     if limit is not None:

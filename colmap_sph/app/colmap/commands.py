@@ -1,5 +1,6 @@
 """COLMAP's commands on our command line: done here, or handed over to COLMAP."""
 
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,7 +27,7 @@ def is_colmap_command(name: str) -> bool:
     return name in OWN or name in OTHERS
 
 
-def answer(arguments: Sequence[str], terminal: Terminal) -> int:
+def answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int:
     """Do what a command of COLMAP does; returns the exit code.
 
     Parameters
@@ -34,6 +35,8 @@ def answer(arguments: Sequence[str], terminal: Terminal) -> int:
     arguments : sequence of str
         The command's name, for which `is_colmap_command` holds, and its options.
     terminal : Terminal
+    started : float
+        When the program began, as `time.monotonic` tells.
     """
     name, *options = arguments
     if name not in OWN:
@@ -48,7 +51,7 @@ def answer(arguments: Sequence[str], terminal: Terminal) -> int:
     with workspace_log(workspace, header(arguments)), Display(terminal) as display:
         make = make_maps if name == "patch_match_stereo" else make_cloud
         report = make(given.plain, given.sectioned, command=to_repeat(arguments), progress=display)
-    _print_end(given, report, workspace, terminal)
+    _print_end(given, report, workspace, terminal, started)
     return PARTIAL_EXIT_CODE if report.incomplete else 0
 
 
@@ -58,11 +61,11 @@ def _tell_idle(given: Given, terminal: Terminal) -> None:
         terminal.note(", ".join(f"--{flag}" for flag in given.idle), label="without effect here:", style="yellow")
 
 
-def _print_end(given: Given, report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
+def _print_end(given: Given, report: RunReport, workspace: Workspace, terminal: Terminal, started: float) -> None:
     if "output_path" not in given.plain:
-        print_summary(report, workspace, terminal)
+        print_summary(report, workspace, terminal, started)
         return
-    seconds = sum(report.seconds.values())
+    seconds = time.monotonic() - started
     cloud = f"{report.points:,} points of {report.images} images in {given.plain['output_path']}"
     terminal.facts([("cloud", cloud), ("seconds", f"{seconds:.1f}")])
     for name, reason in (*report.skipped_images.items(), *report.incomplete.items()):

@@ -67,10 +67,13 @@ class Survey:
         What the stages said, in their order.
     workers : int
         That would work side by side.
+    is_bounded : bool
+        Whether a job that never fits into this machine's budget of memory is refused, as in a run.
     """
 
     stages: list[StagePlan] = field(default_factory=list)
     workers: int = 1
+    is_bounded: bool = False
 
     @property
     def seconds(self) -> float:
@@ -89,6 +92,7 @@ class Survey:
         results: dict[Item, Result] = {item: _TO_MAKE for item in missing if item not in asked}
         scale = len(missing) / max(len(asked), 1)
         costs: list[tuple[Cost, float]] = []
+        most: tuple[float, Item] | None = None
         for item in stage.items:
             if item in results:
                 continue
@@ -102,6 +106,10 @@ class Survey:
             else:
                 results[item] = Result(job.key, made=True, facts=_TO_MAKE.facts)
                 costs.append((job.cost, scale if item in asked else 1.0))
+                if most is None or job.cost.memory > most[0]:
+                    most = (job.cost.memory, item)
+        if self.is_bounded and most is not None and not stage.whole:
+            _refuse_too_little(stage, *most)
         results = {item: results[item] for item in stage.items if item in results}
         stage.tell_problems()
         made, there = stage.count(results)
@@ -116,6 +124,14 @@ class Survey:
             )
         )
         return results
+
+
+def _refuse_too_little(stage: Stage[Item, Task], memory: float, item: Item) -> None:
+    """Raise `OptionError` where the costliest job would never fit beside what the stage keeps."""
+    options = stage.context.options
+    gate = MemoryGate(options.memory_budget, options.num_threads)
+    with gate.keeping(stage.kept_memory(gate).total(gate.threads)):
+        gate.check(memory, stage.label(item))
 
 
 def _memory_of(stage: Stage[Item, Task], costs: list[Cost]) -> float:

@@ -73,6 +73,11 @@ def _panorama(camera: pycolmap.Camera, name: str) -> Lens:
 
 def _fisheye(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str) -> Lens:
     lens = _lens(camera)
+    problem = _outside(lens)
+    if problem is not None:
+        raise InputError(
+            f"Camera {camera.camera_id} ({camera.model_name}) in {name} has {problem}; calibrate it again."
+        )
     is_possible = np.isfinite(lens.params).all() and camera.mean_focal_length() > 0
     turn = turning_angle(lens) if is_possible else 0.0
     if turn < _BEYOND:
@@ -93,6 +98,22 @@ def _fisheye(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str)
         )
     reach = float(np.arccos(np.clip(rays[~beyond, 2].min(), -1, 1)))
     return replace(lens, limit=min(turn, reach + _BEYOND))
+
+
+def _outside(lens: Lens) -> str | None:
+    """Say which parameter has no meaning in the formula of its model, or return None.
+
+    There the formula goes on, and describes some other lens. FOV with 0 is the pinhole that it tends to.
+    """
+    if lens.model == "EUCM":
+        alpha, beta = lens.params[-2:]
+        if not 0 <= alpha <= 1:
+            return f"alpha = {alpha:g}, which must be from 0 to 1"
+        if not 0 < beta < np.inf:
+            return f"beta = {beta:g}, which must be above 0"
+    if lens.model == "FOV" and not abs(lens.params[-1]) < np.pi:
+        return f"omega = {lens.params[-1]:g}, which must be an angle below pi"
+    return None
 
 
 def _observed(model: pycolmap.Reconstruction, camera_id: int) -> NDArray[np.float64]:
