@@ -63,8 +63,8 @@ _RESIDUALS = 2.0
 _MOST_RESIDUAL = 1.5
 # Slope of the steepest surface that is looked for around a pixel, as depth over width.
 _STEEPEST = 4.0
-# A partner with depth on less of its image than this fits no other: turned, mirrored or another place's, it would let
-# what any two images make of each other pass. So it counts as one that has a point in view and does not confirm it.
+# A partner with depth on less of its image than this fits no other: if it is turned, mirrored or of another place,
+# its silence would let pass what any two images make of each other. So it counts as one that does not confirm.
 _LEAST_COVERED = 0.1
 _MOST_COUNTED = np.iinfo(np.uint8).max
 
