@@ -16,6 +16,7 @@ from projects import FOUR_NAMES, FOUR_SIZE, read_picture, render_four_images
 
 import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
+from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
@@ -557,8 +558,9 @@ def test_plan_of_reduced_images(project: Path) -> None:
     assert half.pairs == whole.pairs
 
 
-def test_plan_of_the_fusion(finished: Finished) -> None:
+def test_plan_of_the_fusion(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     """The budget bounds ours, not COLMAP's, and more partners take more time."""
+    monkeypatch.setattr(memory, "resident", lambda: 100 << 20)  # whatever other tests have left behind
 
     def plan(**changes: Any) -> Plan:
         tight = replace(OPTIONS, memory="203MB", fusion=FusionOptions(max_depth_error=0.011, **changes))
@@ -610,7 +612,8 @@ def test_plan_where_no_depth_was_confirmed(method: Any, finished: Finished) -> N
     assert (plan.images_done, plan.fuse) == (4, True)
 
 
-def test_plan_keeps_to_the_memory(finished: Finished) -> None:
+def test_plan_keeps_to_the_memory(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "resident", lambda: 100 << 20)  # whatever other tests have left behind
     tight = replace(OPTIONS, memory="203MB", threads=16)
     assert 200e6 <= make_plan(Project(workspace=finished.dense), tight, overwrite=True).memory <= 203e6
 
