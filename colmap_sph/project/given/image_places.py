@@ -168,24 +168,10 @@ def _common_size(folder: Path, problems: Mapping[str, str], undistorted: bool) -
     sizes = [(each.found, each.wanted) for each in wrong.values()]
     way, remedy = _way_and_remedy(sizes, longest=max(example.found))
     if not way:
-        return _one_wrong_size(folder, problems, sizes, undistorted)
+        return None
     return (
         f"All {len(wrong)} images in {folder} {way} their cameras (such as {name!r}, which {example}); "
         f"{_UNDISTORT if undistorted else remedy}."
-    )
-
-
-def _one_wrong_size(
-    folder: Path, problems: Mapping[str, str], sizes: list[tuple[_Size, _Size]], undistorted: bool
-) -> str | None:
-    """Say which size all images have, where it is one, and another one than that of all their cameras."""
-    if len(sizes) < len(problems) or len(set(sizes)) > 1:
-        return None
-    (found, wanted) = sizes[0]
-    remedy = _UNDISTORT if undistorted else "give those from which the model was made as --images"
-    return (
-        f"All {len(sizes)} images in {folder} have {found[0]} x {found[1]} pixels, "
-        f"but their cameras {wanted[0]} x {wanted[1]}; {remedy}."
     )
 
 
