@@ -358,6 +358,7 @@ def compare_depths(
     max_reprojection_error: float,
     tolerance: float,
     min_support: int,
+    silence_counts: bool,
     observing: NDArray[np.uint8],
     agreeing: NDArray[np.uint8],
     contradicting: NDArray[np.uint8],
@@ -378,6 +379,7 @@ def compare_depths(
     max_reprojection_error : float
     tolerance : float
     min_support : int
+    silence_counts : bool
     observing : (H, W) uint8, written
     agreeing : (H, W) uint8, written
     contradicting : (H, W) uint8, written

@@ -313,7 +313,8 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
     def compare_depths(backend: str) -> None:
         counts.fill(0)
         sums.fill(0)
-        _native.compare_depths(backend, *maps[0], *maps[1], support, beside, back, 2.0, 4.5, 2, *counts, *sums)
+        found = (*maps[0], *maps[1], support)
+        _native.compare_depths(backend, *found, beside, back, 2.0, 4.5, 2, False, *counts, *sums)
 
     inverse = scene.disparity / focal
     planes = np.stack([inverse, *np.gradient(inverse)[::-1]]).astype(np.float32)

@@ -325,7 +325,8 @@ def compare_depths(rng: Random) -> Arguments:
     sums = [filled(rng, sizes[0], np.float32) for _ in range(2)]
     if rng.random() < 0.5:  # a few pixels aside
         matrices = [np.hstack([np.eye(3), rng.uniform(-3, 3, (3, 1))]) for _ in range(2)]
-    return [backend(rng), *inputs, support, *matrices, number(rng), number(rng), least, *counts, *sums]
+    gates = [number(rng), number(rng), least, bool(rng.integers(2))]
+    return [backend(rng), *inputs, support, *matrices, *gates, *counts, *sums]
 
 
 def fuse_partner(rng: Random) -> Arguments:

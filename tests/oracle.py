@@ -400,9 +400,9 @@ def _read_depth(depth, u, v):
     return 1 / (weights / corners).sum()
 
 
-def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_support):
-    """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner has a depth there that does not hide the
-    point, the partner's depth and sigma, clearance.
+def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_support, *, silence_counts):
+    """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner has a depth there (or, if silence
+    counts, the point in view) that does not hide the point, the partner's depth and sigma, clearance.
 
     `maps` are the partner's depth, sigma and support.
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
@@ -426,6 +426,10 @@ def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_
         clearance[row, col] = np.abs([u, v, *(border - (u, v))]).min()
         found = _read_depth(partner_depth.astype(float), u, v)
         if not found > 0:
+            is_in_view = 0 <= u <= border[0] and 0 <= v <= border[1]
+            observing[row, col] = silence_counts and is_in_view
+            if is_in_view:  # another pixel may have a depth
+                clearance[row, col] = min(clearance[row, col], abs(u % 1 - 0.5), abs(v % 1 - 0.5))
             continue
         nearest = int(np.floor(v + 0.5)), int(np.floor(u + 0.5))
         spread[row, col] = float(partner_sigma[nearest])

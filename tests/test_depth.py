@@ -362,8 +362,9 @@ def confirm(views, maps, options=CONFIRM, support=2):
 @pytest.mark.parametrize("kernels", _native.backends())
 @pytest.mark.parametrize("max_error", [1.0, 0.1])
 @pytest.mark.parametrize("counted", [3, 255])
+@pytest.mark.parametrize("silence_counts", [False, True])
 @pytest.mark.parametrize("seed", range(2))
-def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
+def test_consistency_is_the_oracles(seed, silence_counts, counted, max_error, kernels):
     """Verdicts and weighted sums on noisy, holed depth maps of views that turn and differ."""
     rng = np.random.default_rng(seed)
     views, maps = wall_views(3)
@@ -395,6 +396,7 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
         max_error,
         4.0,
         2,
+        silence_counts,
         observing,
         agreeing,
         contradicting,
@@ -402,7 +404,15 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
         weight,
     )
     verdict, seen, carried, spread, clearance = oracle.compare_depths(
-        reference, maps[0], sigmas[0], partner, (maps[1], sigmas[1], support), max_error, 4.0, 2
+        reference,
+        maps[0],
+        sigmas[0],
+        partner,
+        (maps[1], sigmas[1], support),
+        max_error,
+        4.0,
+        2,
+        silence_counts=silence_counts,
     )
     clear = clearance > 1e-4
     assert clear.mean() > 0.95 and (verdict > 0).mean() > 0.1 and (verdict < 0).mean() > 0.01
@@ -420,8 +430,9 @@ def test_consistency_is_the_oracles(seed, counted, max_error, kernels):
 
 @pytest.mark.parametrize("odd", [0, np.nan, np.inf, -1, 1e-40])
 @pytest.mark.parametrize("shift", [0.0, 0.3, -2.5])
+@pytest.mark.parametrize("silence_counts", [False, True])
 @pytest.mark.parametrize("size", [(1, 1), (3, 1), (1, 2), (5, 127), (4, 128), (3, 129), (2, 300)])
-def test_consistency_does_not_depend_on_the_backend(size, shift, odd):
+def test_consistency_does_not_depend_on_the_backend(size, silence_counts, shift, odd):
     """Rows that fill blocks and do not, points on the rim of the partner's map, and depths that are none."""
     rng = np.random.default_rng(0)
     maps = [rng.uniform(*bounds, size).astype(np.float32) for bounds in ((9.9, 10.1), (0.01, 0.1)) * 2]
@@ -434,7 +445,7 @@ def test_consistency_does_not_depend_on_the_backend(size, shift, odd):
         sums = [np.full(size, counted, np.uint8) for counted in (0, 254, 255)]
         sums += [np.full(size, -0.0, np.float32), np.full(size, 2, np.float32)]
         _native.compare_depths(
-            kernels, maps[0], maps[1], maps[2], maps[3], support, forward, back, 2.0, 4.0, 2, *sums
+            kernels, maps[0], maps[1], maps[2], maps[3], support, forward, back, 2.0, 4.0, 2, silence_counts, *sums
         )
         results.append(sums)
     assert results[0][0].any() or size[1] <= abs(shift) + 1
@@ -466,6 +477,7 @@ def test_at_the_rim_the_nearest_depth_is_taken():
                 2.0,
                 4.0,
                 2,
+                False,
                 counts[0],
                 counts[1],
                 counts[2],

@@ -167,6 +167,7 @@ def arguments(function):
             "max_reprojection_error": 1.0,
             "tolerance": 4.0,
             "min_support": 2,
+            "silence_counts": False,
             "out observing": np.zeros((H, W), u8),
             "out agreeing": np.zeros((H, W), u8),
             "out contradicting": np.zeros((H, W), u8),
@@ -1110,7 +1111,7 @@ def test_empty_maps_are_no_work(shape):
         counts = [np.zeros(reference.shape, dtype) for dtype in (*[np.uint8] * 3, *[np.float32] * 2)]
         for backend in BACKENDS:
             maps = reference, reference, other, other, np.ones(other.shape, np.uint8)
-            _native.compare_depths(backend, *maps, matrix, matrix, 1.0, 4.0, 2, *counts)
+            _native.compare_depths(backend, *maps, matrix, matrix, 1.0, 4.0, 2, False, *counts)
             assert not any(count.any() for count in counts)
         fuse_empty(reference, other, matrix)
     _native.fit_planes(

@@ -66,7 +66,6 @@ _STEEPEST = 4.0
 # A partner with depth on less of its image than this fits no other: if it is turned, mirrored or of another place,
 # its silence would let pass what any two images make of each other. So it counts as one that does not confirm.
 _LEAST_COVERED = 0.1
-_MOST_COUNTED = np.iinfo(np.uint8).max
 
 
 def confirm_depth(
@@ -149,6 +148,7 @@ def _compare(
     sums: _Sums,
 ) -> None:
     """Add what a partner says of every pixel."""
+    fits_none = bool(np.count_nonzero(partner_estimate.depth) < _LEAST_COVERED * partner_estimate.depth.size)
     _native.compare_depths(
         backend(),
         estimate.depth,
@@ -161,30 +161,9 @@ def _compare(
         options.max_reprojection_error + _RESIDUALS * min(residual * float(view.K[0, 0]), _MOST_RESIDUAL),
         options.tolerance,
         options.min_contradicting_support,
+        fits_none,
         *sums,
     )
-    if np.count_nonzero(partner_estimate.depth) < _LEAST_COVERED * partner_estimate.depth.size:
-        silent = _in_view_without_depth(view, estimate.depth, partner, partner_estimate.depth)
-        np.add(sums.observing, 1, out=sums.observing, where=silent & (sums.observing < _MOST_COUNTED))
-
-
-def _in_view_without_depth(
-    view: View, depth: NDArray[np.float32], partner: View, partner_depth: NDArray[np.float32]
-) -> NDArray[np.bool_]:
-    """(H, W): which points of a view project to pixels of the partner's that have no depth."""
-    rows, columns = np.nonzero(depth > 0)
-    transfer = pixel_transfer(view, partner)
-    pixels = np.stack([columns, rows, np.ones(len(rows))]) * depth[rows, columns]
-    seen = transfer[:, :3] @ pixels + transfer[:, 3:]
-    in_front = seen[2] > 0
-    places = np.full((2, len(rows)), -1.0)
-    np.divide(seen[:2], seen[2], out=places, where=in_front)
-    height, width = partner_depth.shape
-    inside = (places >= 0).all(axis=0) & (places[0] <= width - 1) & (places[1] <= height - 1)
-    x, y = (places[:, inside] + 0.5).astype(np.int64)
-    silent = np.zeros(depth.shape, dtype=bool)
-    silent[rows[inside], columns[inside]] = partner_depth[y, x] <= 0
-    return silent
 
 
 def _add_as_one(station: _Sums, sums: _Sums) -> None:
@@ -198,7 +177,7 @@ def _add_as_one(station: _Sums, sums: _Sums) -> None:
         (agrees, sums.agreeing),
         (contradicts, sums.contradicting),
     ):
-        np.add(counts, 1, out=counts, where=verdict & (counts < _MOST_COUNTED))
+        np.add(counts, 1, out=counts, where=verdict & (counts < np.iinfo(counts.dtype).max))
     for depths, total in ((station.weighted, sums.weighted), (station.weight, sums.weight)):
         np.divide(depths, station.agreeing, out=depths, where=agrees)
         np.add(total, depths, out=total, where=agrees)

@@ -269,7 +269,7 @@ static void run_compare_depths(const kernel_table *k, image_size size) {
                                     {-15, 2, 0.1},
                                     {1, -0.001, -0.1, 0.001, 1, -0.2, 0, 0, 1},
                                     {15, -2, -0.1}};
-    const consistency_gates gates = {2, 4.5f, 2};
+    const consistency_gates gates = {2, 4.5f, 2, 0};
     const consistency_sums verdict = {counts, counts + PIXELS, counts + 2 * PIXELS, sums, sums + PIXELS};
     EACH_TIME k->compare_depths(&reference, &partner, &transfer, gates, &verdict);
     HASH(counts, 3 * PIXELS);

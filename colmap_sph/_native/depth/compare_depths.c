@@ -111,12 +111,12 @@ static inline void judge(consistency_gates gates, block *k) {
         const float difference = k->found[i] - k->expected[i], own = k->sigma[i], spread = k->spread[i];
         const float gate = gates.tolerance * sqrtf(spread * spread + own * own);
         const int seen = k->found[i] > 0 ? k->inside[i] : 0;
-        /* Where it sees something nearer, that hides the point; without a depth there it tells nothing of it. */
+        /* Where it sees something nearer, that hides the point. */
         const int hidden = difference >= -2 * gate ? 0 : seen;
         /* Where it sees something behind it, it looks through it; if it is sure of that. */
         const int sure = k->support[i] >= gates.min_support ? seen : 0;
         k->contradicted[i] = (difference > 2 * gate ? sure : 0) & ~hidden;
-        k->observed[i] = seen & ~hidden;
+        k->observed[i] = (gates.silence_counts ? k->inside[i] : seen) & ~hidden;
         k->agreed[i] = fabsf(difference) <= gate ? seen & k->near[i] : 0;
         const float weight = 1 / (spread * spread);
         k->weight[i] = weight;

@@ -106,11 +106,11 @@ typedef struct {
     float max_reprojection_error; /* pixels */
     float tolerance;              /* standard deviations that depths may differ by */
     int min_support;              /* pairs behind a depth that contradicts */
+    int silence_counts;           /* whether a partner observes a point where it has no depth */
 } consistency_gates;
 
-/* Of the partners so far, per pixel: how many have a depth where the point is and see nothing in front of it,
- * agree, and contradict; and the running weighted sums of their depths, carried to the pixel's ray, less its own.
- */
+/* Of the partners so far, per pixel: how many observe the point, and see nothing in front of it, agree, and
+ * contradict; and the running weighted sums of their depths, carried to the pixel's ray, less its own. */
 typedef struct {
     uint8_t *observing, *agreeing, *contradicting;
     float *weighted_depth, *weight;

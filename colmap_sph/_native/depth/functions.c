@@ -114,6 +114,7 @@ FUNCTION(
     X(VALUE, float, max_reprojection_error) \
     X(VALUE, float, tolerance) \
     X(VALUE, int, min_support) \
+    X(VALUE, flag, silence_counts) \
     X(OUT, uint8, observing, H, W) \
     X(OUT, uint8, agreeing, H, W) \
     X(OUT, uint8, contradicting, H, W) \
@@ -131,7 +132,7 @@ static int run_compare_depths(void *arguments) {
     const depth_map reference = {a->depth, a->sigma, NULL, a->size.H, a->size.W};
     const depth_map partner = {a->partner_depth, a->partner_sigma, a->partner_support, a->size.PARTNER_H,
                                a->size.PARTNER_W};
-    const consistency_gates gates = {a->max_reprojection_error, a->tolerance, a->min_support};
+    const consistency_gates gates = {a->max_reprojection_error, a->tolerance, a->min_support, a->silence_counts};
     const consistency_sums sums = {a->observing, a->agreeing, a->contradicting, a->weighted_depth, a->weight};
     view_transfer transfer;
     split_transfer(a->partner_from_reference, transfer.pixel_from_reference, transfer.translation);
