@@ -176,11 +176,5 @@ def _depths_around(samples: MapSamples) -> NDArray[np.float32]:
 
 def _angles(rays: NDArray[np.float64], baseline: NDArray[np.float64]) -> NDArray[np.float64]:
     """(n,) degrees at the points (3, n), relative to the view's centre, between it and one `baseline` away."""
-    sines = np.linalg.norm(_cross(rays, baseline), axis=0)
+    sines = np.linalg.norm(np.cross(rays, baseline, axisa=0, axisc=0), axis=0)
     return np.asarray(np.degrees(np.arctan2(sines, (rays**2).sum(axis=0) - baseline @ rays)))
-
-
-def _cross(rays: NDArray[np.float64], other: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, n) products of the vectors (3, n) with another."""
-    (x, y, z), (a, b, c) = rays, other
-    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a])
