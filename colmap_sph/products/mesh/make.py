@@ -77,7 +77,8 @@ def make_mesh(
     check_places(request.workspace, request.folder, _names(request), overwrite=request.overwrite)
     scene, seen = seen_views(request.workspace)
     gsd = float(np.median(np.concatenate([each.footprint for each in seen])))
-    _check_voxel(options, _size(seen))
+    if options.voxel:
+        _check_voxel(options, _size(seen))
     make_dir(request.folder)
     scratch = request.folder / ".mesh.tmp"
     with scratch_folder(scratch):
@@ -109,7 +110,7 @@ def _check_voxel(options: MeshOptions, size: float) -> None:
     if options.voxel > size:
         raise OptionError(f"voxel is {options.voxel:g}, and all that is seen {size:g}; give less.", "voxel")
     least = size / 2 ** (_DEPTHS[1] + 0.5)
-    if options.method == "poisson" and 0 < options.voxel < least:
+    if options.method == "poisson" and options.voxel < least:
         raise OptionError(
             f"voxel is {options.voxel:g}, and must be at least {least:g} here for poisson; give more.", "voxel"
         )
