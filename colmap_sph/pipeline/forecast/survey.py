@@ -1,6 +1,6 @@
 """Stages → what there is of their results, and what the rest takes; nothing is made."""
 
-from collections.abc import Hashable
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from heapq import nlargest
 from typing import TypeVar
@@ -91,8 +91,7 @@ class Survey:
         asked = set(missing[:: -(-len(missing) // _ASKED) or 1])
         results: dict[Item, Result] = {item: _TO_MAKE for item in missing if item not in asked}
         scale = len(missing) / max(len(asked), 1)
-        costs: list[tuple[Cost, float]] = []
-        most: tuple[float, Item] | None = None
+        costs: dict[Item, Cost] = {}
         for item in stage.items:
             if item in results:
                 continue
@@ -105,33 +104,33 @@ class Survey:
                 results[item] = Result(job.key, made=False, facts=job.done)
             else:
                 results[item] = Result(job.key, made=True, facts=_TO_MAKE.facts)
-                costs.append((job.cost, scale if item in asked else 1.0))
-                if most is None or job.cost.memory > most[0]:
-                    most = (job.cost.memory, item)
-        if self.is_bounded and most is not None and not stage.whole:
-            _refuse_too_little(stage, *most)
+                costs[item] = job.cost
+        if self.is_bounded and costs and not stage.whole:
+            _refuse_too_little(stage, costs)
         results = {item: results[item] for item in stage.items if item in results}
         stage.tell_problems()
         made, there = stage.count(results)
+        like = {item: scale if item in asked else 1.0 for item in costs}
         self.stages.append(
             StagePlan(
                 stage.name,
                 made + there,
                 there,
-                sum(cost.seconds * times for cost, times in costs),
-                _memory_of(stage, [cost for cost, _ in costs]),
-                sum(cost.disk * times for cost, times in costs),
+                sum(cost.seconds * like[item] for item, cost in costs.items()),
+                _memory_of(stage, list(costs.values())),
+                sum(cost.disk * like[item] for item, cost in costs.items()),
             )
         )
         return results
 
 
-def _refuse_too_little(stage: Stage[Item, Task], memory: float, item: Item) -> None:
+def _refuse_too_little(stage: Stage[Item, Task], costs: Mapping[Item, Cost]) -> None:
     """Raise `OptionError` where the costliest job would never fit beside what the stage keeps."""
     options = stage.context.options
+    most = max(costs, key=lambda item: costs[item].memory)
     gate = MemoryGate(options.memory_budget, options.num_threads)
     with gate.keeping(stage.kept_memory(gate).total(gate.threads)):
-        gate.check(memory, stage.label(item))
+        gate.check(costs[most].memory, stage.label(most))
 
 
 def _memory_of(stage: Stage[Item, Task], costs: list[Cost]) -> float:
