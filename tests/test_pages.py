@@ -104,6 +104,14 @@ def test_a_run_ends_with_its_page(finished: FinishedRun, page: Page) -> None:
         assert f"{seconds:,.1f}" in page.text("td")
 
 
+def test_threads_make_the_same_page(tmp_path: Path) -> None:
+    workspace = ground_workspace(tmp_path / "dense", NAMES)
+    write_page(workspace)
+    alone = workspace.page_path.read_bytes()
+    write_page(workspace, threads=3)
+    assert workspace.page_path.read_bytes() == alone
+
+
 def test_the_page_loads_nothing(page: Page) -> None:
     links = [value or "" for _, each in page.elements for name, value in each.items() if name in ("src", "href")]
     assert len(links) > 20
@@ -185,7 +193,7 @@ def test_a_page_that_fails_does_not_fail_the_run(
     dense = tmp_path / "dense"
     shutil.copytree(finished.dense, dense)
 
-    def fail(*_: object) -> str:
+    def fail(*_: object, **__: object) -> str:
         raise RuntimeError("no ink")
 
     monkeypatch.setattr(report_files, "write_page", fail)

@@ -1,5 +1,6 @@
 """Cloud and samples of all views, from above → the layers of a map, with cameras and footprints to draw on it."""
 
+import threading
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -121,7 +122,7 @@ def _cells(
 
 @dataclass(eq=False)
 class Ground:
-    """What all views know of each cell of a map, added up view by view.
+    """What all views know of each cell of a map, added up view by view, in any order and by any thread.
 
     Attributes
     ----------
@@ -138,6 +139,7 @@ class Ground:
     images: NDArray[np.int32] = field(init=False)
     gsd: NDArray[np.float32] = field(init=False)
     samples: NDArray[np.int64] = field(init=False)
+    _lock: threading.Lock = field(init=False, default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
         shape = self.frame.cells(_COUNTED_CELLS)
@@ -162,11 +164,12 @@ class Ground:
         likely = likely[inside]
         cells = cells[likely]
         which = reasons[inside][likely]
-        np.add.at(self.samples.reshape(len(Reason), -1), (which, cells), 1)
         seen = cells[which == Reason.CONFIRMED]
-        self.images.ravel()[np.unique(seen)] += 1
         gsd = (depth[inside][likely] / focal)[which == Reason.CONFIRMED]
-        np.minimum.at(self.gsd.reshape(-1), seen, gsd)
+        with self._lock:
+            np.add.at(self.samples.reshape(len(Reason), -1), (which, cells), 1)
+            self.images.ravel()[np.unique(seen)] += 1
+            np.minimum.at(self.gsd.reshape(-1), seen, gsd)
 
     def count_layer(self) -> tuple[Bytes, tuple[float, float]]:
         """How many images see each cell, on a scale from 0."""

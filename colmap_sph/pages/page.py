@@ -1,8 +1,9 @@
 """A dense workspace → its page ``colmap_sph/report.html``, one file that shows what came out and loads nothing."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,8 @@ from colmap_sph.stereo.partners.pairs import overlapping_views
 from colmap_sph.stereo.region.map_axes import map_axes
 
 Bytes = NDArray[np.uint8]
+Item = TypeVar("Item")
+Fact = TypeVar("Fact")
 
 # Points of an image's surface, to stand for it where there is no cloud; of the cloud, to frame the map.
 _SURFACE_SAMPLE = 300
@@ -65,7 +68,7 @@ class _Silent:
         pass
 
 
-def write_page(workspace: Workspace, progress: Progress | None = None) -> str:
+def write_page(workspace: Workspace, progress: Progress | None = None, *, threads: int = 1) -> str:
     """Make the page of a workspace from what is on disk: model, images, maps, cloud, and ``report.json``.
 
     It also shows workspaces whose run was ended before its end, and what COLMAP's own programs made.
@@ -74,6 +77,8 @@ def write_page(workspace: Workspace, progress: Progress | None = None) -> str:
     ----------
     workspace : Workspace
     progress : Progress, optional
+    threads : int, optional
+        So many images are looked at at a time; each may be in memory at its full size. The page is the same.
 
     Returns
     -------
@@ -87,7 +92,7 @@ def write_page(workspace: Workspace, progress: Progress | None = None) -> str:
     OutputError
         The page cannot be written.
     """
-    content = gather(workspace, progress or _Silent())
+    content = gather(workspace, progress or _Silent(), threads)
     page = render(content)
     make_dir(workspace.state_dir)
     with atomic_file(workspace.page_path) as file:
@@ -95,16 +100,20 @@ def write_page(workspace: Workspace, progress: Progress | None = None) -> str:
     return content.missing
 
 
-def gather(workspace: Workspace, progress: Progress) -> Content:
-    """Look at all of a workspace, one image at a time; otherwise as `write_page`."""
+def gather(workspace: Workspace, progress: Progress, threads: int) -> Content:
+    """Look at all of a workspace, a few images at a time; otherwise as `write_page`."""
     scene = read_scene(workspace.sparse_dir)
     facts = read_run_facts(workspace)
     progress.start("report", 2 * len(scene.views))
-    samples = {}
     told = facts or RunFacts()
-    for view in scene.views:
-        kinds = told.kinds_of(view.name)
-        samples[view.name] = read_samples(workspace, view, samples_per_side(len(scene.views)), kinds)
+    side = samples_per_side(len(scene.views))
+    samples = {}
+
+    def sample(view: View) -> MapSamples:
+        return read_samples(workspace, view, side, told.kinds_of(view.name))
+
+    for view, its_samples in _in_threads(sample, scene.views, threads):
+        samples[view.name] = its_samples
         progress.advance()
     cloud = read_cloud(workspace, scene, samples)
     if not cloud.total and not any(each.has_maps for each in samples.values()):
@@ -114,8 +123,8 @@ def gather(workspace: Workspace, progress: Progress) -> Content:
         )
     block = _Block(workspace, scene, told, samples, cloud)
     images = []
-    for photograph in block.photographs:
-        images.append(block.look_at(photograph))
+    for photograph, image in _in_threads(block.look_at, block.photographs, threads):
+        images.append(image)
         for _ in photograph.views:
             progress.advance()
     return Content(
@@ -131,6 +140,16 @@ def gather(workspace: Workspace, progress: Progress) -> Content:
         _missing(block, facts),
         *products_of(workspace),
     )
+
+
+def _in_threads(look: Callable[[Item], Fact], items: Iterable[Item], threads: int) -> Iterator[tuple[Item, Fact]]:
+    """Items in their order, each with what a worker thread makes of it."""
+    with ThreadPoolExecutor(threads) as pool:
+        items = list(items)
+        try:
+            yield from zip(items, pool.map(look, items), strict=True)
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 @dataclass(eq=False)
@@ -164,7 +183,7 @@ class _Block:
         self.ground = Ground(self.frame)
 
     def look_at(self, photograph: Photograph) -> ImageFacts:
-        """Work out what became of a photograph's pixels, make its pictures, and put it on the map."""
+        """Work out what became of a photograph's pixels, make its pictures, put it on the map; in any thread."""
         cuts = [(view, self._cuts[view.name]) for view in photograph.views if view.name in self._cuts]
         return self._look_at_cut(photograph.name, cuts) if cuts else self._look_at_whole(photograph.lead)
 

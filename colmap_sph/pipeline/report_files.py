@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 # What of a report differs from run to run with the same results.
 _OF_THE_RUN = {"made", "reused", "seconds", "peak_memory"}
+# Bytes per pixel of an image while the page looks at it.
+_PAGE_BYTES = 8
 
 
 def command_of(project: Project, options: RunOptions) -> str:
@@ -113,7 +115,7 @@ def make_page(context: Context) -> None:
     workspace = context.workspace
     start = time.perf_counter()
     try:
-        write_page(workspace, context.progress)
+        write_page(workspace, context.progress, threads=_page_threads(context))
     except Exception as error:
         with suppress(OutputError):
             remove(workspace.page_path)  # one of an earlier run says what is not so any more
@@ -126,6 +128,13 @@ def make_page(context: Context) -> None:
         logger.info("Why there is no page", exc_info=True)
     else:
         logger.info("Report: %.1f s", time.perf_counter() - start)
+
+
+def _page_threads(context: Context) -> int:
+    """As many images as the page may look at at a time, each decoded at its full size."""
+    largest = max((view.width * view.height for view in context.scene.views), default=1)
+    options = context.options
+    return max(1, min(options.num_threads, options.memory_budget // (_PAGE_BYTES * largest)))
 
 
 def _changed(chosen: Mapping[str, Any], usual: Mapping[str, Any], prefix: str) -> Iterator[str]:
