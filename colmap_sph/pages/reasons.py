@@ -146,8 +146,9 @@ def _look_from(
         moved = transfer[:, :3] @ points + transfer[:, 3:]
         in_view, places = _in_view(partner, moved, known)
         seen[in_view] = True
-        angles = _angles(rays[:, in_view], partner.view.center - view.center)
-        apart[in_view] |= angles >= min_angle
+        unsure = in_view[~apart[in_view]]
+        angles = _angles(rays[:, unsure], partner.view.center - view.center)
+        apart[unsure] = angles >= min_angle
         # What lies behind the surface that the partner sees is hidden from it.
         most = _depths_around(partner.samples)[places]
         met[in_view] |= (most > 0) & (moved[2, in_view] <= (1 + _SLACK) * most)
