@@ -455,6 +455,7 @@ def add_patch_equations(
     image: NDArray[np.uint8],
     sources: tuple[NDArray[np.uint16], ...],
     sources_from_reference: NDArray[np.floating[Any]],
+    used: NDArray[np.uint32],
     planes: NDArray[np.float32],
     first_row: int,
     row_step: int,
@@ -463,13 +464,15 @@ def add_patch_equations(
     equations: NDArray[np.float32],
     /,
 ) -> None:
-    """Add the normal equations of matching planes of every `row_step`-th row in each of the sources, where every
-    pixel (the lower byte) has the one below it beside it.
+    """Add the normal equations of matching planes of every `row_step`-th row in sources, where every pixel
+    (the lower byte) has the one below it beside it. Each tile of 32 columns uses the sources whose bits
+    are set.
 
     backend : str
     image : (H, W) uint8
     sources : tuple of SOURCES images, uint16
     sources_from_reference : (SOURCES, 3, 4) float64
+    used : (TILES) uint32
     planes : (3, ROWS, W) float32
     first_row : int
     row_step : int

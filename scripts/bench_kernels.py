@@ -321,11 +321,13 @@ def partner_kernels(scene: Scene) -> list[Kernel]:
     pairs = scene.right[:-1] + np.uint16(256) * scene.right[1:]  # pixels, and in upper bytes those below them
     sources = (pairs.astype(np.uint16),) * SOURCES
     transfers = np.stack([beside] * SOURCES)
+    used = np.full(-(-shape[1] // 32), 2**SOURCES - 1, np.uint32)
     equations = np.empty((12, *shape), np.float32)
 
     def add_patch_equations(backend: str) -> None:
         equations.fill(0)
-        _native.add_patch_equations(backend, scene.left, sources, transfers, planes, 0, 1, 20.0, 0.5, equations)
+        given = (scene.left, sources, transfers, used, planes)
+        _native.add_patch_equations(backend, *given, 0, 1, 20.0, 0.5, equations)
 
     return [
         Kernel("compare_depths", compare_depths, [counts, sums], pixels),

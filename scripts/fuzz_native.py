@@ -424,9 +424,11 @@ def add_patch_equations(rng: Random) -> Arguments:
         # Half of them look at the same place, so that windows do meet.
         same = np.hstack([np.eye(3), np.zeros((3, 1))])
         matrix[:] = same if rng.random() < 0.5 else filled(rng, (3, 4), np.float64)
+    used = filled(rng, (-(-w // 32),), np.uint32)
     planes = filled(rng, (3, rows, w), np.float32)
     equations = np.zeros((12, rows, w), np.float32)
-    return [backend(rng), image, sources, matrices, planes, first, step, number(rng), number(rng) / 10, equations]
+    limits = (number(rng), number(rng) / 10)
+    return [backend(rng), image, sources, matrices, used, planes, first, step, *limits, equations]
 
 
 def source_pixels(rng: Random) -> Arguments:

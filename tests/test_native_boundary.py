@@ -280,6 +280,7 @@ def arguments(function):
             "image": np.zeros((H, W), u8),
             "sources": (np.zeros((9, 20), np.uint16), np.zeros((8, 7), np.uint16)),
             "sources_from_reference": np.stack([matrix, matrix]),
+            "used": np.full((W + 31) // 32, 3, np.uint32),
             "planes": np.ones((3, H, W), f32),
             "first_row": 0,
             "row_step": 1,

@@ -155,6 +155,73 @@ def test_holes_have_no_normals_and_neighbours_keep_theirs():
     assert angles(normals, normal)[~hole].max() < 0.1
 
 
+def fitted_slowly(inverse, sigma, row, column, options):
+    """Inverse depth of a pixel's plane and its change along row and column, tap by tap; None without a plane.
+
+    The first two of three rounds look at every second row and column.
+    """
+    radius, centre = options.radius, inverse[row, column]
+    noise = min(options.tolerance * sigma[row, column] / centre, 1)
+    plane = np.zeros(3)
+    solved = False
+    for step, widening in ((2, 1 + radius), (2, 2), (1, 1)):
+        places = [place for place in range(-radius, radius + 1) if place % step == 0]
+        taps = []
+        for j in places:
+            for i in places:
+                inside = 0 <= row + j < inverse.shape[0] and 0 <= column + i < inverse.shape[1]
+                if not inside or inverse[row + j, column + i] == 0:
+                    continue
+                value = inverse[row + j, column + i] / centre - 1
+                error = value - plane @ [1, i, j]
+                near = (1 - (i / (radius + 1)) ** 2) ** 2 * (1 - (j / (radius + 1)) ** 2) ** 2
+                taps.append((near / (1 + (error / (noise * widening)) ** 2) ** 2, i, j, value))
+        weight, i, j, value = np.array(taps).T
+        A = np.column_stack([np.ones_like(i), i, j])
+        normal_matrix = (A * weight[:, None]).T @ A
+        solved = np.linalg.det(normal_matrix) > 1e-6 * weight.sum() ** 3
+        if solved:
+            plane = np.linalg.solve(normal_matrix, (A * weight[:, None]).T @ value)
+    return centre * (plane + np.array([1, 0, 0])) if solved else None
+
+
+@pytest.mark.parametrize("radius", [2, 3, 4])
+def test_planes_are_those_of_a_slow_fit(radius):
+    """Noise, a step between two surfaces, and holes between which few neighbours are left."""
+    rng = np.random.default_rng(radius)
+    view = replace(VIEW, width=24, height=20)
+    inverse = inverse_depth(plane_normal(40, 30), view=view)
+    inverse[:, 11:] *= 1.2
+    inverse = np.where(rng.random(inverse.shape) < np.linspace(0.1, 1, 20)[:, None], inverse, 0)
+    given = estimate(inverse, 0.3, seed=1)
+    options = replace(OPTIONS, radius=radius, max_shift=1e9)
+    normals, depth = fit_normals(view, given, options)
+    inverse = np.where(given.depth > 0, 1 / np.maximum(given.depth, 1e-9), 0)
+    found = 0
+    for row, column in np.argwhere(given.depth > 0):
+        plane = fitted_slowly(inverse, given.sigma * inverse**2, row, column, options)
+        if plane is None or plane[0] <= 0:
+            assert depth[row, column] == 0
+            continue
+        found += 1
+        value, right, down = plane
+        expected = view.K.T @ [right, down, value - right * column - down * row]
+        assert depth[row, column] == pytest.approx(1 / value, rel=1e-4)
+        np.testing.assert_allclose(normals[row, column], -expected / np.linalg.norm(expected), atol=2e-3)
+    assert found > 150
+
+
+def test_neighbours_off_the_coarse_rounds_are_enough_for_a_plane():
+    """Two by two pixels of a plane alone: no two of them lie in one of every second rows and columns."""
+    normal = plane_normal(40, 30)
+    inverse = inverse_depth(normal)
+    lone = np.zeros(inverse.shape, np.bool_)
+    lone[30:32, 40:42] = lone[60:62, 71:73] = True
+    normals, _ = fit_normals(VIEW, estimate(np.where(lone, inverse, 0), 0.1), OPTIONS)
+    assert (normals.any(axis=-1) == lone).all()
+    assert angles(normals, normal)[lone].max() < 0.5
+
+
 def test_too_few_neighbours_give_no_normal():
     full = inverse_depth(plane_normal(20, 0))
     for keep in ((slice(40, 41), slice(60, 61)), (slice(40, 41), slice(30, 90)), (slice(20, 80), slice(60, 61))):

@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,12 +21,13 @@ from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 
-# Rows whose equations are in memory at a time.
-_BAND_ROWS = 32
-# Which partners say most is found on every so many rows.
-_SURVEY_ROWS = 32
-# Partners that bring the planes near in the rounds before the last.
-_FIRST_PARTNERS = 3
+# Pixels of a tile of so many rows and columns are matched in the same partners, found on one of its rows. The
+# equations of as many rows are in memory at a time. See `depth.h`.
+_TILE = 32
+# Partners that bring the planes near in the rounds before the last, and that are enough where poses are precise.
+_FEW_PARTNERS = 3
+# Where no partner says anything, those count that say most elsewhere.
+_ELSEWHERE = 1e-6
 # Standard deviation of a match on a smooth surface, pixels.
 _MATCH_SIGMA = 0.2
 # Arrays of equations, and sources of one call; see `depth.h`.
@@ -43,8 +45,9 @@ class RefinementOptions:
     rounds: int = 2
     """Times that all planes are refined, at most: views with precise poses are refined once, as what comes between
     two rounds smooths. 0 leaves planes as the disparity maps gave them."""
-    max_partners: int = 8
-    """Partners whose images are used, at most: those that say most about the depth. Time grows with them."""
+    max_partners: int = 6
+    """Partners in whose images a pixel is matched, at most: those that say most about the depth around it. Time
+    grows with them. Three are as good for views with precise poses, which have no more."""
     depth_freedom: float = 6.0
     """How far a depth may move: the standard deviation of the pull to the confirmed depth, in those of that depth.
     The images can move it farther."""
@@ -79,14 +82,17 @@ class RefinementOptions:
     def for_residual(self, pixels: float) -> "RefinementOptions":
         """The same for a view whose rows disagree with its partners' by so many pixels.
 
-        One round where that is less than matches are off by.
+        One round, in few images, where that is less than matches are off by. Else each view's planes are drawn to
+        where its own partners meet, the less so the more there are.
         """
-        return replace(self, rounds=min(self.rounds, 1)) if pixels < _MATCH_SIGMA else self
+        if pixels >= _MATCH_SIGMA:
+            return self
+        return replace(self, rounds=min(self.rounds, 1), max_partners=min(self.max_partners, _FEW_PARTNERS))
 
     def images_used(self, partners: int) -> int:
-        """How often a partner's image is matched in, all rounds together, where there are so many partners."""
+        """In how many images a pixel is matched, all rounds together, where there are so many partners."""
         last = min(partners, self.max_partners)
-        return (self.rounds - 1) * min(last, _FIRST_PARTNERS) + last if self.rounds else 0
+        return (self.rounds - 1) * min(last, _FEW_PARTNERS) + last if self.rounds else 0
 
 
 def refine_maps(
@@ -125,8 +131,9 @@ def refine_maps(
     """
     options = replace(options, depth_freedom=options.depth_freedom * _trust(residual * float(view.K[0, 0])))
     partners = [(_paired(source_image), pixel_transfer(view, source)) for source, source_image in sources]
-    if options.rounds:
-        partners = _most_telling(view, image, estimate, normals, depth, partners, options)
+    if not partners or not options.rounds:
+        return normals, depth
+    rank = _ranks(view, image, estimate, normals, depth, partners, options)
     K = np.ascontiguousarray(view.K)
     for done in range(options.rounds):
         if done:
@@ -138,12 +145,12 @@ def refine_maps(
             smooth_depth[lone] = depth[lone]
             normals[:] = smooth_normals
             depth[:] = smooth_depth
-        for first in range(0, view.height, _BAND_ROWS):
-            rows = slice(first, min(first + _BAND_ROWS, view.height), 1)
+        is_last = done == options.rounds - 1
+        most = options.max_partners if is_last else min(options.max_partners, _FEW_PARTNERS)
+        for tile, first in enumerate(range(0, view.height, _TILE)):
+            rows = slice(first, min(first + _TILE, view.height), 1)
             planes = _planes_of_maps(view, normals, depth, rows)
-            last = done == options.rounds - 1
-            used = partners if last else partners[:_FIRST_PARTNERS]
-            equations = _equations(image, used, planes, rows, options)
+            equations = _equations(image, partners, rank[:, tile] < most, planes, rows, options)
             sigma = _freedom(estimate.sigma[rows], planes, options)
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma, slope_sigma, planes)
@@ -164,7 +171,7 @@ def _trust(residual: float) -> float:
     return _MATCH_SIGMA / math.hypot(_MATCH_SIGMA, residual)
 
 
-def _most_telling(
+def _ranks(
     view: View,
     image: NDArray[np.uint8],
     estimate: DepthEstimate,
@@ -172,21 +179,27 @@ def _most_telling(
     depth: NDArray[np.float32],
     partners: list[_Partner],
     options: RefinementOptions,
-) -> list[_Partner]:
-    """The partners whose images tell most about the depth on some of the rows, those which tell most first."""
-    rows = slice(_SURVEY_ROWS // 2, view.height, _SURVEY_ROWS)
+) -> NDArray[np.int64]:
+    """(partners, tile rows, tile columns) rank of each by what its image tells about the depth around a tile."""
+    rows = slice(min(_TILE, view.height) // 2, view.height, _TILE)
     planes = _planes_of_maps(view, normals, depth, rows)
     sigma = _freedom(estimate.sigma[rows], planes, options)
-    information = np.zeros(len(partners))
-    for index, partner in enumerate(partners):
-        equations = _equations(image, [partner], planes, rows, options)
-        matched = equations[0] > 0
-        weight, difference, curvature = (equations[k][matched] for k in (0, 1, 6))
+    tile_columns = np.arange(0, view.width, _TILE)
+    tile_rows = -(-view.height // _TILE)
+    told = np.empty((len(partners), tile_rows, len(tile_columns)))
+    for partner, in_tiles in zip(partners, told, strict=True):
+        equations = _equations(image, [partner], np.ones((1, len(tile_columns)), np.bool_), planes, rows, options)
+        weight, difference, curvature = (equations[k] for k in (0, 1, 6))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            information = np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma**2
         # What a pixel gains, in nats: a long baseline that few pixels match must not outdo all others.
-        gain = np.log1p(np.maximum(curvature, 0) * weight / (difference + 0.02 * weight) * sigma[matched] ** 2)
-        information[index] = gain.sum(dtype=float)
-    best = np.argsort(-information, kind="stable")[: options.max_partners]
-    return [partners[index] for index in best]
+        gain = np.log1p(np.where(weight > 0, information, 0)).astype(float)
+        surveyed = np.add.reduceat(gain, tile_columns, axis=1)
+        # The last tiles may have so few rows that none is surveyed.
+        surveyed = np.pad(surveyed, ((0, tile_rows - len(surveyed)), (0, 0)), mode="edge")
+        in_tiles[:] = cv2.blur(surveyed, (3, 3), borderType=cv2.BORDER_REPLICATE)
+    told += _ELSEWHERE * told.mean(axis=(1, 2), keepdims=True)
+    return np.argsort(np.argsort(-told, axis=0, kind="stable"), axis=0)
 
 
 def _freedom(
@@ -199,17 +212,32 @@ def _freedom(
 def _equations(
     image: NDArray[np.uint8],
     partners: Sequence[_Partner],
+    used: NDArray[np.bool_],
     planes: NDArray[np.float32],
     rows: slice,
     options: RefinementOptions,
 ) -> NDArray[np.float32]:
-    """(12, h, W) sums of the normal equations of all partners for planes of the image's `rows`."""
+    """(12, h, W) sums of the normal equations for planes of the image's `rows`.
+
+    Of the partners that are `used`, (partners, tile columns), in each tile of columns.
+    """
     equations = np.zeros((_EQUATIONS, *planes.shape[1:]), np.float32)
     for start in range(0, len(partners), _SOURCES):
         sources, transfers = zip(*partners[start : start + _SOURCES], strict=True)
         limits = options.contrast, options.min_score
+        bits = np.left_shift(used[start : start + _SOURCES], np.arange(len(sources), dtype=np.uint32)[:, None])
+        chosen = np.bitwise_or.reduce(bits, axis=0)
         _native.add_patch_equations(
-            backend(), image, sources, np.stack(transfers), planes, rows.start, rows.step, *limits, equations
+            backend(),
+            image,
+            sources,
+            np.stack(transfers),
+            chosen,
+            planes,
+            rows.start,
+            rows.step,
+            *limits,
+            equations,
         )
     return equations
 

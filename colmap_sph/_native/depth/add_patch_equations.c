@@ -336,17 +336,18 @@ static inline void add_block(const block_windows *windows, const block_sums *sum
     }
 }
 
-/* Adds what all sources say to a block's columns of the equations; in the order of the sources, so that it does
- * not matter how many come in one call. */
+/* Adds what the sources used say to a block's columns of the equations; in the order of the sources, so that it
+ * does not matter how many come in one call. */
 static inline void match_sources(const block_windows *windows, const patch_source *sources, ptrdiff_t source_count,
-                                 float min_score, ptrdiff_t count, ptrdiff_t stride, float *equations) {
+                                 uint32_t used, float min_score, ptrdiff_t count, ptrdiff_t stride,
+                                 float *equations) {
     lanes e[PATCH_EQUATIONS];
     for (int k = 0; k < PATCH_EQUATIONS; k++) {
         e[k] = load_some(equations + k * stride, count);
     }
     for (ptrdiff_t i = 0; i < source_count; i++) {
         block_place place;
-        if (locate(windows, &sources[i], &place)) {
+        if (used >> i & 1 && locate(windows, &sources[i], &place)) {
             block_sums sums;
             match_block(windows, &sources[i].image, &place, &sums);
             add_block(windows, &sums, &place, min_score, e);
@@ -358,8 +359,8 @@ static inline void match_sources(const block_windows *windows, const patch_sourc
 }
 
 void VERSION_OF(add_patch_equations)(const grey_image *reference, const patch_source *sources,
-                                     ptrdiff_t source_count, const float *planes, patch_rows rows,
-                                     patch_options options, float *equations) {
+                                     ptrdiff_t source_count, const uint32_t *used, const float *planes,
+                                     patch_rows rows, patch_options options, float *equations) {
     const ptrdiff_t width = reference->width, stride = rows.count * width;
     float near[SIDE][SIDE];
     for (int j = 0; j < SIDE; j++) {
@@ -372,7 +373,8 @@ void VERSION_OF(add_patch_equations)(const grey_image *reference, const patch_so
         if (y < SIDE / 2 || y + SIDE / 2 > reference->height) {
             continue;
         }
-        /* Windows reach SIDE / 2 pixels before and SIDE / 2 - 1 pixels behind their corner. */
+        /* Windows reach SIDE / 2 pixels before and SIDE / 2 - 1 pixels behind their corner. Tiles begin at the
+         * first corner, too, and their side is a multiple of LANES, so that a block lies in one of them. */
         for (ptrdiff_t x = SIDE / 2; x + SIDE / 2 <= width; x += LANES) {
             const ptrdiff_t left = width - SIDE / 2 + 1 - x, count = left < LANES ? left : LANES;
             block_windows windows;
@@ -380,8 +382,8 @@ void VERSION_OF(add_patch_equations)(const grey_image *reference, const patch_so
                 continue;
             }
             read_taps(reference->values + y * width + x, width, count, near, 1 / options.contrast, &windows);
-            match_sources(&windows, sources, source_count, options.min_score, count, stride,
-                          equations + row * width + x);
+            match_sources(&windows, sources, source_count, used[(x - SIDE / 2) / PATCH_TILE], options.min_score,
+                          count, stride, equations + row * width + x);
         }
     }
 }

@@ -82,10 +82,14 @@ typedef struct {
     ptrdiff_t first, step, count;
 } patch_rows;
 
-/* Adds the normal equations of matching a reference's pixels in each of the sources. `planes` (3 arrays of inverse
- * depth, 0 = none, and its change along x and y) and `equations` belong to that many rows of the reference. */
+enum { PATCH_TILE = 32 }; /* columns that are matched in the same sources */
+
+/* Adds the normal equations of matching a reference's pixels in each of the sources that its tile of columns uses:
+ * bit k of `used`, of which there is one per tile, stands for source k. `planes` (3 arrays of inverse depth, 0 =
+ * none, and its change along x and y) and `equations` belong to that many rows of the reference. */
 typedef void add_patch_equations_fn(const grey_image *reference, const patch_source *sources, ptrdiff_t count,
-                                    const float *planes, patch_rows rows, patch_options options, float *equations);
+                                    const uint32_t *used, const float *planes, patch_rows rows,
+                                    patch_options options, float *equations);
 
 /* A view's depth (0 = none), its standard deviation, and how many pairs are behind it (of a reference nobody
  * asks); fewer than 2^31 rows and columns. */

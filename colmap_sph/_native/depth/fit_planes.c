@@ -26,7 +26,7 @@ typedef struct {
     float centre[LANES], scale[LANES]; /* inverse depth and its reciprocal */
     float noise[LANES];
     float value[LANES], du[LANES], dv[LANES]; /* the plane at the pixel, and its gradient per pixel */
-    int good[LANES];
+    int there[LANES], solved[LANES];          /* whether the pixel has a depth, and the last round a plane */
 } block;
 
 /* Sums of weights times 1, x, y, xx, xy, yy and of weights times the value times 1, x, y. */
@@ -43,17 +43,19 @@ static inline lanes load(const float *values) {
 /* NaN becomes `least`. */
 static inline float clamp(float v, float least, float most) { return v > least ? v < most ? v : most : least; }
 
-/* One round: neighbours weigh by distance from the centre and from the plane so far (Geman-McClure). */
-static inline void accumulate(const float *window, ptrdiff_t stride, int radius, const float *falloff,
+/* One round, on every `step`-th row and column of the window: neighbours weigh by distance from the centre and
+ * from the plane so far (Geman-McClure). */
+static inline void accumulate(const float *window, ptrdiff_t stride, int radius, int step, const float *falloff,
                               float widening, const block *k, normal_equations *sums) {
+    const int reach = radius / step * step;
     const lanes centre = load(k->centre), scale = load(k->scale), noise = load(k->noise);
     const lanes value = load(k->value), du = load(k->du), dv = load(k->dv);
     const lanes inverse_scale = 1 / (noise * noise * widening * widening);
     lanes n[6] = {{0}}, b[3] = {{0}};
-    for (int x = -radius; x <= radius; x++) {
+    for (int x = -reach; x <= reach; x += step) {
         lanes a0 = {0}, a1 = {0}, a2 = {0}, b0 = {0}, b1 = {0};
         const float fx = (float)x;
-        for (int y = -radius; y <= radius; y++) {
+        for (int y = -reach; y <= reach; y += step) {
             const lanes tap = load(window + y * stride + x);
             const float fy = (float)y, near = falloff[abs(x)] * falloff[abs(y)];
             const lanes w = (tap - centre) * scale;
@@ -80,6 +82,7 @@ static inline void accumulate(const float *window, ptrdiff_t stride, int radius,
     memcpy(sums->b, b, sizeof b);
 }
 
+/* Where there are too few neighbours for a plane, the one so far stays. */
 static inline void solve(const normal_equations *sums, block *k) {
     for (int l = 0; l < LANES; l++) {
         const double sw = sums->n[0][l], sx = sums->n[1][l], sy = sums->n[2][l];
@@ -91,10 +94,13 @@ static inline void solve(const normal_equations *sums, block *k) {
         /* Else fewer than three neighbours, or all on a line. */
         const int solved = determinant > 1e-6 * sw * sw * sw;
         const double inverse = 1 / (solved ? determinant : 1);
-        k->good[l] &= solved;
-        k->value[l] = (float)((c00 * b0 + c01 * b1 + c02 * b2) * inverse);
-        k->du[l] = (float)((c01 * b0 + c11 * b1 + c12 * b2) * inverse);
-        k->dv[l] = (float)((c02 * b0 + c12 * b1 + c22 * b2) * inverse);
+        const float value = (float)((c00 * b0 + c01 * b1 + c02 * b2) * inverse);
+        const float du = (float)((c01 * b0 + c11 * b1 + c12 * b2) * inverse);
+        const float dv = (float)((c02 * b0 + c12 * b1 + c22 * b2) * inverse);
+        k->solved[l] = solved;
+        k->value[l] = solved ? value : k->value[l];
+        k->du[l] = solved ? du : k->du[l];
+        k->dv[l] = solved ? dv : k->dv[l];
     }
 }
 
@@ -102,15 +108,15 @@ static inline void solve(const normal_equations *sums, block *k) {
 static inline int begin(const float *centre, const float *sigma, ptrdiff_t count, float tolerance, block *k) {
     for (int l = 0; l < LANES; l++) {
         const float w = l < count ? centre[l] : 0;
-        k->good[l] = w >= SMALLEST;
-        k->centre[l] = k->good[l] ? w : 1;
+        k->there[l] = w >= SMALLEST;
+        k->centre[l] = k->there[l] ? w : 1;
         k->scale[l] = 1 / k->centre[l];
-        k->noise[l] = clamp(k->good[l] ? tolerance * sigma[l] * k->scale[l] : 1, LEAST_NOISE, 1);
+        k->noise[l] = clamp(k->there[l] ? tolerance * sigma[l] * k->scale[l] : 1, LEAST_NOISE, 1);
         k->value[l] = k->du[l] = k->dv[l] = 0;
     }
     int any = 0;
     for (int l = 0; l < LANES; l++) {
-        any |= k->good[l];
+        any |= k->there[l];
     }
     return any;
 }
@@ -135,7 +141,7 @@ static inline void store_plane(const plane_fit *fit, const block *k, int l, doub
     const double norm = sqrt(x * x + y * y + z * z);
     const double ray_y = (row - K[5]) / K[4], ray_x = (column - K[2] - K[1] * ray_y) / K[0];
     const double facing = value / (norm * sqrt(ray_x * ray_x + ray_y * ray_y + 1));
-    if (!(k->good[l] && value > 0 && norm > 0) ||
+    if (!(k->there[l] && k->solved[l] && value > 0 && norm > 0) ||
         is_doubtful(fit, k, l, value, sigma * k->scale[l], K[0], facing, support)) {
         normal[0] = normal[1] = normal[2] = *depth = 0;
         return;
@@ -181,7 +187,9 @@ int VERSION_OF(fit_planes)(const float *inverse_depth, const float *inverse_sigm
                 /* The first round allows for a slope of the surface, the later ones for noise only. */
                 const float widening = round == 0 ? (float)(1 + radius) : round == 1 ? 2 : 1;
                 normal_equations sums;
-                accumulate(window, stride, radius, falloff, widening, &k, &sums);
+                /* The plane that the last round starts from may come from fewer neighbours. */
+                const int step = round < ROUNDS - 1 && radius > 1 ? 2 : 1;
+                accumulate(window, stride, radius, step, falloff, widening, &k, &sums);
                 solve(&sums, &k);
             }
             for (int l = 0; l < count; l++) {

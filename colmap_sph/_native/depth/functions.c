@@ -206,6 +206,7 @@ FUNCTION(fit_planes, FIT_PLANES, check_fit_planes,
     X(IN, uint8, image, H, W) \
     X(IMAGES, uint16, sources, SOURCES) \
     X(IN, float64, sources_from_reference, SOURCES, 3, 4) \
+    X(IN, uint32, used, TILES) \
     X(IN, float32, planes, 3, ROWS, W) \
     X(VALUE, ptrdiff, first_row) \
     X(VALUE, ptrdiff, row_step) \
@@ -233,7 +234,9 @@ static int check_add_patch_equations(const void *arguments) {
             return 0;
         }
     }
-    return check_rows(a->first_row, a->row_step, a->size.H, a->size.ROWS);
+    return check(a->size.TILES == (a->size.W + PATCH_TILE - 1) / PATCH_TILE,
+                 "used must have a size of one per 32 columns") &&
+           check_rows(a->first_row, a->row_step, a->size.H, a->size.ROWS);
 }
 
 static int run_add_patch_equations(void *arguments) {
@@ -247,14 +250,15 @@ static int run_add_patch_equations(void *arguments) {
             (paired_image){a->sources->image[k].values, a->sources->image[k].height, a->sources->image[k].width};
         split_transfer(a->sources_from_reference + 12 * k, sources[k].matrix, sources[k].translation);
     }
-    a->backend->add_patch_equations(&reference, sources, a->size.SOURCES, a->planes, rows, options, a->equations);
+    a->backend->add_patch_equations(&reference, sources, a->size.SOURCES, a->used, a->planes, rows, options,
+                                    a->equations);
     return 0;
 }
 
-FUNCTION(
-    add_patch_equations, ADD_PATCH_EQUATIONS, check_add_patch_equations,
-    "Add the normal equations of matching planes of every `row_step`-th row in each of the sources, where every\n"
-    "pixel (the lower byte) has the one below it beside it.");
+FUNCTION(add_patch_equations, ADD_PATCH_EQUATIONS, check_add_patch_equations,
+         "Add the normal equations of matching planes of every `row_step`-th row in sources, where every pixel\n"
+         "(the lower byte) has the one below it beside it. Each tile of 32 columns uses the sources whose bits\n"
+         "are set.");
 
 #define PLANES_OF_MAPS(X) \
     X(IN, float32, normals, H, W, 3) \

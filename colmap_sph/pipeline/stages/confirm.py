@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 # matched in.
 _FAINT_SECONDS = 0.05
 _CONFIRM_SECONDS = 0.015
-_REFINE_SECONDS = 0.055
+_REFINE_SECONDS = 0.075
 # Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
 _CONFIRM_BYTES = 40.0
 _REFINE_BYTES = 55.0
