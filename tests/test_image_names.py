@@ -4,7 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pycolmap
@@ -18,6 +20,7 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.project.given import image_places
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
@@ -162,6 +165,32 @@ def test_a_folder_too_deep_or_too_high(tmp_path: Path) -> None:
     rename(sparse, {f"all/{name}": name for name in NAMES})
     with pytest.raises(InputError, match=r"but in .*/images/all; give that as --images"):
         prepare_with(sparse, tmp_path / "images")
+
+
+def test_a_folder_of_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is looked through once, and not to its end."""
+    sparse = make_project(tmp_path)
+    for number in range(60):
+        (tmp_path / "all" / f"{number}" / "below").mkdir(parents=True)
+    walks: list[str] = []
+    monkeypatch.setattr(os, "walk", counted(os.walk, walks))
+    with pytest.raises(InputError, match=r"None of the model's 4 images in .* is usable"):
+        prepare_with(sparse, tmp_path / "all")
+    assert len(walks) == 121
+    monkeypatch.setattr(image_places, "_MAX_ENTRIES", 50)
+    monkeypatch.setattr(image_places, "_MAX_ENTRIES_PER_IMAGE", 1)
+    with pytest.raises(InputError, match=r"None of the 4 images of .*0 is in .*all, which has many .* --images\."):
+        prepare_with(sparse, tmp_path / "all")
+    assert len(walks) == 121 + 51
+
+
+def counted(walk: Callable[[Path], Iterable[tuple[str, list[str], list[str]]]], places: list[str]) -> Any:
+    def counting(top: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+        for place in walk(top):
+            places.append(place[0])
+            yield place
+
+    return counting
 
 
 def prepare_with(sparse: Path, images: Path) -> None:
