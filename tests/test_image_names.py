@@ -21,7 +21,8 @@ from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.project.given import image_places
-from colmap_sph.project.given.image_places import find_images
+from colmap_sph.project.given.image_places import find_images, tell_problems
+from colmap_sph.project.images.reading import WrongSize
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -243,6 +244,27 @@ def test_sizes_without_a_rule_are_told_one_by_one(tmp_path: Path, caplog: pytest
     with pytest.raises(InputError, match=r"None of the model's 4 images in .* is usable; check --images"):
         prepare_with(sparse, folder)
     assert caplog.text.count("but its camera 96 x 64; left out") == 4
+
+
+@pytest.mark.parametrize("num_whole", [0, 1])
+def test_many_of_one_wrong_size_are_told_together(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, num_whole: int
+) -> None:
+    """And those that have another problem by name."""
+    sparse = make_project(tmp_path)
+    names = [f"{number:02d}.png" for number in range(9)]
+    problems = dict.fromkeys(names[num_whole:], WrongSize((96, 55), (96, 64))) | {names[8]: "is damaged"}
+    if num_whole:
+        tell_problems(sparse, tmp_path, problems, len(names), undistorted=False)
+    else:
+        with pytest.raises(InputError, match=r"None of the model's 9 images in .* is usable; check --images"):
+            tell_problems(sparse, tmp_path, problems, len(names), undistorted=False)
+    first = ", ".join(names[num_whole : num_whole + 4])
+    assert caplog.messages == [
+        f"{8 - num_whole} images in {tmp_path}, each of which has 96 x 55 pixels, but its camera 96 x 64; "
+        f"left out: {first}, …",
+        f"{tmp_path / names[8]} is damaged; left out",
+    ]
 
 
 def test_size_of_undistorted_images(tmp_path: Path) -> None:

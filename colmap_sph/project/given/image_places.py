@@ -18,6 +18,8 @@ logger = logging.getLogger(__name__)
 _MAX_ENTRIES = 20_000
 _MAX_ENTRIES_PER_IMAGE = 100
 _MAX_FACTOR = 16
+# Of images with the same problem so many are told one by one; of more the first in one sentence.
+_MOST_TOLD = 4
 _UNDISTORT = "give the sparse model with --model to have them undistorted anew"
 _SHARES = {2: "half", 3: "a third of", 4: "a quarter of", 8: "an eighth of"}
 _SLASHES = (
@@ -90,9 +92,18 @@ def tell_problems(
         if common:
             raise InputError(common)
     spelled = other_spellings(files, missing)
+    alike: dict[str, list[str]] = {}
     for name, problem in problems.items():
         instead = f", but there is {spelled[name]!r}" if name in spelled else ""
-        logger.warning("%s %s%s; left out", folder / name, problem, instead)
+        alike.setdefault(f"{problem}{instead}", []).append(name)
+    for problem, names in alike.items():
+        for name in names if len(names) <= _MOST_TOLD else ():
+            logger.warning("%s %s; left out", folder / name, problem)
+        if len(names) > _MOST_TOLD:
+            first = ", ".join(names[:_MOST_TOLD])
+            logger.warning(
+                "%d images in %s, each of which %s; left out: %s, …", len(names), folder, problem, first
+            )
     if len(problems) == num_images:
         remedy = _UNDISTORT if undistorted else "check --images"
         raise InputError(f"None of the model's {num_images} images in {folder} is usable; {remedy}.")
