@@ -172,7 +172,7 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
             return part_command(command, terminal, arguments, events)
         return run_command(command, terminal, arguments, events, started)
     if isinstance(command, DemoCommand):
-        return demo_command(command, terminal, arguments, started)
+        return demo_command(command, terminal, arguments)
     if isinstance(command, ReportCommand):
         return report_command(command, terminal)
     if isinstance(command, ViewCommand):
@@ -182,14 +182,14 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
     return next(answer for options, answer in PRODUCTS.values() if isinstance(command, options))(command, terminal)
 
 
-def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str], started: float) -> int:
+def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str]) -> int:
     """`colmap_sph demo`."""
     options = RunOptions(threads=command.threads)
     options.check()
     log = workspace_log(Workspace(command.output / "dense"), header(arguments))
     with log, Display(terminal, options.num_threads) as display:
         result = run_demo(command.output, options=options, progress=display)
-    print_summary(result.report, result.workspace, terminal, started)
+    print_summary(result.report, result.workspace, terminal)
     terminal.say("")
     terminal.say("in pixels on the ground (GSD)", label="Against exact depth,", style="bold")
     terminal.say_lines(format_depth_maps(result.depth_maps, terminal.width))

@@ -114,9 +114,10 @@ def run_command(
             overwrite=command.overwrite,
             verify=command.verify,
             limit=limit,
+            started=started,
         )
     events.note(report)
-    print_summary(report, workspace, terminal, started)
+    print_summary(report, workspace, terminal)
     if limit is not None:
         _print_arrival(limit, terminal)
     return PARTIAL_EXIT_CODE if report.skipped_images or report.incomplete else 0
@@ -242,7 +243,7 @@ def _agreement(report: RunReport) -> str:
     return f"{report.overall_agreement:.1%} of the sparse points agree with the depth maps"
 
 
-def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, started: float) -> None:
+def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
     """Print the closing summary of a run.
 
     Parameters
@@ -251,8 +252,6 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, s
     workspace : Workspace
         With the results.
     terminal : Terminal
-    started : float
-        When the command began, as `time.monotonic` tells.
     """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
     rows = [
@@ -285,9 +284,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, s
     if any(report.reused.values()):
         kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
         facts.append(("up to date", kept))
-    # More than the stages: what is found out between them, the page, and the start of the program.
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
-    facts.append(("seconds", f"{time.monotonic() - started:.1f} ({times})"))
+    facts.append(("seconds", f"{report.total_seconds:.1f} ({times})"))
     facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
     if workspace.page_path.is_file():
         facts.append(
