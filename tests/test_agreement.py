@@ -160,6 +160,14 @@ def test_the_summary_tells_the_time_of_the_whole_command(tmp_path, capsys):
     assert re.search(r"seconds +7\.0 \(match pairs 2\.0, fuse 1\.0\)", capsys.readouterr().err)
 
 
+def test_of_many_images_left_out_the_first_are_listed(tmp_path, capsys):
+    report = reported({"a.jpg": Agreement()})
+    report.skipped_images = {f"{number}.jpg": "is missing" for number in range(70)}
+    print_summary(report, Workspace(tmp_path), Terminal())
+    told = re.findall(r"image skipped: (.*)", capsys.readouterr().err)
+    assert told == [*(f"{number}.jpg: is missing" for number in range(60)), "10 more, see report.json"]
+
+
 # ---- whole runs --------------------------------------------------------------------------------------------
 
 

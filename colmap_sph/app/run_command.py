@@ -3,9 +3,10 @@
 import io
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -294,13 +295,19 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     terminal.facts(facts)
     images = by_originals(report.skipped_images, report.views)
     for what, skipped in (("image", images), ("pair", report.skipped_pairs)):
-        for name, reason in skipped.items():
-            terminal.say(f"{name}: {reason}", label=f"{what} skipped:", style="yellow")
-    for name, reason in by_originals(report.incomplete, report.views).items():
-        terminal.say(f"{name}: {reason}", label="incomplete:", style="yellow")
+        _print_causes(skipped, f"{what} skipped:", terminal)
+    _print_causes(by_originals(report.incomplete, report.views), "incomplete:", terminal)
     if report.imprecision:
         terminal.say(report.imprecision, label="imprecise:", style="yellow")
     if report.doubts:
         terminal.say(report.doubts, label="disagreement:", style="yellow")
     if report.advice:
         terminal.say(report.advice, label="few points:", style="yellow")
+
+
+def _print_causes(causes: Mapping[str, str], label: str, terminal: Terminal) -> None:
+    """Say what became of images or pairs, of many of the first ones."""
+    for name, reason in islice(causes.items(), _MAX_LISTED_IMAGES):
+        terminal.say(f"{name}: {reason}", label=label, style="yellow")
+    if len(causes) > _MAX_LISTED_IMAGES:
+        terminal.say(f"{len(causes) - _MAX_LISTED_IMAGES} more, see report.json", label=label, style="yellow")
