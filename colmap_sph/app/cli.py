@@ -25,6 +25,7 @@ from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.part_command import part_command
 from colmap_sph.app.products.commands import PRODUCTS
+from colmap_sph.app.refusals import refusals_in_words
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, with_dashed_values
@@ -139,20 +140,20 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal, started: flo
 
 
 def _parsed(arguments: Sequence[str]) -> Command:
-    arguments = with_dashed_values(arguments)
-    if arguments[:1] == ["run"]:
-        arguments = ["run", *all_arguments(arguments[1:], RunCommand)]
-    with standard_output(), short_completion(arguments):
+    typed = with_dashed_values(arguments)
+    arguments = ["run", *all_arguments(typed[1:], RunCommand)] if typed[:1] == ["run"] else typed
+    # `run` alone has flags without a value, among its own options.
+    commands: dict[str, Any] = {
+        "run": RunCommand,
+        "demo": DemoCommand,
+        "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
+        "report": ReportCommand,
+        "view": ViewCommand,
+        **{name: options for name, (options, _) in PRODUCTS.items()},
+    }
+    with standard_output(), refusals_in_words(typed, commands), short_completion(arguments):
         command: Command = tyro.extras.subcommand_cli_from_dict(
-            # `run` alone has flags without a value, among its own options.
-            {
-                "run": RunCommand,
-                "demo": DemoCommand,
-                "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
-                "report": ReportCommand,
-                "view": ViewCommand,
-                **{name: options for name, (options, _) in PRODUCTS.items()},
-            },
+            commands,
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU. COLMAP's own commands are taken, too: "
             "patch_match_stereo and stereo_fusion are done here, all others by COLMAP.",
