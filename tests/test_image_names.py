@@ -153,6 +153,16 @@ def test_some_are_spelled_differently(tmp_path: Path, caplog: pytest.LogCaptureF
     assert "b.png is missing, but there is 'B.png'; left out" in caplog.text
 
 
+@pytest.mark.parametrize("target", ["nowhere.png", "b.png"])
+def test_links_that_lead_nowhere_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, target: str) -> None:
+    """Also one to itself; there is no other spelling of it."""
+    sparse = make_project(tmp_path)
+    (tmp_path / "images" / "b.png").unlink()
+    (tmp_path / "images" / "b.png").symlink_to(target)
+    prepare(sparse, tmp_path / "dense")
+    assert "b.png is a link to a file that is missing; left out" in caplog.text
+
+
 def test_a_folder_too_deep_or_too_high(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     rename(sparse, {name: f"all/{name}" for name in NAMES})

@@ -77,7 +77,7 @@ def tell_problems(
     InputError
         No image is left; the message says what is wrong with all of them, where that is one thing.
     """
-    missing = [name for name in problems if not (folder / name).exists()]
+    missing = [name for name in problems if not os.path.lexists(folder / name)]
     files = _files_below(folder, num_images) if missing else []
     if files is None and len(missing) == num_images:
         raise InputError(
