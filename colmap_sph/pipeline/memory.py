@@ -96,7 +96,7 @@ class MemoryGate:
         self.threads = threads
         self._total = total
         self._outside = resident() if in_use is None else in_use
-        self._needed_anyway = _at_start() if in_use is None else in_use
+        self._needed_anyway = min(self._outside, _at_start()) if in_use is None else in_use
         self._source = source
         self._reserved = 0
         self._changed = threading.Condition()
