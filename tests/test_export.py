@@ -25,6 +25,7 @@ from colmap_sph.products.clouds import copc, octree
 from colmap_sph.products.crs import read_crs, utm_zone_of, wkt_of
 from colmap_sph.products.export import Exporter, ExportFormat, ExportOptions, export
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.places import check_places
 from colmap_sph.project.cloud_tiles import INDEX, Tile, TileIndex
 from colmap_sph.project.map_files import write_depth_map
 from colmap_sph.project.scene_reader import read_scene
@@ -464,6 +465,17 @@ def test_a_full_disk_leaves_nothing_behind(workspace: Workspace, tmp_path: Path,
         exported(workspace, folder, kind)
     assert str(folder) in str(told.value) and "cannot be written" in str(told.value)
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("place", ["images", "images/deeper", "sparse", "stereo/depth_maps", "colmap_sph", "link"])
+def test_no_product_lies_among_what_is_read(workspace: Workspace, tmp_path: Path, place: str) -> None:
+    (tmp_path / "link").symlink_to(workspace.images_dir, target_is_directory=True)
+    folder = tmp_path / "link" if place == "link" else workspace.root / place
+    with pytest.raises(OutputError, match="whose files are read; choose another --output"):
+        exported(workspace, folder, "las")
+    with pytest.raises(OutputError, match="whose files are read; choose another --output"):
+        check_places(workspace, folder, ["dsm.tif"], overwrite=True)
+    assert not list(workspace.root.rglob("*.las"))
 
 
 def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path: Path) -> None:

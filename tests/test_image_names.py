@@ -4,7 +4,9 @@ import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import pycolmap
@@ -18,7 +20,9 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
-from colmap_sph.project.given.image_places import find_images
+from colmap_sph.project.given import image_places
+from colmap_sph.project.given.image_places import find_images, tell_problems
+from colmap_sph.project.images.reading import WrongSize
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -149,6 +153,16 @@ def test_some_are_spelled_differently(tmp_path: Path, caplog: pytest.LogCaptureF
     assert "b.png is missing, but there is 'B.png'; left out" in caplog.text
 
 
+@pytest.mark.parametrize("target", ["nowhere.png", "b.png"])
+def test_links_that_lead_nowhere_are_told(tmp_path: Path, caplog: pytest.LogCaptureFixture, target: str) -> None:
+    """Also one to itself; there is no other spelling of it."""
+    sparse = make_project(tmp_path)
+    (tmp_path / "images" / "b.png").unlink()
+    (tmp_path / "images" / "b.png").symlink_to(target)
+    prepare(sparse, tmp_path / "dense")
+    assert "b.png is a link to a file that is missing; left out" in caplog.text
+
+
 def test_a_folder_too_deep_or_too_high(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     rename(sparse, {name: f"all/{name}" for name in NAMES})
@@ -162,6 +176,32 @@ def test_a_folder_too_deep_or_too_high(tmp_path: Path) -> None:
     rename(sparse, {f"all/{name}": name for name in NAMES})
     with pytest.raises(InputError, match=r"but in .*/images/all; give that as --images"):
         prepare_with(sparse, tmp_path / "images")
+
+
+def test_a_folder_of_everything(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is looked through once, and not to its end."""
+    sparse = make_project(tmp_path)
+    for number in range(60):
+        (tmp_path / "all" / f"{number}" / "below").mkdir(parents=True)
+    walks: list[str] = []
+    monkeypatch.setattr(os, "walk", counted(os.walk, walks))
+    with pytest.raises(InputError, match=r"None of the model's 4 images in .* is usable"):
+        prepare_with(sparse, tmp_path / "all")
+    assert len(walks) == 121
+    monkeypatch.setattr(image_places, "_MAX_ENTRIES", 50)
+    monkeypatch.setattr(image_places, "_MAX_ENTRIES_PER_IMAGE", 1)
+    with pytest.raises(InputError, match=r"None of the 4 images of .*0 is in .*all, which has many .* --images\."):
+        prepare_with(sparse, tmp_path / "all")
+    assert len(walks) == 121 + 51
+
+
+def counted(walk: Callable[[Path], Iterable[tuple[str, list[str], list[str]]]], places: list[str]) -> Any:
+    def counting(top: Path) -> Iterator[tuple[str, list[str], list[str]]]:
+        for place in walk(top):
+            places.append(place[0])
+            yield place
+
+    return counting
 
 
 def prepare_with(sparse: Path, images: Path) -> None:
@@ -214,6 +254,27 @@ def test_sizes_without_a_rule_are_told_one_by_one(tmp_path: Path, caplog: pytest
     with pytest.raises(InputError, match=r"None of the model's 4 images in .* is usable; check --images"):
         prepare_with(sparse, folder)
     assert caplog.text.count("but its camera 96 x 64; left out") == 4
+
+
+@pytest.mark.parametrize("num_whole", [0, 1])
+def test_many_of_one_wrong_size_are_told_together(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, num_whole: int
+) -> None:
+    """And those that have another problem by name."""
+    sparse = make_project(tmp_path)
+    names = [f"{number:02d}.png" for number in range(9)]
+    problems = dict.fromkeys(names[num_whole:], WrongSize((96, 55), (96, 64))) | {names[8]: "is damaged"}
+    if num_whole:
+        tell_problems(sparse, tmp_path, problems, len(names), undistorted=False)
+    else:
+        with pytest.raises(InputError, match=r"None of the model's 9 images in .* is usable; check --images"):
+            tell_problems(sparse, tmp_path, problems, len(names), undistorted=False)
+    first = ", ".join(names[num_whole : num_whole + 4])
+    assert caplog.messages == [
+        f"{8 - num_whole} images in {tmp_path}, each of which has 96 x 55 pixels, but its camera 96 x 64; "
+        f"left out: {first}, …",
+        f"{tmp_path / names[8]} is damaged; left out",
+    ]
 
 
 def test_size_of_undistorted_images(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from colmap_sph.errors import OptionError
+from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.memory import MemoryGate, budget, format_memory, parse_memory, resident
 
 GIB = 1 << 30
@@ -88,3 +89,25 @@ def test_work_that_can_never_fit_is_refused_with_a_budget_that_would_do():
     enough = parse_memory(str(refused.value).split("; ")[1].split()[0])
     with MemoryGate(enough).reserve(3 * GIB, "the pair a - b"):
         pass
+
+
+def test_what_earlier_work_has_left_behind_refuses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run refuses what a dry run refuses, which has made nothing yet; beside other work it waits."""
+    monkeypatch.setattr(memory, "_at_start", lambda: GIB)
+    monkeypatch.setattr(memory, "resident", lambda: 3 * GIB)
+    gate = MemoryGate(4 * GIB)
+    assert gate.free == GIB
+    with gate.reserve(2 * GIB, "the pair a - b"):
+        began = threading.Event()
+
+        def work() -> None:
+            with gate.reserve(GIB / 2, "the pair c - d"):
+                began.set()
+
+        other = threading.Thread(target=work)
+        other.start()
+        assert not began.wait(0.1)
+    other.join()
+    assert began.is_set()
+    with pytest.raises(OptionError, match=r"4096MiB .* is too little for the pair e - f; 4\d{3}MiB would do"):
+        gate.check(3 * GIB, "the pair e - f")

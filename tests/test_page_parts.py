@@ -410,6 +410,11 @@ def test_some_points_are_of_the_cloud_and_evenly_spread(tmp_path: Path) -> None:
             "known format",
         ),
         (b"ply\nformat binary_little_endian 1.0\n\n\nproperty\nend_header\n", "begin with points"),
+        (
+            b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
+            b"property float z\nend_header\n" + 24 * b"\0",
+            "goes on behind the 1 points that its header counts",
+        ),
     ],
 )
 def test_what_is_no_cloud_is_refused(content: bytes, words: str, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from colmap_sph.errors import OutputError, printable
 from colmap_sph.pages import write_page
 from colmap_sph.pages.image_facts import small_pictures
 from colmap_sph.pages.samples import read_normals, read_samples, samples_per_side
+from colmap_sph.pages.words import duration
 from colmap_sph.pipeline import report_files
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report_files import command_of
@@ -102,6 +103,8 @@ def test_a_run_ends_with_its_page(finished: FinishedRun, page: Page) -> None:
     for stage, seconds in report.seconds.items():
         assert stage in page.text("th")
         assert f"{seconds:,.1f}" in page.text("td")
+    assert report.total_seconds > sum(report.seconds.values())
+    assert f", in {duration(report.total_seconds)}." in page.text("p")
 
 
 def test_threads_make_the_same_page(tmp_path: Path) -> None:

@@ -116,6 +116,23 @@ def test_pose_that_is_not_finite_is_left_out(tmp_path: Path, caplog: pytest.LogC
     assert "sub/2.png" in caplog.text and "1 sparse points have no possible coordinates" in caplog.text
 
 
+@pytest.mark.parametrize("num_turned", [3, 4])
+def test_points_behind_all_images_are_refused(tmp_path: Path, num_turned: int) -> None:
+    """As in a model whose z axes point backwards; one image whose points are in front goes on."""
+    model = make_model()
+    half_turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag([-1.0, 1.0, -1.0])), np.zeros(3))
+    for image_id in range(1, num_turned + 1):
+        image = model.image(image_id)
+        assert image.frame is not None
+        image.frame.rig_from_world = half_turn * image.cam_from_world()
+    sparse = write(model, tmp_path / "sparse", text=False)
+    if num_turned < 4:
+        assert len(read_scene(sparse).views) == 4
+    else:
+        with pytest.raises(InputError, match=r"sparse lie behind the images .*; export the model again\."):
+            read_scene(sparse)
+
+
 def test_distorted_camera_is_refused(tmp_path: Path) -> None:
     model = make_model("OPENCV")
     model.camera(1).params = [500.0, 500.0, 320.0, 240.0, 0.1, 0.0, 0.0, 0.0]

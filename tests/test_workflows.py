@@ -285,7 +285,8 @@ def test_snakemake_refuses_in_a_sentence(tmp_path: Path, stub: Path, setting: st
     "damaged", ["[1]", '{"coverage": ["x"]}', '{"seconds": {"fuse": "x"}}', '{"incomplete": 3}']
 )
 def test_one_damaged_report_does_not_cost_the_summary(tmp_path: Path, damaged: str) -> None:
-    for name, text in (("a", damaged), ("b", '{"images": 7, "points": 70}')):
+    sound = '{"images": 7, "points": 70, "seconds": {"fuse": 30}, "total_seconds": 41.6}'
+    for name, text in (("a", damaged), ("b", sound)):
         state = tmp_path / name / "dense/colmap_sph"
         state.mkdir(parents=True)
         (state / "report.json").write_text(text)
@@ -295,4 +296,4 @@ def test_one_damaged_report_does_not_cost_the_summary(tmp_path: Path, damaged: s
     assert done.returncode == 1 and "Traceback" not in done.stderr
     rows = [line.split("\t") for line in (tmp_path / "list.tsv").read_text().splitlines()]
     assert rows[1][:2] == ["a/sparse/0", "FAILED (?)"]
-    assert rows[2][:4] == ["b/sparse/0", "done", "7", "70"]
+    assert rows[2][:6] == ["b/sparse/0", "done", "7", "70", "0.0%", "42"]

@@ -47,7 +47,7 @@ class Project:
             str(report.get("images", "")),
             str(report.get("points", "")),
             f"{sum(coverage.values()) / max(len(coverage), 1):.1%}",
-            f"{sum(report.get('seconds', {}).values()):.0f}",
+            f"{_seconds(report):.0f}",
             " ".join(folder.name for folder in self.products()),
             "; ".join(f"{name}: {reason}" for name, reason in missing.items()),
         )
@@ -87,6 +87,12 @@ class Project:
         if report is None:
             return "?", "it has not come to its end"
         return ("5" if report.get("skipped_images") or report.get("incomplete") else "0"), ""
+
+
+def _seconds(report: dict) -> float:
+    """Of the whole command; earlier versions tell those of its stages."""
+    total = report.get("total_seconds")
+    return total if isinstance(total, int | float) and total > 0 else sum(report.get("seconds", {}).values())
 
 
 def read_projects(path: Path) -> list[Project]:

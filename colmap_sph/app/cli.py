@@ -25,6 +25,7 @@ from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.part_command import part_command
 from colmap_sph.app.products.commands import PRODUCTS
+from colmap_sph.app.refusals import refusals_in_words
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, with_dashed_values
@@ -139,20 +140,20 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal, started: flo
 
 
 def _parsed(arguments: Sequence[str]) -> Command:
-    arguments = with_dashed_values(arguments)
-    if arguments[:1] == ["run"]:
-        arguments = ["run", *all_arguments(arguments[1:], RunCommand)]
-    with standard_output(), short_completion(arguments):
+    typed = with_dashed_values(arguments)
+    arguments = ["run", *all_arguments(typed[1:], RunCommand)] if typed[:1] == ["run"] else typed
+    # `run` alone has flags without a value, among its own options.
+    commands: dict[str, Any] = {
+        "run": RunCommand,
+        "demo": DemoCommand,
+        "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
+        "report": ReportCommand,
+        "view": ViewCommand,
+        **{name: options for name, (options, _) in PRODUCTS.items()},
+    }
+    with standard_output(), refusals_in_words(typed, commands), short_completion(arguments):
         command: Command = tyro.extras.subcommand_cli_from_dict(
-            # `run` alone has flags without a value, among its own options.
-            {
-                "run": RunCommand,
-                "demo": DemoCommand,
-                "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
-                "report": ReportCommand,
-                "view": ViewCommand,
-                **{name: options for name, (options, _) in PRODUCTS.items()},
-            },
+            commands,
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU. COLMAP's own commands are taken, too: "
             "patch_match_stereo and stereo_fusion are done here, all others by COLMAP.",
@@ -172,7 +173,7 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
             return part_command(command, terminal, arguments, events)
         return run_command(command, terminal, arguments, events, started)
     if isinstance(command, DemoCommand):
-        return demo_command(command, terminal, arguments, started)
+        return demo_command(command, terminal, arguments)
     if isinstance(command, ReportCommand):
         return report_command(command, terminal)
     if isinstance(command, ViewCommand):
@@ -182,14 +183,14 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
     return next(answer for options, answer in PRODUCTS.values() if isinstance(command, options))(command, terminal)
 
 
-def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str], started: float) -> int:
+def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[str]) -> int:
     """`colmap_sph demo`."""
     options = RunOptions(threads=command.threads)
     options.check()
     log = workspace_log(Workspace(command.output / "dense"), header(arguments))
     with log, Display(terminal, options.num_threads) as display:
         result = run_demo(command.output, options=options, progress=display)
-    print_summary(result.report, result.workspace, terminal, started)
+    print_summary(result.report, result.workspace, terminal)
     terminal.say("")
     terminal.say("in pixels on the ground (GSD)", label="Against exact depth,", style="bold")
     terminal.say_lines(format_depth_maps(result.depth_maps, terminal.width))

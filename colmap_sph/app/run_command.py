@@ -3,9 +3,10 @@
 import io
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from itertools import islice
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -114,9 +115,10 @@ def run_command(
             overwrite=command.overwrite,
             verify=command.verify,
             limit=limit,
+            started=started,
         )
     events.note(report)
-    print_summary(report, workspace, terminal, started)
+    print_summary(report, workspace, terminal)
     if limit is not None:
         _print_arrival(limit, terminal)
     return PARTIAL_EXIT_CODE if report.skipped_images or report.incomplete else 0
@@ -242,7 +244,7 @@ def _agreement(report: RunReport) -> str:
     return f"{report.overall_agreement:.1%} of the sparse points agree with the depth maps"
 
 
-def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, started: float) -> None:
+def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
     """Print the closing summary of a run.
 
     Parameters
@@ -251,8 +253,6 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, s
     workspace : Workspace
         With the results.
     terminal : Terminal
-    started : float
-        When the command began, as `time.monotonic` tells.
     """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
     rows = [
@@ -285,9 +285,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, s
     if any(report.reused.values()):
         kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
         facts.append(("up to date", kept))
-    # More than the stages: what is found out between them, the page, and the start of the program.
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
-    facts.append(("seconds", f"{time.monotonic() - started:.1f} ({times})"))
+    facts.append(("seconds", f"{report.total_seconds:.1f} ({times})"))
     facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
     if workspace.page_path.is_file():
         facts.append(
@@ -296,13 +295,19 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal, s
     terminal.facts(facts)
     images = by_originals(report.skipped_images, report.views)
     for what, skipped in (("image", images), ("pair", report.skipped_pairs)):
-        for name, reason in skipped.items():
-            terminal.say(f"{name}: {reason}", label=f"{what} skipped:", style="yellow")
-    for name, reason in by_originals(report.incomplete, report.views).items():
-        terminal.say(f"{name}: {reason}", label="incomplete:", style="yellow")
+        _print_causes(skipped, f"{what} skipped:", terminal)
+    _print_causes(by_originals(report.incomplete, report.views), "incomplete:", terminal)
     if report.imprecision:
         terminal.say(report.imprecision, label="imprecise:", style="yellow")
     if report.doubts:
         terminal.say(report.doubts, label="disagreement:", style="yellow")
     if report.advice:
         terminal.say(report.advice, label="few points:", style="yellow")
+
+
+def _print_causes(causes: Mapping[str, str], label: str, terminal: Terminal) -> None:
+    """Say what became of images or pairs, of many of the first ones."""
+    for name, reason in islice(causes.items(), _MAX_LISTED_IMAGES):
+        terminal.say(f"{name}: {reason}", label=label, style="yellow")
+    if len(causes) > _MAX_LISTED_IMAGES:
+        terminal.say(f"{len(causes) - _MAX_LISTED_IMAGES} more, see report.json", label=label, style="yellow")

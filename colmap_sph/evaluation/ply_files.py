@@ -28,6 +28,8 @@ _ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 _KINDS = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"}
 _KINDS |= {"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"}
 _KINDS |= {"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"}
+# Looked at for something that is no white space, behind the last element.
+_SPACE_BYTES = 64
 _CORNERS = ("vertex_indices", "vertex_index")
 
 
@@ -97,6 +99,8 @@ def read_ply(path: Path) -> tuple[Points, Faces]:
                 polygons = reader.polygons(element, element.place(_CORNERS, in_list=True))
             else:
                 reader.polygons(element, None)
+        if reader.has_more():
+            raise DamagedError("it goes on behind what its header counts")
     if points is None:
         raise DamagedError("it has no element vertex")
     return points, polygons.triangles()
@@ -181,6 +185,10 @@ class _BinaryRows:
         self._left -= length
         self._file.seek(length - len(data), io.SEEK_CUR)
         return polygons
+
+    def has_more(self) -> bool:
+        """Whether anything but the end of a line follows."""
+        return bool(self._file.read(_SPACE_BYTES).strip())
 
     def _take(self, count: int) -> bytes:
         if count > self._left:
@@ -291,6 +299,10 @@ class _TextRows:
                     polygons.add_one(words[position : position + length])
                 position += length
         return polygons
+
+    def has_more(self) -> bool:
+        """As `_BinaryRows.has_more`."""
+        return next(self._lines, None) is not None
 
     def _next(self, count: int) -> Iterator[bytes]:
         found = 0

@@ -126,7 +126,7 @@ def _headline(content: Content, run: RunFacts) -> str:
     words = f"{with_depth:,} of {number(len(content.images), 'image')} with depth maps"
     if content.cloud.total:
         words += f", {content.cloud.total:,} points"
-    seconds = sum(run.seconds.values())
+    seconds = run.total_seconds or sum(run.seconds.values())  # earlier versions knew the stages' alone
     return f"{words}, in {duration(seconds)}." if seconds else f"{words}."
 
 

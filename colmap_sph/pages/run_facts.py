@@ -77,6 +77,7 @@ class RunFacts(msgspec.Struct, frozen=True):
     made: dict[str, Count] = {}
     reused: dict[str, Count] = {}
     seconds: dict[str, Positive] = {}
+    total_seconds: Positive = 0.0
     peak_memory: Count = 0
 
     @property

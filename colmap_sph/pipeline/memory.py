@@ -4,6 +4,7 @@ import re
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 
 from colmap_sph.errors import OptionError
 from colmap_sph.platforms import control_groups
@@ -63,6 +64,12 @@ def _free() -> int:
     return max(min([free, *(limit for limit in limits if limit is not None)]), 0)
 
 
+@cache
+def _at_start() -> int:
+    """Bytes in use when the process asks first: before any stage, so that a dry run and the run ask alike."""
+    return resident()
+
+
 class MemoryGate:
     """Lets work begin when its share of a budget is free.
 
@@ -89,6 +96,7 @@ class MemoryGate:
         self.threads = threads
         self._total = total
         self._outside = resident() if in_use is None else in_use
+        self._needed_anyway = min(self._outside, _at_start()) if in_use is None else in_use
         self._source = source
         self._reserved = 0
         self._changed = threading.Condition()
@@ -106,27 +114,33 @@ class MemoryGate:
     def keeping(self, amount: int) -> Iterator[None]:
         """Take `amount` bytes for caches and scratch memory; no work is under way when this begins or ends."""
         self._outside += amount
+        self._needed_anyway += amount
         try:
             yield
         finally:
             self._outside -= amount
+            self._needed_anyway -= amount
 
     def check(self, amount: float, what: str) -> int:
         """Bytes to reserve for `amount` bytes of arrays; `OptionError` where they never fit."""
         needed = int(_SLACK * amount)
-        if needed > self.free:
+        if self._needed_anyway + needed > self._total:
             raise OptionError(
                 f"{format_memory(self._total)} of memory ({self._source}) is too little for "
-                f"{what}; {format_memory((self._outside + needed) * 1.05)} would do."
+                f"{what}; {format_memory((self._needed_anyway + needed) * 1.05)} would do."
             )
         return needed
 
     @contextmanager
     def reserve(self, amount: float, what: str) -> Iterator[None]:
-        """Wait until `amount` bytes of arrays fit, and hold them; `OptionError` where they never can."""
+        """Wait until `amount` bytes of arrays fit, and hold them; `OptionError` where they never can.
+
+        What earlier work has left with the allocators serves later work, so a piece that fits without it may begin
+        where no other is under way.
+        """
         needed = self.check(amount, what)
         with self._changed:
-            self._changed.wait_for(lambda: self._reserved + needed <= self.free)
+            self._changed.wait_for(lambda: not self._reserved or self._reserved + needed <= self.free)
             self._reserved += needed
         try:
             yield

@@ -4,6 +4,7 @@ Stages talk through files in the workspace: disparity maps of pairs, photometric
 deviations, geometric maps, the cloud. What an earlier run finished with the same input is used as it is.
 """
 
+import time
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
@@ -103,6 +104,7 @@ def run_project(
     overwrite: bool = False,
     verify: bool = False,
     limit: TimeLimit | None = None,
+    started: float | None = None,
 ) -> RunReport:
     """Do what `run` does, for what is in one record.
 
@@ -114,7 +116,10 @@ def run_project(
         See `run`.
     limit : TimeLimit, optional
         The time to end within.
+    started : float, optional
+        When the run began, as `time.monotonic` tells; default: now.
     """
+    started = time.monotonic() if started is None else started
     check_input(project, options, limit)
     if limit is not None:
         options = with_affordable_size(project, options, limit, overwrite=overwrite)
@@ -140,6 +145,7 @@ def run_project(
             overwrite=overwrite,
             verify=verify,
             limit=limit,
+            started=started,
         )
 
 
@@ -178,6 +184,7 @@ def reconstruct(
     pair_list: Path | None = None,
     needs_all: bool = False,
     limit: TimeLimit | None = None,
+    started: float | None = None,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -209,11 +216,14 @@ def reconstruct(
         Whether an image that is missing or damaged ends the run (`InputError`) before anything is made.
     limit : TimeLimit, optional
         The time to end within.
+    started : float, optional
+        When the run began, as `time.monotonic` tells; default: now.
 
     Returns
     -------
     RunReport
     """
+    started = time.monotonic() if started is None else started
     progress = Silent() if progress is None else progress
     report = report or RunReport()
     report.until = until
@@ -241,7 +251,7 @@ def reconstruct(
         else:
             context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), executor)
         judge_agreement(report)
-    write_report(context)
+    write_report(context, started)
     keep_or_make_page(context)
     refuse_disagreement(report)
     if until == "cloud" and not report.points:

@@ -152,6 +152,9 @@ class RunReport:
         Stage → how many of its results this run worked out, and how many an earlier run had left ready.
     seconds : dict
         Stage → wall time.
+    total_seconds : float
+        Wall time from the start of the command until this report is written, before the page is made: more than
+        the stages take.
     peak_memory : int
         Largest resident set of the process, or of a worker on another machine, bytes.
     """
@@ -193,4 +196,5 @@ class RunReport:
     made: dict[str, int] = field(default_factory=dict)
     reused: dict[str, int] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
+    total_seconds: float = 0.0
     peak_memory: int = 0

@@ -29,7 +29,7 @@ from colmap_sph.stereo.kernels import backend
 logger = logging.getLogger(__name__)
 
 # What of a report differs from run to run with the same results.
-_OF_THE_RUN = {"made", "reused", "seconds", "peak_memory"}
+_OF_THE_RUN = {"made", "reused", "seconds", "total_seconds", "peak_memory"}
 # Bytes per pixel of an image while the page looks at it.
 _PAGE_BYTES = 8
 
@@ -56,9 +56,10 @@ def command_of(project: Project, options: RunOptions) -> str:
     return " ".join(map(shell_word, words))
 
 
-def write_report(context: Context) -> None:
-    """Write `report.json`: versions, options, and what the run tells of itself."""
+def write_report(context: Context, started: float) -> None:
+    """Write `report.json`: versions, options, and what the run, begun at `started`, tells of itself."""
     report = context.report
+    report.total_seconds = time.monotonic() - started
     report.peak_memory = max(report.peak_memory, most_resident())
     with atomic_file(context.workspace.report_path) as file:
         file.write(json.dumps(_content(context), indent=1, default=str).encode())

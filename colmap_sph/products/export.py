@@ -18,6 +18,7 @@ from colmap_sph.products.clouds.thinning import ThinCloud, thinned
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.maps.files import write_exr, write_npz, write_png
 from colmap_sph.products.maps.reading import MappedScene, mapped_scene
+from colmap_sph.products.places import check_no_input
 from colmap_sph.products.scenes.mvsnet import write_mvsnet
 from colmap_sph.products.scenes.nerfstudio import write_nerfstudio
 from colmap_sph.products.scenes.splats import write_splats
@@ -158,6 +159,7 @@ def export(exporter: Exporter, status: Status, *, overwrite: bool = False) -> Se
     exporter.options.check()
     formats = list(dict.fromkeys(exporter.options.formats))
     paths = [exporter.folder / _MAKERS[each][0] for each in formats]
+    check_no_input(exporter.workspace, exporter.folder)
     if exporter.folder.is_relative_to(exporter.workspace.root):
         check_ways_out(exporter.workspace.root, [exporter.folder], unlinked={exporter.folder})
     for path in paths:

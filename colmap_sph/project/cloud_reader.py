@@ -122,8 +122,11 @@ def read_layout(path: Path, file: BufferedReader) -> PlyLayout:
         raise InputError(f"The points of {path} are in no known format; fuse again.")
     kind = np.dtype(list(zip(names, kinds, strict=True)))
     count = int(element[2][:15])
-    if os.fstat(file.fileno()).st_size < end.end() + count * kind.itemsize:
+    length = os.fstat(file.fileno()).st_size - end.end() - count * kind.itemsize
+    if length < 0:
         raise InputError(f"{path} is cut off; fuse again.")
+    if length > 0 and [words[0] for words in lines].count("element") == 1:
+        raise InputError(f"{path} goes on behind the {count} points that its header counts; fuse again.")
     return PlyLayout(kind, count, end.end())
 
 

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -49,7 +50,7 @@ def answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int:
     _tell_idle(given, terminal)
     workspace = Workspace(Path(str(given.plain["workspace_path"])))
     with workspace_log(workspace, header(arguments)), Display(terminal) as display:
-        make = make_maps if name == "patch_match_stereo" else make_cloud
+        make = partial(make_maps, started=started) if name == "patch_match_stereo" else make_cloud
         report = make(given.plain, given.sectioned, command=to_repeat(arguments), progress=display)
     _print_end(given, report, workspace, terminal, started)
     return PARTIAL_EXIT_CODE if report.incomplete else 0
@@ -63,7 +64,7 @@ def _tell_idle(given: Given, terminal: Terminal) -> None:
 
 def _print_end(given: Given, report: RunReport, workspace: Workspace, terminal: Terminal, started: float) -> None:
     if "output_path" not in given.plain:
-        print_summary(report, workspace, terminal, started)
+        print_summary(report, workspace, terminal)
         return
     seconds = time.monotonic() - started
     cloud = f"{report.points:,} points of {report.images} images in {given.plain['output_path']}"

@@ -17,6 +17,7 @@ def make_maps(
     *,
     command: str = "",
     progress: Progress | None = None,
+    started: float | None = None,
 ) -> RunReport:
     """Make the maps of a dense workspace.
 
@@ -29,6 +30,8 @@ def make_maps(
     command : str
         What to type to do the same again.
     progress : Progress, optional
+    started : float, optional
+        When the command began, as `time.monotonic` tells; default: now.
 
     Returns
     -------
@@ -52,4 +55,5 @@ def make_maps(
             until="geometric" if chosen.get("geom_consistency", True) else "photometric",
             pair_list=pair_list,
             needs_all=not chosen.get("allow_missing_files", False),
+            started=started,
         )

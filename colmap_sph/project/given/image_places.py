@@ -4,7 +4,6 @@ import logging
 import os
 import unicodedata
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import islice
 from pathlib import Path, PurePosixPath
 
 from colmap_sph.errors import InputError
@@ -15,9 +14,12 @@ _Size = tuple[int, int]
 
 logger = logging.getLogger(__name__)
 
-# More files than these are not looked through for another spelling of a name.
-_MAX_FILES = 500_000
+# A folder with more entries than these, and than so many for each image of the model, is no folder of its images.
+_MAX_ENTRIES = 20_000
+_MAX_ENTRIES_PER_IMAGE = 100
 _MAX_FACTOR = 16
+# Of images with the same problem so many are told one by one; of more the first in one sentence.
+_MOST_TOLD = 4
 _UNDISTORT = "give the sparse model with --model to have them undistorted anew"
 _SHARES = {2: "half", 3: "a third of", 4: "a quarter of", 8: "an eighth of"}
 _SLASHES = (
@@ -46,7 +48,8 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     if max(found) > 0:
         return folders[found.index(max(found))]
     for folder in folders:
-        misspelled = _common_misspelling(model_dir, folder, names)
+        files = _files_below(folder, len(names))
+        misspelled = None if files is None else _common_misspelling(model_dir, folder, files, names)
         if misspelled:
             raise InputError(misspelled)
     tried = ", ".join(str(folder) for folder in folders)
@@ -74,60 +77,92 @@ def tell_problems(
     InputError
         No image is left; the message says what is wrong with all of them, where that is one thing.
     """
-    missing = [name for name in problems if not (folder / name).exists()]
+    missing = [name for name in problems if not os.path.lexists(folder / name)]
+    files = _files_below(folder, num_images) if missing else []
+    if files is None and len(missing) == num_images:
+        raise InputError(
+            f"None of the {num_images} images of {model_dir} is in {folder}, which has many thousands of other "
+            "files; give the folder of the images as --images."
+        )
+    files = files or []
     if len(problems) == num_images:
-        common = _common_size(folder, problems, undistorted) or _common_misspelling(model_dir, folder, missing)
+        common = _common_size(folder, problems, undistorted) or _common_misspelling(
+            model_dir, folder, files, missing
+        )
         if common:
             raise InputError(common)
-    spelled = other_spellings(folder, missing)
+    spelled = other_spellings(files, missing)
+    alike: dict[str, list[str]] = {}
     for name, problem in problems.items():
         instead = f", but there is {spelled[name]!r}" if name in spelled else ""
-        logger.warning("%s %s%s; left out", folder / name, problem, instead)
+        alike.setdefault(f"{problem}{instead}", []).append(name)
+    for problem, names in alike.items():
+        for name in names if len(names) <= _MOST_TOLD else ():
+            logger.warning("%s %s; left out", folder / name, problem)
+        if len(names) > _MOST_TOLD:
+            first = ", ".join(names[:_MOST_TOLD])
+            logger.warning(
+                "%d images in %s, each of which %s; left out: %s, …", len(names), folder, problem, first
+            )
     if len(problems) == num_images:
         remedy = _UNDISTORT if undistorted else "check --images"
         raise InputError(f"None of the model's {num_images} images in {folder} is usable; {remedy}.")
 
 
-def other_spellings(folder: Path, names: Iterable[str]) -> dict[str, str]:
+def other_spellings(files: Iterable[str], names: Iterable[str]) -> dict[str, str]:
     r"""Files whose names differ from those of images only in ways that other systems do not tell apart.
 
     Parameters
     ----------
-    folder : Path
+    files : iterable of str
+        Of the images' folder, relative to it.
     names : iterable of str
         Of images that are not there.
 
     Returns
     -------
     dict
-        Name → name of the file, relative to the folder: with ``/`` in place of ``\``, in other case, or with its
-        accents written in another way. Only where there is one such file.
+        Name → file: with ``/`` in place of ``\``, in other case, or with its accents written in another way. Only
+        where there is one such file.
     """
-    wanted = set(names)
-    if not wanted:
-        return {}
-    files: dict[str, list[str]] = {}
-    for file in islice(_files_below(folder), _MAX_FILES):
-        files.setdefault(_folded(file), []).append(file)
-    found = {name: files.get(_folded(name), []) for name in wanted}
-    return {name: alike[0] for name, alike in found.items() if len(alike) == 1}
+    wanted = {_folded(name) for name in names}
+    alike: dict[str, list[str]] = {}
+    for file in files:
+        if _folded(file) in wanted:
+            alike.setdefault(_folded(file), []).append(file)
+    found = {name: alike.get(_folded(name), []) for name in names}
+    return {name: those[0] for name, those in found.items() if len(those) == 1}
 
 
-def _files_below(folder: Path) -> Iterable[str]:
-    for place, _, files in os.walk(folder):
-        within = Path(place).relative_to(folder).as_posix()
-        yield from (file if within == "." else f"{within}/{file}" for file in files)
+def _files_below(folder: Path, num_images: int) -> list[str] | None:
+    """The files of a folder and those below it, relative to it; None where there is much that is no image.
+
+    Parameters
+    ----------
+    folder : Path
+        Need not exist.
+    num_images : int
+        That the model has.
+    """
+    most = max(_MAX_ENTRIES, _MAX_ENTRIES_PER_IMAGE * num_images)
+    files: list[str] = []
+    for num_folders, (place, _, names) in enumerate(os.walk(folder), start=1):
+        if num_folders + len(files) + len(names) > most:
+            return None
+        within = "" if place == str(folder) else f"{Path(place).relative_to(folder).as_posix()}/"
+        files += [f"{within}{name}" for name in names]
+    return files
 
 
 def _folded(name: str) -> str:
     return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
 
 
-def _common_misspelling(model_dir: Path, folder: Path, names: Sequence[str]) -> str | None:
+def _common_misspelling(model_dir: Path, folder: Path, files: Sequence[str], names: Sequence[str]) -> str | None:
     """Say how a folder spells the names of a model's images, of which it has none; None where it does not."""
-    spelled = other_spellings(folder, names)
+    spelled = other_spellings(files, names)
     if not spelled:
-        return _other_folder(model_dir, folder, names)
+        return _other_folder(model_dir, folder, files, names)
     name = min(spelled)
     if all("\\" in each and each.replace("\\", "/") == file for each, file in spelled.items()):
         remedy = f"write the names in the model with /: {_SLASHES.format(model=str(model_dir))}"
@@ -141,21 +176,23 @@ def _common_misspelling(model_dir: Path, folder: Path, names: Sequence[str]) -> 
     )
 
 
-def _other_folder(model_dir: Path, folder: Path, names: Sequence[str]) -> str | None:
+def _other_folder(model_dir: Path, folder: Path, files: Sequence[str], names: Sequence[str]) -> str | None:
     """Say where the images are, if all in another folder than the model's names say."""
-    files = set(islice(_files_below(folder), _MAX_FILES))
+    there = set(files)
+    wanted = set(names)
     for name in names:
         parts = PurePosixPath(name).parts
         # The model's names begin with folders above, or leave out folders below.
-        if len(parts) > 1 and "/".join(parts[1:]) in files and (folder.parent / name).is_file():
+        if len(parts) > 1 and "/".join(parts[1:]) in there and (folder.parent / name).is_file():
             return (
                 f"The model {model_dir} calls an image {name!r}, and {folder} has {'/'.join(parts[1:])!r}; "
                 f"give --images {folder.parent}."
             )
-    below = {file.partition("/")[0] for file in files if file.partition("/")[2] in names}
+    below = {file.partition("/")[0] for file in files if file.partition("/")[2] in wanted}
     if len(below) == 1:
-        there = folder / below.pop()
-        return f"The images of {model_dir} are not in {folder}, but in {there}; give that as --images."
+        return (
+            f"The images of {model_dir} are not in {folder}, but in {folder / below.pop()}; give that as --images."
+        )
     return None
 
 

@@ -59,6 +59,8 @@ def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -
     """
     try:
         if not path.is_file():
+            if path.is_symlink() and not path.exists():
+                return "is a link to a file that is missing"
             return "is not a regular file" if path.exists() else "is missing"
         header = read_header(path)
         # Before anything is decoded: a small file can hold a huge image.

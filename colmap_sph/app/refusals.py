@@ -1,0 +1,192 @@
+"""What is wrong with a command line that the parser refuses: one sentence, with options as they were typed."""
+
+import io
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr
+from dataclasses import MISSING, dataclass, fields, is_dataclass
+from difflib import get_close_matches
+from itertools import dropwhile, takewhile
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+import tyro
+
+from colmap_sph.app.spelling import SHORT, full_flag
+from colmap_sph.errors import InputError
+
+# Records whose options have no prefix.
+_TAKEN_APART = ("project", "options", "georeference")
+_OPTION = re.compile(r"--?[^\W\d]")
+# Lines, corners and colours of the parser's box, with or without Unicode.
+_DRAWN = re.compile(r"[╭╮╰╯│─]|^[|+]|[|+]$|-{3,}|\x1b\[[\d;]*m")
+
+
+@dataclass(frozen=True)
+class _Known:
+    """An option or, without a flag, a positional argument; its kind is None where it takes no value."""
+
+    flag: str
+    name: str
+    kind: Any
+    is_required: bool
+
+
+@contextmanager
+def refusals_in_words(arguments: Sequence[str], commands: Mapping[str, Any]) -> Iterator[None]:
+    """Raise `InputError` in place of the parser's box and `SystemExit`.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        As they were typed.
+    commands : mapping of str to type
+        Each command's record of options by its name.
+    """
+    said = io.StringIO()
+    try:
+        with redirect_stderr(said):
+            yield
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        raise InputError(_reason(arguments, commands) or _without_box(said.getvalue())) from None
+
+
+def _reason(arguments: Sequence[str], commands: Mapping[str, Any]) -> str | None:
+    names = ", ".join(commands)
+    if not arguments:
+        return f"Name a command: {names}; colmap_sph --help tells more."
+    command, *typed = arguments
+    if command not in commands:
+        return (
+            f"There is no command {command!r}{_nearest(command, commands)}; the commands are {names}, "
+            "and those of COLMAP."
+        )
+    known = list(_known(commands[command]))
+    problem = _problem(typed, {each.flag: each for each in known if each.flag}, known)
+    more = "--help-all" if command == "run" else "--help"
+    return problem and f"{problem}; see colmap_sph {command} {more}."
+
+
+def _known(annotated: Any, prefix: str = "", *, has_switches: bool = True) -> Iterator[_Known]:
+    record, marks = _taken_apart(annotated)
+    has_switches = has_switches and tyro.conf.FlagConversionOff not in marks
+    kinds = get_type_hints(record, include_extras=True)
+    for each in fields(record):
+        kind, marks = _taken_apart(kinds[each.name])
+        if is_dataclass(kind):
+            inner = prefix if each.name in _TAKEN_APART else f"{prefix}{each.name}."
+            yield from _known(kinds[each.name], inner, has_switches=has_switches)
+        else:
+            is_positional = tyro.conf.Positional in marks
+            flag = "" if is_positional else f"--{prefix}{each.name}".replace("_", "-")
+            is_required = each.default is MISSING and each.default_factory is MISSING
+            is_switch = kind is bool and has_switches
+            yield _Known(flag, flag or f"a {each.name}", None if is_switch else kind, is_required)
+
+
+def _taken_apart(annotated: Any) -> tuple[Any, tuple[Any, ...]]:
+    """A kind, and how it is marked."""
+    marks = getattr(annotated, "__metadata__", ())
+    return (get_args(annotated)[0] if marks else annotated), marks
+
+
+def _problem(typed: Sequence[str], options: Mapping[str, _Known], known: Sequence[_Known]) -> str | None:
+    """Say what is wrong first; None where nothing is seen to be."""
+    given = set()
+    loose = []
+    rest = list(typed)
+    while rest:
+        word = rest.pop(0)
+        if not _OPTION.match(word):
+            loose.append(word)
+            continue
+        flag, equals, value = word.partition("=")
+        option = options.get(full_flag(flag)) or options.get(full_flag(flag.replace("--no-", "--", 1)))
+        if option is None:
+            return f"There is no option {flag}{_nearest(flag, [*SHORT.values(), *options])}"
+        given.add(option.flag)
+        values = [value] if equals else _taken(rest, option.kind)
+        problem = _wrong_value(flag, option.kind, values)
+        if problem:
+            return problem
+    return _wrong_number(loose, given, known)
+
+
+def _taken(rest: list[str], kind: Any) -> list[str]:
+    """Take the values of an option from the words behind it."""
+    most = _most_values(kind)
+    values: list[str] = []
+    while rest and len(values) < most and not _OPTION.match(rest[0]):
+        values.append(rest.pop(0))
+    return values
+
+
+def _most_values(kind: Any) -> float:
+    if kind is None:
+        return 0
+    if get_origin(kind) in (UnionType, Union):
+        return max(map(_most_values, get_args(kind)))
+    if get_origin(kind) is not tuple:
+        return 1
+    return float("inf") if get_args(kind)[-1] is Ellipsis else len(get_args(kind))
+
+
+def _wrong_value(flag: str, kind: Any, values: Sequence[str]) -> str | None:
+    if get_origin(kind) in (UnionType, Union):
+        problems = [_wrong_value(flag, each, values) for each in get_args(kind) if each is not NoneType]
+        return problems[0] if all(problems) else None
+    if get_origin(kind) is tuple:
+        kinds = get_args(kind)
+        if kinds[-1] is not Ellipsis and len(values) < len(kinds):
+            return f"{flag} needs {len(kinds)} values"
+        return next(filter(None, (_wrong_value(flag, kinds[0], [value]) for value in values)), None)
+    if kind is None:
+        return f"{flag} takes no value" if values else None
+    if not values:
+        return f"{flag} needs a value"
+    words = _words(kind)
+    return f"{flag} takes {words}, not {values[0]!r}" if words and not _fits(kind, values[0]) else None
+
+
+def _words(kind: Any) -> str:
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(map(str, get_args(kind)))}"
+    return {int: "a whole number", float: "a number", bool: "True or False"}.get(kind, "")
+
+
+def _fits(kind: Any, value: str) -> bool:
+    if get_origin(kind) is Literal:
+        return value in map(str, get_args(kind))
+    if kind is bool:
+        return value in ("True", "False")
+    try:
+        kind(value)
+    except ValueError:
+        return False
+    return True
+
+
+def _wrong_number(loose: Sequence[str], given: set[str], known: Sequence[_Known]) -> str | None:
+    """Say which argument is missing, or one too many."""
+    places = [each for each in known if not each.flag]
+    most = sum(_most_values(each.kind) for each in places)
+    is_model = "--model" in {each.flag for each in known} and "--model" not in given and not places
+    if len(loose) > most + is_model:
+        return f"{loose[-1]!r} is one argument too many, or an option's name is missing before it"
+    missing = [each.name for each in known if each.is_required and each.flag and each.flag not in given]
+    missing += [each.name for each in places if each.is_required and not loose]
+    return f"Give {' and '.join(missing)}" if missing else None
+
+
+def _nearest(word: str, known: Sequence[str] | Mapping[str, Any]) -> str:
+    close = get_close_matches(word.replace("_", "-"), list(known), 1, 0.7)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def _without_box(said: str) -> str:
+    """The first part of what the parser says, in one line."""
+    lines = [" ".join(_DRAWN.sub(" ", line).split()) for line in said.splitlines()]
+    told = " ".join(takewhile(bool, dropwhile(lambda line: not line, lines[1:])))
+    return f"The command line is not understood: {told or 'see colmap_sph --help.'}"
