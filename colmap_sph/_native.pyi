@@ -391,6 +391,7 @@ def confirm_depth(
     depth: NDArray[np.float32],
     sigma: NDArray[np.float32],
     min_consistent: int,
+    may_miss: int,
     max_contradiction: float,
     min_surface: float,
     steepest: float,
@@ -407,6 +408,7 @@ def confirm_depth(
     depth : (H, W) float32
     sigma : (H, W) float32
     min_consistent : int
+    may_miss : int
     max_contradiction : float
     min_surface : float
     steepest : float

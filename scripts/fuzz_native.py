@@ -408,7 +408,8 @@ def confirm_depth(rng: Random) -> Arguments:
     maps = [filled(rng, shape, np.float32) for _ in range(2)]
     counts = [filled(rng, shape, np.uint8) for _ in range(3)]
     sums = [filled(rng, shape, np.float32) for _ in range(2)]
-    return [*maps, int(rng.integers(-1, 300)), number(rng), number(rng), number(rng), *counts, *sums]
+    views = [int(rng.integers(-1, 300)), int(rng.integers(-1, 3))]
+    return [*maps, *views, number(rng), number(rng), number(rng), *counts, *sums]
 
 
 def add_patch_equations(rng: Random) -> Arguments:

@@ -571,9 +571,35 @@ def test_what_one_view_confirms_in_passing_is_dropped():
     inner[18:42, 23:47] = True
     assert (inner & second).sum() > 100
     assert confirmed[inner & second].all()
-    # Nothing outside the block, whose corners have a quarter of a window around them.
+    # Nothing outside the block, whose corners have little more than a third of a window around them.
     assert not confirmed[~block].any() and not confirmed[15, 20]
     assert (confirm(views, maps).depth > 0)[speckles & second].all()
+
+
+def inner(mask, radius):
+    """Where all pixels within a radius are set, on an image that goes on beyond its border."""
+    padded = np.pad(mask, radius, constant_values=True)
+    windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * radius + 1, 2 * radius + 1))
+    return windows.all(axis=(2, 3))
+
+
+def test_a_surface_stands_for_one_view_that_does_not_confirm():
+    views, maps = wall_views(3)
+    first, second = (in_view(views[0], view, 10.0) for view in views[1:])
+    maps[2] = plane_depth(views[2], 14.0)
+    options = replace(UNSURE, min_surface=0.6)
+    unsure = inner(first, 2) & second
+    assert unsure.mean() > 0.2
+    assert (confirm(views, maps, options).depth > 0)[unsure].all()
+    # Not where that view looks through it, nor beside a view of which nothing is known.
+    assert not (confirm(views, maps, replace(options, min_contradicting_support=2)).depth > 0)[unsure].any()
+    silent = [maps[0], maps[1], np.where(np.arange(views[2].width) < 4, maps[2], 0)]
+    assert not (confirm(views, silent, options).depth > 0)[unsure].any()
+    # Of two rows of three a window holds three fifths.
+    sparse = [np.where((np.arange(views[0].height) % 3 < 2)[:, None], maps[0], 0), *maps[1:]]
+    assert not (confirm(views, sparse, options).depth > 0)[unsure].any()
+    milder = confirm(views, sparse, replace(options, min_surface=0.1)).depth > 0
+    assert milder[2:-2][(unsure & (sparse[0] > 0))[2:-2]].all()
 
 
 GHOST = (slice(18, 30), slice(26, 38))

@@ -251,6 +251,7 @@ def arguments(function):
             "depth": np.ones((H, W), f32),
             "sigma": np.ones((H, W), f32),
             "min_consistent": 2,
+            "may_miss": 1,
             "max_contradiction": 0.5,
             "min_surface": 0.8,
             "steepest": 0.01,

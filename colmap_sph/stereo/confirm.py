@@ -38,9 +38,11 @@ class ConfirmOptions:
     min_contradicting_support: int = 2
     """Pairs that must agree on a view's photometric depth before it can look through another's. A view with fewer
     pairs contradicts no other."""
-    min_surface: float = 0.6
-    """Where one view alone confirms a depth, at least this share of the 7 x 7 pixels around it must be of the same
-    surface: what a single pair found in passing is rarely right."""
+    min_surface: float = 0.65
+    """Where one view alone confirms a depth, at least this share of the 5 x 5 pixels around it must be of the same
+    surface: what a single pair found in passing is rarely right. Where two do, half of it is enough. Where one
+    fewer confirms it than must, and none looks through it, half as many pixels may be off it: 0.6 becomes 0.8.
+    0: nothing is asked of the surface, and no view that must confirm is forgone."""
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds."""
@@ -61,10 +63,13 @@ class ConfirmOptions:
 # Points may project back farther away by so many row residuals, of so many pixels at most: what is more is wrong.
 _RESIDUALS = 2.0
 _MOST_RESIDUAL = 1.5
+# Views that must confirm a depth but need not where it is part of a surface that none looks through.
+_MAY_MISS = 1
 # Slope of the steepest surface that is looked for around a pixel, as depth over width.
-_STEEPEST = 4.0
+_STEEPEST = 2.0
 # A partner with depth on less of its image than this fits no other: if it is turned, mirrored or of another place,
-# its silence would let pass what any two images make of each other. So it counts as one that does not confirm.
+# its silence would let pass what any two images make of each other. So it counts as one that does not confirm, and
+# nobody's confirmation is forgone beside it.
 _LEAST_COVERED = 0.1
 
 
@@ -103,17 +108,21 @@ def confirm_depth(
     shifts = itertools.repeat(0.0) if residuals is None else residuals
     are_counted = stations is not None and residuals is not None
     numbered = zip(numbers, partners, shifts, strict=are_counted)
+    any_silence_counts = False
     for number, members in groupby(numbered, key=lambda member: member[0]):
         has_others = sizes[number] > 1
         station = _Sums.empty(estimate.depth.shape) if has_others else sums
         for _, (partner, partner_estimate), residual in members:
-            _compare(view, estimate, partner, partner_estimate, options, residual, station)
+            silence_counts = _fits_none(partner_estimate)
+            any_silence_counts |= silence_counts
+            _compare(view, estimate, partner, partner_estimate, options, residual, silence_counts, station)
         if has_others:
             _add_as_one(station, sums)
     _native.confirm_depth(
         estimate.depth,
         estimate.sigma,
         options.min_consistent,
+        0 if any_silence_counts else _MAY_MISS,
         options.max_contradiction,
         options.min_surface,
         _STEEPEST / view.K[0, 0],
@@ -138,6 +147,10 @@ class _Sums(NamedTuple):
         return cls(observing, agreeing, contradicting, weighted, weight)
 
 
+def _fits_none(estimate: DepthEstimate) -> bool:
+    return bool(np.count_nonzero(estimate.depth) < _LEAST_COVERED * estimate.depth.size)
+
+
 def _compare(
     view: View,
     estimate: DepthEstimate,
@@ -145,10 +158,10 @@ def _compare(
     partner_estimate: DepthEstimate,
     options: ConfirmOptions,
     residual: float,
+    silence_counts: bool,
     sums: _Sums,
 ) -> None:
     """Add what a partner says of every pixel."""
-    fits_none = bool(np.count_nonzero(partner_estimate.depth) < _LEAST_COVERED * partner_estimate.depth.size)
     _native.compare_depths(
         backend(),
         estimate.depth,
@@ -161,7 +174,7 @@ def _compare(
         options.max_reprojection_error + _RESIDUALS * min(residual * float(view.K[0, 0]), _MOST_RESIDUAL),
         options.tolerance,
         options.min_contradicting_support,
-        fits_none,
+        silence_counts,
         *sums,
     )
 

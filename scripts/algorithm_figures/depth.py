@@ -138,7 +138,7 @@ _REASONS = {
     "confirmed": "#d9e6d3",
     "too few partners agree": "#4477aa",
     "too many look through it": "#cc3311",
-    "one agrees, little surface around": "#ee9933",
+    "few agree, little surface around": "#ee9933",
     "no photometric depth": "#ffffff",
 }
 

@@ -2,19 +2,39 @@
 
 #include "depth/depth.h"
 
-/* Share of the window around a pixel, cut off at the image's borders, that is kept and lies on the pixel's
- * surface. */
-static float surface_share(const float *depth, const uint8_t *kept, ptrdiff_t height, ptrdiff_t width,
-                           ptrdiff_t row, ptrdiff_t column, const confirmation *options) {
-    const ptrdiff_t radius = SURFACE_RADIUS;
+/* What becomes of a pixel's depth: it is dropped; or dropped, but part of its neighbours' surfaces; or kept. */
+enum { DROPPED, OF_SURFACE, KEPT };
+
+/* What so many views confirm needs no surface around it. */
+enum { WELL_CONFIRMED = 3 };
+
+/* Depths of one surface differ by so many standard deviations. */
+static const float NOISE = 2;
+
+/* Least share of the window around a pixel that must lie on its surface, by how many agree of the views wanted. */
+static float least_surface(float min_surface, int agreeing, int wanted) {
+    return agreeing < wanted ? (1 + min_surface) / 2 : agreeing < 2 ? min_surface : min_surface / 2;
+}
+
+/* Views that must agree: as many as observe the pixel's point, but one at least. */
+static int wanted_views(const confirmation *options, int observing) {
+    const int seen = observing > 1 ? observing : 1;
+    return seen < options->min_consistent ? seen : options->min_consistent;
+}
+
+/* Share of the window around a pixel, cut off at the image's borders, that lies on the pixel's surface. */
+static float surface_share(const float *depth, const float *sigma, const uint8_t *fates, ptrdiff_t height,
+                           ptrdiff_t width, ptrdiff_t row, ptrdiff_t column, float steepest) {
+    const ptrdiff_t radius = SURFACE_RADIUS, p = row * width + column;
     const ptrdiff_t top = row > radius ? row - radius : 0, left = column > radius ? column - radius : 0;
     const ptrdiff_t bottom = row + radius < height ? row + radius : height - 1;
     const ptrdiff_t right = column + radius < width ? column + radius : width - 1;
-    const float own = depth[row * width + column], step = own * options->steepest * SURFACE_RADIUS;
+    const float step = depth[p] * steepest * SURFACE_RADIUS + NOISE * sigma[p];
     int count = 0;
     for (ptrdiff_t y = top; y <= bottom; y++) {
         for (ptrdiff_t x = left; x <= right; x++) {
-            count += kept[y * width + x] && fabsf(depth[y * width + x] - own) <= step;
+            const ptrdiff_t q = y * width + x;
+            count += fates[q] != DROPPED && fabsf(depth[q] - depth[p]) <= step;
         }
     }
     return (float)count / (float)((bottom - top + 1) * (right - left + 1));
@@ -23,12 +43,14 @@ static float surface_share(const float *depth, const uint8_t *kept, ptrdiff_t he
 void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                    const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
                    uint8_t *contradicting, float *weighted_depth, float *weight) {
-    uint8_t *kept = contradicting;
+    const int least = options->min_consistent > 0, may_miss = options->min_surface > 0 ? options->may_miss : 0;
+    uint8_t *fates = contradicting;
     for (ptrdiff_t p = 0; p < height * width; p++) {
-        const int seen = observing[p] > 1 ? observing[p] : 1;
-        const int enough = agreeing[p] >= (seen < options->min_consistent ? seen : options->min_consistent);
+        const int missing = wanted_views(options, observing[p]) - agreeing[p];
         const float most = options->max_contradiction * (float)agreeing[p];
-        kept[p] = depth[p] > 0 && enough && (float)contradicting[p] <= most;
+        const int fits = depth[p] > 0 && agreeing[p] >= least && (float)contradicting[p] <= most;
+        const int enough = missing <= (contradicting[p] > 0 ? 0 : may_miss);
+        fates[p] = fits ? enough ? KEPT : OF_SURFACE : DROPPED;
         const float own = 1 / (sigma[p] * sigma[p]);
         weighted_depth[p] = depth[p] + weighted_depth[p] / (weight[p] + own);
         weight[p] = 1 / __builtin_sqrtf(weight[p] + own);
@@ -36,11 +58,19 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
     for (ptrdiff_t row = 0; row < height; row++) {
         for (ptrdiff_t column = 0; column < width; column++) {
             const ptrdiff_t p = row * width + column;
-            if (!kept[p] || (agreeing[p] < 2 && surface_share(depth, kept, height, width, row, column, options) <
-                                                    options->min_surface)) {
-                weighted_depth[p] = weight[p] = 0;
-                agreeing[p] = 0;
+            if (fates[p] == KEPT && agreeing[p] < WELL_CONFIRMED) {
+                const int wanted = wanted_views(options, observing[p]);
+                const float share =
+                    surface_share(weighted_depth, weight, fates, height, width, row, column, options->steepest);
+                /* Either way it stays part of its neighbours' surfaces. */
+                fates[p] = share < least_surface(options->min_surface, agreeing[p], wanted) ? OF_SURFACE : KEPT;
             }
+        }
+    }
+    for (ptrdiff_t p = 0; p < height * width; p++) {
+        if (fates[p] != KEPT) {
+            weighted_depth[p] = weight[p] = 0;
+            agreeing[p] = 0;
         }
     }
 }

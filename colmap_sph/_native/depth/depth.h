@@ -136,10 +136,11 @@ add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add
 void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
                         float max_step, float *right);
 
-enum { SURFACE_RADIUS = 3 };
+enum { SURFACE_RADIUS = 2 };
 
 typedef struct {
     int min_consistent;      /* views that must agree, or all that see the point's place, one at least; 0: none */
+    int may_miss;            /* so many fewer are enough on a surface that none looks through */
     float max_contradiction; /* most that look through it, per agreeing view */
     float min_surface;       /* least share of the window that must be on the surface where one view agrees */
     float steepest;          /* largest relative change of depth per pixel there */

@@ -148,6 +148,7 @@ FUNCTION(compare_depths, COMPARE_DEPTHS, check_compare_depths,
     X(IN, float32, depth, H, W) \
     X(IN, float32, sigma, H, W) \
     X(VALUE, int, min_consistent) \
+    X(VALUE, int, may_miss) \
     X(VALUE, float, max_contradiction) \
     X(VALUE, float, min_surface) \
     X(VALUE, float, steepest) \
@@ -160,7 +161,8 @@ ARGUMENTS(confirm_depth, CONFIRM_DEPTH);
 
 static int run_confirm_depth(void *arguments) {
     const confirm_depth_arguments *a = arguments;
-    const confirmation options = {a->min_consistent, a->max_contradiction, a->min_surface, a->steepest};
+    const confirmation options = {a->min_consistent, a->may_miss, a->max_contradiction, a->min_surface,
+                                  a->steepest};
     confirm_depth(a->depth, a->sigma, a->size.H, a->size.W, &options, a->observing, a->agreeing, a->contradicting,
                   a->weighted_depth, a->weight);
     return 0;
