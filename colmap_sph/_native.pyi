@@ -25,26 +25,19 @@ def census(
     backend: str,
     padded: NDArray[np.int16],
     valid: NDArray[np.uint8],
+    fine: bool,
+    first: int,
     census: NDArray[np.uint64],
     /,
 ) -> None:
-    """Census words: a bit for each neighbour that is darker, bit 63 where a pixel is not valid.
+    """Census words, weighed if fine, from column `first` on; bit 63 where a pixel is not valid.
 
     backend : str
     padded : (H + 6, W + 8) int16
     valid : (H, W) uint8
-    census : (H, W) uint64, written
-    """
-
-def weigh_census(
-    census: NDArray[np.uint64],
-    weighed: NDArray[np.uint64],
-    /,
-) -> None:
-    """Census words in which near neighbours count twice, and the most distant ones not.
-
-    census : (H, W) uint64
-    weighed : (H, W) uint64, written
+    fine : bool
+    first : int
+    census : (H, TARGET_W) uint64, written
     """
 
 def matching_cost(
@@ -188,7 +181,7 @@ def warp(
     margin : int
     warped : (H, TARGET_W) float32, written
     warped_valid : (H, TARGET_W) uint8, written
-    columns : (H, TARGET_W) int32, written
+    columns : (H, MAP_W) int32, written
     """
 
 def unwarp_offsets(
@@ -890,18 +883,16 @@ def target_bases(
     """
 
 def join_targets(
-    warped: NDArray[np.uint64],
-    warped_columns: NDArray[np.int32],
-    source: NDArray[np.uint64],
+    warped_width: int,
+    source_width: int,
     census: NDArray[np.uint64],
     columns: NDArray[np.int32],
     /,
 ) -> None:
-    """Census of a warped image, a gap without content and the source as it is side by side; and their columns.
+    """In rows of a warped image, a gap and the source as it is: no content in the gap; the source's own columns.
 
-    warped : (H, W) uint64
-    warped_columns : (H, W) int32
-    source : (H, SOURCE_W) uint64
+    warped_width : int
+    source_width : int
     census : (H, TARGET_W) uint64, written
     columns : (H, TARGET_W) int32, written
     """

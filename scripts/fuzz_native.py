@@ -58,12 +58,9 @@ def size(rng: Random) -> tuple[int, int]:
 def census(rng: Random) -> Arguments:
     h, w = size(rng)
     padded = filled(rng, (h + 6, w + 8), np.int16)
-    return [backend(rng), padded, filled(rng, (h, w), np.uint8), np.zeros((h, w), np.uint64)]
-
-
-def weigh_census(rng: Random) -> Arguments:
-    shape = size(rng)
-    return [filled(rng, shape, np.uint64), np.zeros(shape, np.uint64)]
+    first, spare = rng.integers(0, 9, 2).tolist()
+    words = np.zeros((h, first + w + spare), np.uint64)
+    return [backend(rng), padded, filled(rng, (h, w), np.uint8), bool(rng.integers(2)), first, words]
 
 
 def matching_cost(rng: Random) -> Arguments:
@@ -221,8 +218,7 @@ def join_targets(rng: Random) -> Arguments:
     h, w = size(rng)
     source = int(rng.integers(0, 70))
     joined = (h, w + source + int(rng.integers(0, 40)))
-    inputs = [filled(rng, *each) for each in (((h, w), np.uint64), ((h, w), np.int32), ((h, source), np.uint64))]
-    return [*inputs, np.zeros(joined, np.uint64), np.zeros(joined, np.int32)]
+    return [w, source, np.zeros(joined, np.uint64), np.zeros(joined, np.int32)]
 
 
 def bases_about(rng: Random) -> Arguments:
@@ -486,7 +482,6 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
     function.__name__: function
     for function in (
         census,
-        weigh_census,
         matching_cost,
         aggregation,
         selection,

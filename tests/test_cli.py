@@ -267,6 +267,12 @@ def test_as_a_program(small: Path) -> None:
     assert "nowhere does not exist" in error_sentence(done.returncode, done.stderr)
 
 
+def test_what_few_commands_need_is_not_loaded_by_all() -> None:
+    program = "import sys, colmap_sph.app.cli; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)
+    assert not {"laspy", "pyproj", "scipy.interpolate", "scipy.optimize"} & {*loaded.stdout.split()}
+
+
 def test_a_reader_that_has_seen_enough() -> None:
     """The output's reader closes it at once, as `| head` does."""
     read, write = os.pipe()

@@ -72,9 +72,9 @@ def p2_table(rng, p1, least, most):
     return table
 
 
-def run_census(backend, padded, valid):
+def run_census(backend, padded, valid, *, fine=False):
     census = np.full(valid.shape, 7, dtype=np.uint64)
-    _native.census(backend, padded, valid, census)
+    _native.census(backend, padded, valid, fine, 0, census)
     return census
 
 
@@ -163,15 +163,31 @@ def test_census_leaves_out_half_a_grey_value(backend, centre, darker):
     np.testing.assert_array_equal(census, darker * 0b111111111)
 
 
+@every_backend
+@property_test
+@given(size=sizes, before=st.integers(0, 9), after=st.integers(0, 9), seed=seeds)
+def test_census_goes_into_some_columns_of_wider_rows(backend, size, before, after, seed):
+    rng = np.random.default_rng(seed)
+    padded = rng.integers(0, 9, (size[0] + 6, size[1] + 8)).astype(np.int16)
+    valid = rng.integers(0, 2, size).astype(np.uint8)
+    rows = np.full((size[0], before + size[1] + after), 7, dtype=np.uint64)
+    expected = rows.copy()
+    expected[:, before : before + size[1]] = oracle.census(padded, valid)
+    _native.census(backend, padded, valid, False, before, rows)
+    np.testing.assert_array_equal(rows, expected)
+
+
+@every_backend
 @property_test
 @given(size=sizes, invalid=shares, seed=seeds)
-def test_weighed_census_counts_near_neighbours_twice(size, invalid, seed):
+def test_fine_census_counts_near_neighbours_twice(backend, size, invalid, seed):
     """Of what differs: neighbours within two pixels twice, others within the root of 10 once; content always."""
     rng = np.random.default_rng(seed)
-    first, second = (words(rng, size, invalid) for _ in range(2))
-    weighed = np.zeros((2, *size), np.uint64)
-    for word, out in zip((first, second), weighed, strict=True):
-        _native.weigh_census(word, out)
+    images = [rng.integers(0, 200, (size[0] + 6, size[1] + 8)).astype(np.int16) for _ in range(2)]
+    contents = [(rng.random(size) >= invalid).astype(np.uint8) for _ in range(2)]
+    first, second = (oracle.census(*each) for each in zip(images, contents, strict=True))
+    weighed = [run_census(backend, *each, fine=True) for each in zip(images, contents, strict=True)]
+    differing = first ^ second
     neighbours = [(y, x) for y in range(-3, 4) for x in range(-4, 5) if (y, x) != (0, 0)]
     times = [2 if max(abs(y), abs(x)) <= 2 else int(y * y + x * x <= 10) for y, x in neighbours]
     assert sum(times) == 60

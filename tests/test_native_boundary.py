@@ -28,9 +28,10 @@ def arguments(function):
             "backend": "scalar",
             "padded": np.zeros((H + 6, W + 8), np.int16),
             "valid": np.ones((H, W), u8),
-            "out census": np.zeros((H, W), np.uint64),
+            "fine": True,
+            "first": 3,
+            "out census": np.zeros((H, W + 5), np.uint64),
         },
-        "weigh_census": {"census": np.zeros((H, W), np.uint64), "out weighed": np.zeros((H, W), np.uint64)},
         "matching_cost": {
             "backend": "scalar",
             **census_pair,
@@ -355,9 +356,8 @@ def offsets_arguments():
             "out target_base": ints(),
         },
         "join_targets": {
-            "warped": np.zeros((H, W), np.uint64),
-            "warped_columns": ints(),
-            "source": np.zeros((H, 50), np.uint64),
+            "warped_width": W,
+            "source_width": 50,
             "out census": np.zeros((H, W + 55), np.uint64),
             "out columns": np.zeros((H, W + 55), np.int32),
         },
@@ -486,7 +486,6 @@ FUNCTIONS = [
     "refine_planes",
     "source_pixels",
     "sharpen",
-    "weigh_census",
     *offsets_arguments(),
     *ties_arguments(),
 ]
@@ -507,7 +506,9 @@ OUTPUTS = [(function, name) for function, name in ARRAYS if name.startswith("out
 FREE = {
     ("matching_cost", "target"): {1},
     ("fit_offsets", "target"): {1},
+    ("census", "out census"): {1},
     ("warp", "prediction"): {1},
+    ("warp", "out columns"): {1},
     ("upsample_offsets", "out fine"): {0, 1},  # one less than twice as many will do, see below
     **{
         (function, name): {0, 1}
@@ -522,7 +523,6 @@ FREE = {
             ("fit_surfaces", "disparity"),
         )
     },
-    ("join_targets", "source"): {1},
     ("transfer_disparity", "left"): {1},
     ("transfer_disparity", "out right"): {1},
     ("depth_candidates", "disparity"): {0, 1},
@@ -806,6 +806,24 @@ def test_sources_of_impossible_width_are_refused(function, width, message):
         call(function, {**arguments(function), "source_width": width})
 
 
+@pytest.mark.parametrize("change", [{"first": -1}, {"first": 6}, {"out census": np.zeros((H, W + 2), np.uint64)}])
+def test_census_must_fit_into_the_rows(change):
+    with pytest.raises(ValueError, match="must fit"):
+        call("census", {**arguments("census"), **change})
+
+
+def test_columns_must_have_room_for_the_warped_image():
+    call("warp", {**arguments("warp"), "out columns": np.zeros((H, TARGET + 1), np.int32)})
+    with pytest.raises(ValueError, match="room"):
+        call("warp", {**arguments("warp"), "out columns": np.zeros((H, TARGET - 1), np.int32)})
+
+
+@pytest.mark.parametrize("change", [{"warped_width": -1}, {"warped_width": W + 6}, {"source_width": 56}])
+def test_targets_must_fit_beside_each_other(change):
+    with pytest.raises(ValueError, match="beside"):
+        call("join_targets", {**arguments("join_targets"), **change})
+
+
 @pytest.mark.parametrize("function", ["warp", "unwarp_offsets"])
 @pytest.mark.parametrize("margin", [-1, 65536, 2**31 - 1, -(2**31)])
 def test_margins_out_of_bounds_are_refused(function, margin):
@@ -1043,7 +1061,7 @@ def test_empty_images_are_no_work(backend, size, target_width):
     target = np.zeros((size[0], target_width), np.uint64)
     shown = np.zeros((size[0], target_width), np.int32), 9
     volume, sums = np.zeros((*size, 32), np.uint8), np.zeros((*size, 32), np.uint8)
-    _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.int16), image, words)
+    _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.int16), image, True, 0, words)
     _native.matching_cost(backend, words, target, base, volume)
     _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, volume.copy(), sums)
     offset = np.zeros(size, np.int32)

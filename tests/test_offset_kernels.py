@@ -133,7 +133,10 @@ def test_targets_lie_side_by_side(shape, source, gap, seed):
     columns = rng.integers(-1, 50, shape).astype(np.int32)
     census = np.empty((shape[0], shape[1] + gap + source), np.uint64)
     joined = np.empty(census.shape, np.int32)
-    _native.join_targets(warped, columns, own, census, joined)
+    census[:, : shape[1]] = warped
+    census[:, shape[1] + gap :] = own
+    joined[:, : shape[1]] = columns
+    _native.join_targets(shape[1], source, census, joined)
     nothing = np.full((shape[0], gap), 1 << 63, np.uint64)
     np.testing.assert_array_equal(census, np.hstack([warped, nothing, own]))
     own_columns = np.tile(np.arange(source), (shape[0], 1))

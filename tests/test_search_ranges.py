@@ -5,6 +5,7 @@ import pytest
 from scipy import ndimage
 
 from colmap_sph.errors import RectificationError
+from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.disparity_range import columns_with_counterparts, few_digits, parallax_range
 from colmap_sph.stereo.search import prediction as prediction_module
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
@@ -14,6 +15,7 @@ from colmap_sph.stereo.search.prediction import (
     from_coarser,
     from_seeds,
     is_flat,
+    near_matches,
     searched_depth,
 )
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, STEP, num_levels, range_depth
@@ -297,3 +299,20 @@ def test_without_warping_windows_stay_in_the_whole_range() -> None:
 def test_without_warping_or_any_match_the_middle_is_searched() -> None:
     offset = np.full((5, 5), INVALID, np.int32)
     assert (middles(offset, (10, 9), 32, 10, 90, 4) == 34).all()
+
+
+@pytest.mark.parametrize(("shape", "found"), [((80, 120), (20, 31)), ((79, 119), (0, 59)), ((79, 120), (39, 0))])
+def test_what_is_far_from_all_coarser_matches_is_left_out(shape: tuple[int, int], found: tuple[int, int]) -> None:
+    offset = np.full((40, 60), INVALID, np.int32)
+    offset[found] = 5 * SUBPIXEL
+    valid = np.where(np.arange(shape[1]) % 7 == 0, 0, 255) * np.ones((shape[0], 1))
+    image = RectifiedImage(np.zeros(shape, np.float32), valid.astype(np.uint8))
+    near = near_matches(image, offset).valid
+    rows, columns = (np.arange(side) // 2 for side in shape)
+    distance = np.maximum(abs(rows - found[0])[:, None], abs(columns - found[1]))
+    np.testing.assert_array_equal(near, np.where(distance <= 8, image.valid, 0))
+
+
+def test_where_nothing_was_found_nothing_is_matched() -> None:
+    image = RectifiedImage(np.zeros((80, 120), np.float32), np.full((80, 120), 255, np.uint8))
+    assert not near_matches(image, np.full((40, 60), INVALID, np.int32)).valid.any()

@@ -6,12 +6,9 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from colmap_sph.errors import OptionError, OutputError
-from colmap_sph.products.clouds.copc import write_copc
-from colmap_sph.products.clouds.las import write_las
-from colmap_sph.products.clouds.las_points import Extent, extent_of
 from colmap_sph.products.clouds.source import Cloud, open_cloud
 from colmap_sph.products.clouds.spread import DepthSpread
 from colmap_sph.products.clouds.thinning import ThinCloud, thinned
@@ -25,6 +22,9 @@ from colmap_sph.products.scenes.splats import write_splats
 from colmap_sph.project.claim import check_ways_out
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.workspace import Workspace
+
+if TYPE_CHECKING:
+    from colmap_sph.products.clouds.las_points import Extent
 
 ExportFormat = Literal["las", "laz", "copc", "exr", "png", "npz", "nerfstudio", "splats", "mvsnet"]
 
@@ -72,8 +72,11 @@ class Exporter:
         return replace(cloud, measure=spread.of) if cloud.has_images and spread.has_maps else cloud
 
     @cached_property
-    def extent(self) -> Extent:
+    def extent(self) -> "Extent":
         """Of the cloud, on the map."""
+        # Here and below not before: laspy takes its time to load, and every command knows this module.
+        from colmap_sph.products.clouds.las_points import extent_of
+
         return extent_of(self.cloud, self.georeference)
 
     @cached_property
@@ -88,10 +91,14 @@ class Exporter:
 
     def las(self, path: Path) -> None:
         """The cloud as LAS or LAZ."""
+        from colmap_sph.products.clouds.las import write_las
+
         write_las(self.cloud, self.extent, self.georeference, path, scale=self.options.las_scale)
 
     def copc(self, path: Path) -> None:
         """The cloud as COPC."""
+        from colmap_sph.products.clouds.copc import write_copc
+
         write_copc(self.cloud, self.extent, self.georeference, path, scale=self.options.las_scale)
 
     def exr(self, path: Path) -> None:

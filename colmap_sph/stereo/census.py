@@ -52,14 +52,14 @@ def census(image: RectifiedImage, *, fine: bool = False) -> NDArray[np.uint64]:
 
     Of a `fine` image, neighbours within 5 x 5 pixels have two bits, and distant ones none.
     """
+    words = np.empty(image.image.shape, dtype=np.uint64)
+    put_census(image, words, fine=fine)
+    return words
+
+
+def put_census(image: RectifiedImage, words: NDArray[np.uint64], first: int = 0, *, fine: bool = False) -> None:
+    """Set `words`, from their column `first` on, to the census of an image; see `census`."""
     height, width = image.image.shape
     padded = np.empty((height + 2 * _BORDER[0], width + 2 * _BORDER[1]), dtype=np.int16)
     _native.sharpen(backend(), np.ascontiguousarray(image.image), _SHARPENING, padded)
-    words = np.empty(image.image.shape, dtype=np.uint64)
-    _native.census(backend(), padded, np.ascontiguousarray(image.valid), words)
-    if not fine:
-        return words
-    del padded
-    weighed = np.empty_like(words)
-    _native.weigh_census(words, weighed)
-    return weighed
+    _native.census(backend(), padded, np.ascontiguousarray(image.valid), fine, first, words)

@@ -23,6 +23,7 @@ from colmap_sph.stereo.search.prediction import (
     Prediction,
     from_coarser,
     from_seeds,
+    near_matches,
     searched_depth,
 )
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
@@ -231,6 +232,7 @@ def match_pair(
             prediction = from_seeds(seeds, shape, level, low, high)
         else:
             prediction = from_coarser(offset, prediction, shape, depth, options.range_radius, (low, high))
+            lefts[-1] = near_matches(lefts[-1], offset)
         unseeded: Matches | None = None
         if offset is None and level > 0 and seeds is not None and len(seeds):
             whole_range = from_seeds(None, shape, level, low, high)

@@ -138,8 +138,11 @@ static void run_census(const kernel_table *k, image_size size) {
     FILL(int16_t, padded, padded_size, seldom(3) ? greys[between(0, 7)] : between(0, 16320))
     FILL(uint8_t, valid, PIXELS, !seldom(9))
     MAKE(uint64_t, census, PIXELS);
-    EACH_TIME k->census(padded, valid, size.height, size.width, census);
-    HASH(census, PIXELS);
+    const census_image image = {padded, valid, size.height, size.width};
+    for (int fine = 0; fine < 2; fine++) {
+        EACH_TIME k->census(image, fine, size.width, census);
+        HASH(census, PIXELS);
+    }
 }
 
 static void run_cost(const kernel_table *k, image_size size) {

@@ -2,35 +2,45 @@
 #ifndef COLMAP_SPH_CENSUS_BLOCKS_H
 #define COLMAP_SPH_CENSUS_BLOCKS_H
 
-#include "matching/matching.h"
+#include "matching/weighed_census.h"
 
 /* Words of the pixels of a block, whose first one's window begins at `window`. */
 typedef void census_block_fn(const int16_t *window, ptrdiff_t stride, uint64_t *words);
 
+ALWAYS_INLINE void finish_row(const uint8_t *restrict valid, ptrdiff_t width, int fine, uint64_t *restrict row) {
+    for (ptrdiff_t x = 0; x < width; x++) {
+        const uint64_t word = fine ? weighed_census(row[x]) : row[x];
+        row[x] = valid[x] ? word : CENSUS_INVALID;
+    }
+}
+
 /* `lanes` is the number of pixels in a block. */
-ALWAYS_INLINE void census_in_blocks(census_block_fn *block, ptrdiff_t lanes, const int16_t *padded,
-                                    const uint8_t *valid, ptrdiff_t height, ptrdiff_t width, uint64_t *census) {
-    if (width < lanes) {
-        census_scalar(padded, valid, height, width, census);
+ALWAYS_INLINE void census_in_blocks(census_block_fn *block, ptrdiff_t lanes, census_image image, int fine,
+                                    ptrdiff_t stride, uint64_t *census) {
+    if (image.width < lanes) {
+        census_scalar(image, fine, stride, census);
         return;
     }
-    const ptrdiff_t stride = width + 2 * CENSUS_RADIUS_X;
-    for (ptrdiff_t y = 0; y < height; y++) {
-        uint64_t *row = census + y * width;
+    const ptrdiff_t width = image.width, padded_stride = width + 2 * CENSUS_RADIUS_X;
+    for (ptrdiff_t y = 0; y < image.height; y++) {
+        const uint8_t *valid = image.valid + y * width;
+        uint64_t *row = census + y * stride;
         for (ptrdiff_t x = 0; x < width; x += lanes) {
             /* The last block overlaps the one before it. */
             const ptrdiff_t start = x + lanes <= width ? x : width - lanes;
             uint8_t any = 0;
             for (ptrdiff_t i = 0; i < lanes; i++) {
-                any |= valid[y * width + start + i];
+                any |= valid[start + i];
             }
             if (!any) {
                 continue;
             }
-            block(padded + y * stride + start, stride, row + start);
+            block(image.padded + y * padded_stride + start, padded_stride, row + start);
         }
-        for (ptrdiff_t x = 0; x < width; x++) {
-            row[x] = valid[y * width + x] ? row[x] : CENSUS_INVALID;
+        if (fine) {
+            finish_row(valid, width, 1, row);
+        } else {
+            finish_row(valid, width, 0, row);
         }
     }
 }

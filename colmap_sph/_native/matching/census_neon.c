@@ -33,7 +33,6 @@ static inline void census_8_pixels(const int16_t *window, ptrdiff_t stride, uint
     vst4q_u16((uint16_t *)(void *)words, parts);
 }
 
-void census_neon(const int16_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
-                 uint64_t *census) {
-    census_in_blocks(census_8_pixels, LANES, padded, valid, height, width, census);
+void census_neon(census_image image, int fine, ptrdiff_t stride, uint64_t *census) {
+    census_in_blocks(census_8_pixels, LANES, image, fine, stride, census);
 }

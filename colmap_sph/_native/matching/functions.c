@@ -64,31 +64,26 @@ static match_size warped_size_of(const sizes *size, int source_width) {
     X(VALUE, backend, backend) \
     X(IN, int16, padded, H + 6, W + 8) \
     X(IN, uint8, valid, H, W) \
-    X(OUT, uint64, census, H, W)
+    X(VALUE, flag, fine) \
+    X(VALUE, ptrdiff, first) \
+    X(OUT, uint64, census, H, TARGET_W)
 ARGUMENTS(census, CENSUS);
+
+static int check_census(const void *arguments) {
+    const census_arguments *a = arguments;
+    return check(a->first >= 0 && a->first <= a->size.TARGET_W - a->size.W,
+                 "the words must fit into the rows from the first column on");
+}
 
 static int run_census(void *arguments) {
     const census_arguments *a = arguments;
-    a->backend->census(a->padded, a->valid, a->size.H, a->size.W, a->census);
+    const census_image image = {a->padded, a->valid, a->size.H, a->size.W};
+    a->backend->census(image, a->fine, a->size.TARGET_W, a->census + a->first);
     return 0;
 }
 
-FUNCTION(census, CENSUS, any,
-         "Census words: a bit for each neighbour that is darker, bit 63 where a pixel is not valid.");
-
-#define WEIGH_CENSUS(X) \
-    X(IN, uint64, census, H, W) \
-    X(OUT, uint64, weighed, H, W)
-ARGUMENTS(weigh_census, WEIGH_CENSUS);
-
-static int run_weigh_census(void *arguments) {
-    const weigh_census_arguments *a = arguments;
-    weigh_census(a->census, a->size.H * a->size.W, a->weighed);
-    return 0;
-}
-
-FUNCTION(weigh_census, WEIGH_CENSUS, any,
-         "Census words in which near neighbours count twice, and the most distant ones not.");
+FUNCTION(census, CENSUS, check_census,
+         "Census words, weighed if fine, from column `first` on; bit 63 where a pixel is not valid.");
 
 #define MATCHING_COST(X) \
     X(VALUE, backend, backend) \
@@ -240,19 +235,21 @@ FUNCTION(fit_offsets, FIT_OFFSETS, check_fit_offsets,
     X(VALUE, int, margin) \
     X(OUT, float32, warped, H, TARGET_W) \
     X(OUT, uint8, warped_valid, H, TARGET_W) \
-    X(OUT, int32, columns, H, TARGET_W)
+    X(OUT, int32, columns, H, MAP_W)
 ARGUMENTS(warp, WARP);
 
 static int check_warp(const void *arguments) {
     const warp_arguments *a = arguments;
     return check_widths(&a->size) && check_width(a->size.SOURCE_W) && check_margin(a->margin) &&
-           check(a->size.W > 0 || a->size.H == 0, "without a reference column nothing is predicted");
+           check(a->size.W > 0 || a->size.H == 0, "without a reference column nothing is predicted") &&
+           check(a->size.MAP_W >= a->size.TARGET_W, "the columns must have room for those of the warped image");
 }
 
 static int run_warp(void *arguments) {
     const warp_arguments *a = arguments;
     const match_size size = {a->size.H, a->size.W, a->size.TARGET_W, 0, a->size.SOURCE_W};
-    warp(a->source, a->valid, a->prediction, a->margin, size, a->warped, a->warped_valid, a->columns);
+    warp(a->source, a->valid, a->prediction, a->margin, size, a->warped, a->warped_valid, a->size.MAP_W,
+         a->columns);
     return 0;
 }
 
@@ -371,10 +368,16 @@ static int run_to_disparity(void *arguments) {
 FUNCTION(to_disparity, TO_DISPARITY, any,
          "Disparities, pixels, of offsets, less the shift of their fraction; NaN where there is no offset.");
 
-native_function *const matching_functions[] = {&census_function,           &weigh_census_function,
-                                               &matching_cost_function,    &aggregation_function,
-                                               &selection_function,        &match_function,
-                                               &fit_offsets_function,      &warp_function,
-                                               &unwarp_offsets_function,   &mean_offsets_function,
-                                               &upsample_offsets_function, &search_windows_function,
-                                               &to_disparity_function,     NULL};
+native_function *const matching_functions[] = {&census_function,
+                                               &matching_cost_function,
+                                               &aggregation_function,
+                                               &selection_function,
+                                               &match_function,
+                                               &fit_offsets_function,
+                                               &warp_function,
+                                               &unwarp_offsets_function,
+                                               &mean_offsets_function,
+                                               &upsample_offsets_function,
+                                               &search_windows_function,
+                                               &to_disparity_function,
+                                               NULL};

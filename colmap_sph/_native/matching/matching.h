@@ -38,10 +38,16 @@ typedef struct {
     ptrdiff_t source_width;
 } match_size;
 
-/* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}; bit set where the neighbour is darker by more than
- * CENSUS_MARGIN. */
-typedef void census_fn(const int16_t *padded, const uint8_t *valid, ptrdiff_t height, ptrdiff_t width,
-                       uint64_t *census);
+/* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}. */
+typedef struct {
+    const int16_t *padded;
+    const uint8_t *valid;
+    ptrdiff_t height, width;
+} census_image;
+
+/* Bit set where the neighbour is darker by more than CENSUS_MARGIN; words of a `fine` image are weighed, see
+ * weighed_census.h. Rows of `census` begin `stride` words apart. */
+typedef void census_fn(census_image image, int fine, ptrdiff_t stride, uint64_t *census);
 
 typedef int cost_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
                     uint8_t *cost);
@@ -90,16 +96,12 @@ typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint8_t *scr
 typedef int fit_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,
                            match_size size, int32_t *fitted);
 
-/* Census words in which the neighbours within 5 x 5 pixels count twice, the 12 next ones once and others not: 60
- * bits. */
-void weigh_census(const uint64_t *census, ptrdiff_t pixels, uint64_t *weighed);
-
 /* A source image as the reference is expected to see it: target pixel w shows what lies `prediction` (1/256 pixel)
  * from reference column w - margin; beyond the reference's sides the outermost predictions count, and beyond those
- * of the source its outermost pixels. `columns` are the nearest ones of the source, -1 outside. Content is what
- * lies in one of them and is made of content alone. */
+ * of the source its outermost pixels. `columns` are the nearest ones of the source, -1 outside; their rows begin
+ * `stride` apart. Content is what lies in one of them and is made of content alone. */
 void warp(const float *source, const uint8_t *valid, const int32_t *prediction, ptrdiff_t margin, match_size size,
-          float *warped, uint8_t *warped_valid, int32_t *columns);
+          float *warped, uint8_t *warped_valid, ptrdiff_t stride, int32_t *columns);
 
 /* From offsets to pixels of the target, as above, to offsets to the source. */
 void unwarp_offsets(const int32_t *offset, const int32_t *prediction, ptrdiff_t margin, match_size size,

@@ -2,7 +2,7 @@
 #include "matching/matching.h"
 
 void warp(const float *source, const uint8_t *valid, const int32_t *prediction, ptrdiff_t margin, match_size size,
-          float *warped, uint8_t *warped_valid, int32_t *columns) {
+          float *warped, uint8_t *warped_valid, ptrdiff_t stride, int32_t *columns) {
     for (ptrdiff_t y = 0; y < size.height; y++) {
         const ptrdiff_t out = y * size.target_width;
         const float *row = source + y * size.source_width;
@@ -12,7 +12,7 @@ void warp(const float *source, const uint8_t *valid, const int32_t *prediction, 
                 (int64_t)(w - margin) * 256 + prediction[y * size.width + within(w - margin, size.width)];
             const int64_t nearest = (place + 128) >> 8;
             const int inside = nearest >= 0 && nearest < size.source_width;
-            columns[out + w] = inside ? (int32_t)nearest : -1;
+            columns[y * stride + w] = inside ? (int32_t)nearest : -1;
             if (size.source_width == 0) {
                 warped[out + w] = 0;
                 warped_valid[out + w] = 0;

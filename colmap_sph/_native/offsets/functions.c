@@ -118,31 +118,29 @@ FUNCTION(target_bases, TARGET_BASES, check_target_bases,
          "First columns of the target to search, less the pixel's own; torn pixels search the source as it is.");
 
 #define JOIN_TARGETS(X) \
-    X(IN, uint64, warped, H, W) \
-    X(IN, int32, warped_columns, H, W) \
-    X(IN, uint64, source, H, SOURCE_W) \
+    X(VALUE, ptrdiff, warped_width) \
+    X(VALUE, ptrdiff, source_width) \
     X(OUT, uint64, census, H, TARGET_W) \
     X(OUT, int32, columns, H, TARGET_W)
 ARGUMENTS(join_targets, JOIN_TARGETS);
 
 static int check_join_targets(const void *arguments) {
     const join_targets_arguments *a = arguments;
-    return check(a->size.SOURCE_W <= 65535, "rows are limited to 65535 columns") &&
-           check(a->size.TARGET_W - a->size.SOURCE_W >= a->size.W, "both images must fit beside each other");
+    return check(a->source_width >= 0 && a->source_width <= 65535, "rows are limited to 65535 columns") &&
+           check(a->warped_width >= 0 && a->warped_width <= a->size.TARGET_W - a->source_width,
+                 "both images must fit beside each other");
 }
 
 static int run_join_targets(void *arguments) {
     const join_targets_arguments *a = arguments;
-    const ptrdiff_t gap = a->size.TARGET_W - a->size.SOURCE_W - a->size.W;
-    const target_parts parts = {a->warped, a->source, a->warped_columns, a->size.H,
-                                a->size.W, gap,       a->size.SOURCE_W};
-    join_targets(parts, a->census, a->columns);
+    const joined_sizes sizes = {a->size.H, a->size.TARGET_W, a->warped_width, a->source_width};
+    join_targets(sizes, a->census, a->columns);
     return 0;
 }
 
 FUNCTION(
     join_targets, JOIN_TARGETS, check_join_targets,
-    "Census of a warped image, a gap without content and the source as it is side by side; and their columns.");
+    "In rows of a warped image, a gap and the source as it is: no content in the gap; the source's own columns.");
 
 #define BASES_ABOUT(X) \
     X(OUT, int32, offset, H, W) \

@@ -36,15 +36,13 @@ void first_offsets(search_bases bases, int32_t *first);
  * before the first column of the source. */
 void target_bases(search_bases bases, int margin, int as_it_is, int gap, int32_t *target_base);
 
-/* Images side by side: warped ones, `gap` columns without content, and the source as it is, whose pixels show
- * their own columns. */
+/* Rows of a target in which a warped image is followed, after a gap, by its source as it is. */
 typedef struct {
-    const uint64_t *warped, *source; /* census */
-    const int32_t *columns;          /* of the source, that the warped ones show */
-    ptrdiff_t height, warped_width, gap, source_width;
-} target_parts;
+    ptrdiff_t height, width, warped_width, source_width;
+} joined_sizes;
 
-void join_targets(target_parts parts, uint64_t *census, int32_t *columns);
+/* The gap has no content, and the source's pixels show their own columns. */
+void join_targets(joined_sizes sizes, uint64_t *census, int32_t *columns);
 
 /* Offsets, 1/256 pixel, become the first of `depth` whole offsets about them, between `first` and `last`. */
 void bases_about(int32_t *offset, ptrdiff_t pixels, int depth, int32_t first, int32_t last);

@@ -51,21 +51,15 @@ void target_bases(search_bases bases, int margin, int as_it_is, int gap, int32_t
     }
 }
 
-void join_targets(target_parts parts, uint64_t *census, int32_t *columns) {
-    const ptrdiff_t warped = parts.warped_width, source = parts.source_width;
-    for (ptrdiff_t y = 0; y < parts.height; y++) {
-        memcpy(census, parts.warped + y * warped, (size_t)warped * sizeof *census);
-        memcpy(columns, parts.columns + y * warped, (size_t)warped * sizeof *columns);
-        census += warped;
-        columns += warped;
-        for (ptrdiff_t x = 0; x < parts.gap; x++) {
-            *census++ = CENSUS_INVALID;
-            *columns++ = -1;
+void join_targets(joined_sizes sizes, uint64_t *census, int32_t *columns) {
+    const ptrdiff_t source = sizes.width - sizes.source_width;
+    for (ptrdiff_t y = 0; y < sizes.height; y++, census += sizes.width, columns += sizes.width) {
+        for (ptrdiff_t x = sizes.warped_width; x < source; x++) {
+            census[x] = CENSUS_INVALID;
+            columns[x] = -1;
         }
-        memcpy(census, parts.source + y * source, (size_t)source * sizeof *census);
-        census += source;
-        for (int32_t x = 0; x < (int32_t)source; x++) {
-            *columns++ = x;
+        for (int32_t x = 0; x < (int32_t)sizes.source_width; x++) {
+            columns[source + x] = x;
         }
     }
 }

@@ -6,11 +6,14 @@ sensor that is not flat) is small and smooth: here it is a bicubic B-spline of r
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
 from scipy.sparse import csr_array
+
+if TYPE_CHECKING:
+    from scipy.interpolate import RectBivariateSpline
 
 Float = NDArray[np.float64]
 
@@ -94,8 +97,11 @@ class LensField:
         return bool(max(float(step.max()) for step in steps) < _STEEPEST)
 
     @cached_property
-    def _inverse(self) -> list[RectBivariateSpline]:
+    def _inverse(self) -> "list[RectBivariateSpline]":
         """Displacements from true rays to those of the camera model, x and y."""
+        # Not before: it takes its time to load, and few runs have a field.
+        from scipy.interpolate import RectBivariateSpline
+
         rays = self.nodes(_NODES)
         there = (self.bent(rays) - rays).reshape(_NODES, _NODES, 2)
         x, y = (np.linspace(self.low[axis], self.high[axis], _NODES) for axis in (0, 1))

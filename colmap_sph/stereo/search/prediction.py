@@ -8,13 +8,14 @@ windows that are compared show the same. Offsets are those of `offsets`; *residu
 predicted ones by.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
+from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.search.offsets import INVALID, MEDIAN_SIDE, SUBPIXEL
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, range_depth
@@ -38,6 +39,9 @@ _FLAT_SHARE = 0.1
 # them as a window reaches.
 _TEAR = 3
 _TORN_RADIUS = 4
+# What the level above found nothing near, within so many of its pixels, is not matched: out of the other image's
+# view, or occluded, it hardly ever finds anything.
+_REACH = 8
 # Steps to which what is interpolated between sparse points is rounded, so that its last bits do not count.
 _SEED_STEPS = 16
 
@@ -211,6 +215,26 @@ def torn_by(predicted: NDArray[np.int32]) -> NDArray[np.bool_]:
     steps = np.empty(predicted.shape, dtype=np.uint8)
     _native.mark_steps(predicted, _TEAR * SUBPIXEL, steps)
     return np.asarray(cv2.dilate(steps, np.ones((2 * _TORN_RADIUS + 1,) * 2, dtype=np.uint8))).view(np.bool_)
+
+
+def near_matches(image: RectifiedImage, offset: NDArray[np.int32]) -> RectifiedImage:
+    """The left image of a level without what is far from all that the level above found.
+
+    Parameters
+    ----------
+    image : RectifiedImage
+        (H, W).
+    offset : (h, w) int32 ndarray
+        Of the coarser level, see `from_coarser`.
+
+    Returns
+    -------
+    RectifiedImage
+    """
+    near = cv2.dilate((offset != INVALID).view(np.uint8), np.ones((2 * _REACH + 1,) * 2, dtype=np.uint8))
+    height, width = image.valid.shape
+    finer = cv2.resize(near, None, fx=2, fy=2, interpolation=cv2.INTER_NEAREST)[:height, :width]
+    return replace(image, valid=np.asarray(cv2.multiply(image.valid, finer), dtype=np.uint8))
 
 
 def searched_depth(low: int, high: int, most: int) -> int:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
-from colmap_sph.stereo.census import RectifiedImage, census
+from colmap_sph.stereo.census import RectifiedImage, census, put_census
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
 from colmap_sph.stereo.search.prediction import Prediction
@@ -160,29 +160,29 @@ def make_target(
         own_columns = np.broadcast_to(np.arange(right_width, dtype=np.int32), (height, right_width))
         columns = np.ascontiguousarray(own_columns)
         return Target(census(right, fine=fine), columns, prediction.base, right_width, 0, prediction)
-    warped, columns = _warped(right, prediction)
-    words = census(warped, fine=fine)
-    del warped
+    warped_width = prediction.offset.shape[1] + 2 * prediction.margin
     if prediction.torn is None:
+        words, columns = TargetRoom().arrays(height, warped_width)
+        put_census(_warped(right, prediction, columns), words, fine=fine)
         base = prediction.base + np.int32(prediction.margin)
-        return Target(words, columns, base, right_width, words.shape[1], prediction)
+        return Target(words, columns, base, right_width, warped_width, prediction)
     # Windows of torn pixels that begin left of the right image must not reach what lies before it here.
     gap = prediction.depth
-    as_it_is = words.shape[1] + gap
-    both, both_columns = (room or TargetRoom()).arrays(height, as_it_is + right_width)
-    _native.join_targets(words, columns, census(right, fine=fine), both, both_columns)
-    del words, columns
+    as_it_is = warped_width + gap
+    words, columns = (room or TargetRoom()).arrays(height, as_it_is + right_width)
+    put_census(_warped(right, prediction, columns), words, fine=fine)
+    _native.join_targets(warped_width, right_width, words, columns)
+    put_census(right, words, as_it_is, fine=fine)
     base = np.empty_like(prediction.base)
     _native.target_bases(prediction.base, prediction.torn_bytes, prediction.margin, as_it_is, gap, base)
-    return Target(both, both_columns, base, right_width, as_it_is, prediction)
+    return Target(words, columns, base, right_width, as_it_is, prediction)
 
 
-def _warped(right: RectifiedImage, prediction: Prediction) -> tuple[RectifiedImage, NDArray[np.int32]]:
-    """The right image as the left one is expected to see it, with a margin; and its columns in the right one."""
+def _warped(right: RectifiedImage, prediction: Prediction, columns: NDArray[np.int32]) -> RectifiedImage:
+    """The right image as the left one is expected to see it, with a margin; sets its columns in the right one."""
     height, width = prediction.offset.shape
     image = np.empty((height, width + 2 * prediction.margin), dtype=np.float32)
     valid = np.empty(image.shape, dtype=np.uint8)
-    columns = np.empty(image.shape, dtype=np.int32)
     _native.warp(
         np.ascontiguousarray(right.image),
         np.ascontiguousarray(right.valid),
@@ -192,4 +192,4 @@ def _warped(right: RectifiedImage, prediction: Prediction) -> tuple[RectifiedIma
         valid,
         columns,
     )
-    return RectifiedImage(image, valid), columns
+    return RectifiedImage(image, valid)
