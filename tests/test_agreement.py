@@ -111,14 +111,14 @@ def test_points_without_parallax_tell_nothing(exact):
 # ---- what is told of it ------------------------------------------------------------------------------------
 
 
-def reported(agreements):
+def reported(agreements, misplaced=0.0):
     """What the confirmation and the end of a run put into the report."""
     report = RunReport(
         agreement={name: found.share for name, found in agreements.items()},
         sparse_points=sum(agreements.values(), Agreement()),
     )
     report.overall_agreement = report.sparse_points.share
-    judge_agreement(report)
+    judge_agreement(report, misplaced=misplaced)
     return report
 
 
@@ -142,6 +142,15 @@ def test_hardly_any_agreement_is_no_result():
     assert "only 6.0% of the sparse points that the images observe have a depth, of which 83% agree" in few.doubts
     # Too few to tell.
     refuse_disagreement(reported({"a.jpg": Agreement(10, 5, 0)}))
+
+
+def test_depth_that_disagrees_with_a_model_that_disagrees_with_itself_is_no_result():
+    """Neither alone: a rig among people agrees with a third; observations of another size leave depth right."""
+    third = {f"{k}.jpg": Agreement(100, 80, 42) for k in range(5)}
+    with pytest.raises(NoResultError, match=r"do not project .* only 42\.0% of them agree"):
+        refuse_disagreement(reported(third, misplaced=0.9))
+    refuse_disagreement(reported(third, misplaced=0.4))
+    refuse_disagreement(reported({f"{k}.jpg": Agreement(100, 95, 90) for k in range(5)}, misplaced=1.0))
 
 
 def test_without_sparse_points_there_is_nothing_to_check(tmp_path, capsys):
@@ -240,10 +249,12 @@ def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):
     wrong.mkdir()
     model.write_binary(wrong)
     report = RunReport()
-    judge_reprojection(report, read_scene(wrong))
+    assert judge_reprojection(report, read_scene(wrong)) == 1
     assert all(name in report.doubts for name in FOUR_NAMES)
     sound = RunReport()
     scene = read_scene(project / "sparse/0")
     assert max(view.reprojection_error for view in scene.views) < 1
-    judge_reprojection(sound, scene)
+    assert judge_reprojection(sound, scene) == 0
     assert sound.doubts == ""
+    with pytest.raises(NoResultError, match="cameras or poses of the model are not those"):
+        colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)

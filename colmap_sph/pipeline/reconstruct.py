@@ -244,13 +244,13 @@ def reconstruct(
             pair_list=pair_list,
             needs_all=needs_all,
         )
-        judge_reprojection(report, context.scene)
+        misplaced = judge_reprojection(report, context.scene)
         if limit is None:
             progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
             go_through_stages(context, selection.unique_pairs(), executor, until=until)
         else:
             context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), executor)
-        judge_agreement(report)
+        judge_agreement(report, misplaced=misplaced)
     write_report(context, started)
     keep_or_make_page(context)
     refuse_disagreement(report)

@@ -17,6 +17,9 @@ logger = logging.getLogger(__name__)
 _DOUBTED_SHARE = 0.15
 # ... and all of them below this one.
 _REFUSED_SHARE = 0.1
+# Where points do not project to their observations in most images, sound depth would still agree with most points:
+# so it does where only the observations are of another size.
+_REFUSED_SHARE_OF_MISPLACED = 0.5
 # Where so large a share of the points with a depth agrees, and of all, little was matched, but what was is right.
 _RIGHT_SHARE_OF_FOUND = 0.5
 _LEAST_SHARE = 0.05
@@ -32,22 +35,27 @@ _IMPRECISE_PIXELS = 0.4
 _NAMED_WORST = 3
 
 
-def judge_agreement(report: RunReport) -> None:
+def judge_agreement(report: RunReport, *, misplaced: float) -> None:
     """Put into the report which images agree with few sparse points, or that hardly any image does.
 
     Parameters
     ----------
     report : RunReport
         With the agreement of its images.
+    misplaced : float
+        Share of the images in which sparse points do not project to their observations, see `judge_reprojection`.
     """
     total = report.sparse_points
+    least = _REFUSED_SHARE_OF_MISPLACED if misplaced > 0.5 else _REFUSED_SHARE
     shares = {name: share for name, share in report.agreement.items() if share is not None}
     doubted = {name: share for name, share in shares.items() if share < _DOUBTED_SHARE}
     if not total.tested:
         logger.info("There are no sparse points to check the depth maps against")
-    elif total.tested >= _FEWEST and total.agreeing < _REFUSED_SHARE * total.tested:
+    elif total.tested >= _FEWEST and total.agreeing < least * total.tested:
         is_right = total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found
-        if is_right and total.agreeing >= _LEAST_SHARE * total.tested:
+        if misplaced > 0.5:
+            report.refusal = _refusal_of_misplaced(total)
+        elif is_right and total.agreeing >= _LEAST_SHARE * total.tested:
             _doubt(report, _hardly_matched(total))
         else:
             report.refusal = _refusal(total)
@@ -55,7 +63,7 @@ def judge_agreement(report: RunReport) -> None:
         _doubt(report, _doubts(doubted))
 
 
-def judge_reprojection(report: RunReport, scene: Scene) -> None:
+def judge_reprojection(report: RunReport, scene: Scene) -> float:
     """Warn of images whose sparse points do not project to where the model says that they observe them.
 
     Parameters
@@ -63,6 +71,11 @@ def judge_reprojection(report: RunReport, scene: Scene) -> None:
     report : RunReport
         Gets the doubts.
     scene : Scene
+
+    Returns
+    -------
+    float
+        The share of such images, 0 to 1.
     """
     far = {
         view.name: view.reprojection_error
@@ -77,6 +90,7 @@ def judge_reprojection(report: RunReport, scene: Scene) -> None:
             "or the model's image coordinates are those of images of another size."
         )
         _doubt(report, words)
+    return len(far) / max(len(scene.views), 1)
 
 
 def judge_rows(report: RunReport, scene: Scene, residuals: Mapping[Pair, float | None]) -> None:
@@ -134,6 +148,15 @@ def _refusal(total: Agreement) -> str:
         "that observe them: these images do not belong to the poses and cameras of the model (exchanged, turned, "
         "mirrored, cropped, or of another model), or hardly anything could be matched; check --images. What was "
         "made is left on disk."
+    )
+
+
+def _refusal_of_misplaced(total: Agreement) -> str:
+    return (
+        "Sparse points do not project to where most images observe them, and only "
+        f"{total.agreeing / total.tested:.1%} of them agree with the depth maps: cameras or poses of the model "
+        "are not those that its points were made with. Give the model as the adjustment wrote it, with its cameras. "
+        "What was made is left on disk."
     )
 
 
