@@ -19,7 +19,8 @@ static float least_surface(float min_surface, int agreeing, int wanted) {
 /* Views that must agree: as many as observe the pixel's point, but one at least. */
 static int wanted_views(const confirmation *options, int observing) {
     const int seen = observing > 1 ? observing : 1;
-    return seen < options->min_consistent ? seen : options->min_consistent;
+    const int most = options->min_consistent > 0 ? options->min_consistent : 0;
+    return seen < most ? seen : most;
 }
 
 /* Share of the window around a pixel, cut off at the image's borders, that lies on the pixel's surface. */

@@ -133,8 +133,8 @@ static int check_join_targets(const void *arguments) {
 
 static int run_join_targets(void *arguments) {
     const join_targets_arguments *a = arguments;
-    const joined_sizes sizes = {a->size.H, a->size.TARGET_W, a->warped_width, a->source_width};
-    join_targets(sizes, a->census, a->columns);
+    const joined_sizes joined = {a->size.H, a->size.TARGET_W, a->warped_width, a->source_width};
+    join_targets(joined, a->census, a->columns);
     return 0;
 }
 

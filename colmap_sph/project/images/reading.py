@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, reason_of
+from colmap_sph.platforms.files import is_link
 from colmap_sph.project.images import jpeg
 from colmap_sph.project.images.decoding import is_jpeg, read_header, read_pixels
 from colmap_sph.project.images.depth import narrow_range, stretched
@@ -59,7 +60,7 @@ def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -
     """
     try:
         if not path.is_file():
-            if path.is_symlink() and not path.exists():
+            if is_link(path) and not path.exists():
                 return "is a link to a file that is missing"
             return "is not a regular file" if path.exists() else "is missing"
         header = read_header(path)
