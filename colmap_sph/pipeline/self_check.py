@@ -155,7 +155,7 @@ def _refusal_of_misplaced(total: Agreement) -> str:
     return (
         "Sparse points do not project to where most images observe them, and only "
         f"{total.agreeing / total.tested:.1%} of them agree with the depth maps: cameras or poses of the model "
-        "are not those that its points were made with. Give the model as the adjustment wrote it, with its cameras. "
+        "are not those that its points were made with. Give the model as it was adjusted, with its cameras. "
         "What was made is left on disk."
     )
 
