@@ -1,6 +1,6 @@
 """A dense workspace → its page ``colmap_sph/report.html``, one file that shows what came out and loads nothing."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
@@ -142,10 +142,9 @@ def gather(workspace: Workspace, progress: Progress, threads: int) -> Content:
     )
 
 
-def _in_threads(look: Callable[[Item], Fact], items: Iterable[Item], threads: int) -> Iterator[tuple[Item, Fact]]:
+def _in_threads(look: Callable[[Item], Fact], items: Sequence[Item], threads: int) -> Iterator[tuple[Item, Fact]]:
     """Items in their order, each with what a worker thread makes of it."""
     with ThreadPoolExecutor(threads) as pool:
-        items = list(items)
         try:
             yield from zip(items, pool.map(look, items), strict=True)
         finally:

@@ -32,6 +32,7 @@ def check_no_input(workspace: Workspace, folder: Path) -> None:
         workspace.tiles_dir,
         workspace.state_dir,
     )
+    real = real_path(folder)
     for place in inputs:
-        if real_path(folder).is_relative_to(real_path(place)):
+        if real.is_relative_to(real_path(place)):
             raise OutputError(f"{folder} lies in {place}, whose files are read; choose another --output.")
