@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from colmap_sph import run
 from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.census import RectifiedImage
@@ -490,6 +491,23 @@ def test_no_point_of_a_run_is_seen_by_one_photograph_alone(courtyard):
         place += 1 + count
         points += 1
     assert points > 3000
+
+
+def test_maps_of_a_run_have_no_fringes(courtyard):
+    """Beside no pixel of a surface, toward its edge, there is anything farther away."""
+    root, _ = courtyard
+    maps = sorted((root / "dense" / "stereo" / "depth_maps").rglob("*.geometric.bin"))
+    assert len(maps) > 10
+    for path in maps:
+        with np.errstate(divide="ignore"):
+            inverse = np.pad(1 / read_depth_map(path), 1, constant_values=np.inf)
+        own = inverse[1:-1, 1:-1]
+        for before, beyond in ((inverse[1:-1, :-2], inverse[1:-1, 2:]), (inverse[:-2, 1:-1], inverse[2:, 1:-1])):
+            for one, other in ((before, beyond), (beyond, before)):
+                known = np.isfinite(own) & np.isfinite(one) & np.isfinite(other)
+                with np.errstate(invalid="ignore"):
+                    ends = (own > 1.11 * other) & (own < 1.09 * one) & (own - other > 2.01 * (one - own))
+                assert not (known & ends).any()
 
 
 def test_what_cannot_be_on_a_plane_is_said(courtyard):
