@@ -18,7 +18,7 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
-from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
+from colmap_sph.stereo.refinement import RefinementOptions, refine_maps, suits_half_size
 
 OPTIONS = RefinementOptions()
 NAME = "F_0.jpg"
@@ -319,11 +319,11 @@ def rays(view):
     return np.stack([column, row, np.ones_like(row)], axis=-1) @ np.linalg.inv(view.K).T
 
 
-def disturbed(view, truth, normals, pixels, degrees, seed=0):
+def disturbed(view, truth, normals, pixels, degrees, seed=0, smoothness=2.0):
     """Exact maps with smooth errors of depth, in pixels on the ground, and turned normals."""
     rng = np.random.default_rng(seed)
     found = (truth > 0) & normals.any(axis=-1)
-    wave = cv2.GaussianBlur(rng.normal(0, 1, truth.shape), (0, 0), 2.0)
+    wave = cv2.GaussianBlur(rng.normal(0, 1, truth.shape), (0, 0), smoothness)
     sigma = np.where(found, pixels * truth / view.K[0, 0], 0).astype(np.float32)
     depth = np.where(found, truth + sigma * wave / wave.std(), 0).astype(np.float32)
     turned = normals + np.tan(np.radians(degrees)) * rng.normal(0, 0.7, normals.shape)
@@ -553,3 +553,80 @@ def test_a_run_refines_its_geometric_maps(block, finished, tmp_path):
 )
 def test_options_out_of_bounds_are_refused(name, value):
     assert_refused(replace(OPTIONS, **{name: value}), name)
+
+
+# ---- images of little detail -------------------------------------------------------------------------------
+
+
+def soft(image):
+    """An image that holds half of its pixels' detail: as if enlarged from half its size."""
+    return cv2.GaussianBlur(image, (0, 0), 1.6)
+
+
+@pytest.mark.parametrize("odd", [0, 1])
+def test_soft_images_are_matched_at_half_their_size(block, scene, monkeypatch, odd):
+    """In a quarter of the pixels; depth at full size comes nearer to the truth all the same."""
+    views, images = scene
+    matched = []
+    kernel = _native.add_patch_equations
+
+    def counted(backend, image, *given):
+        matched.append(image.shape)
+        kernel(backend, image, *given)
+
+    monkeypatch.setattr("colmap_sph.stereo.refinement._native.add_patch_equations", counted)
+    view = views.view(NAME).cropped(0, 0, views.view(NAME).width - odd, views.view(NAME).height - odd)
+    shape = (view.height, view.width)
+    truth, true_normals = (part[: shape[0], : shape[1]] for part in block.truth(NAME))
+    estimate, _ = disturbed(view, truth, true_normals, pixels=0.5, degrees=0, smoothness=6.0)
+    turned = true_normals + np.array([0.1, 0.1, 0])
+    turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
+    normals = np.where(estimate.depth[..., None] > 0, turned, 0).astype(np.float32)
+    sources = [(other, soft(images[other.name])) for other in views.views if other.name != NAME]
+    image = np.ascontiguousarray(soft(images[NAME])[: shape[0], : shape[1]])
+    refined, depth = refine_maps(
+        view, image, estimate, normals.copy(), estimate.depth.copy(), sources, OPTIONS, half_size=True
+    )
+    assert set(matched) == {(shape[0] // 2, shape[1] // 2)}
+    np.testing.assert_array_equal(depth > 0, estimate.depth > 0)
+    np.testing.assert_array_equal(refined.any(axis=-1), depth > 0)
+    for rows, columns in ((0, 0), (0, 1), (1, 0), (1, 1)):
+        part = (slice(rows, None, 2), slice(columns, None, 2))
+        found = depth[part] > 0
+        before, after = (np.abs(values - truth)[part][found] for values in (estimate.depth, depth))
+        assert np.median(after) < 0.8 * np.median(before)
+        before, after = (angle(values[part], true_normals[part])[found] for values in (normals, refined))
+        assert np.median(after) < 0.5 * np.median(before)
+
+
+@pytest.mark.parametrize(("size", "rows"), [((160, 63), 63), ((160, 120), 1)])
+def test_small_images_are_matched_as_they_are(size, rows):
+    """Where the image is small, or one of its partners, which has so many rows."""
+    block = syn.slanted_plane_pair(30.0, focal_length=300.0, size=size)
+    view, other = (
+        View(k, str(k), c.width, c.height, c.K, c.R, c.t, np.zeros(0, np.int64))
+        for k, c in enumerate((block.left, block.right))
+    )
+    truth, normals, _ = syn.exact_geometry(block.surfaces, block.left, origin=0.0)
+    depth = (truth * 1.002).astype(np.float32)
+    estimate = DepthEstimate(depth, (0.01 * depth).astype(np.float32), np.ones(truth.shape, np.uint8))
+    small = other.cropped(0, 0, other.width, rows)
+    sources = [(one, texture((one.height, one.width), 1)) for one in (other, small)]
+    options = replace(OPTIONS, min_score=-0.9)
+    given = (view, texture(truth.shape, 2), estimate)
+    results = [
+        refine_maps(*given, normals.astype(np.float32), depth.copy(), sources, options, half_size=half_size)
+        for half_size in (False, True)
+    ]
+    assert (results[0][1] != depth).any()
+    for one, same in zip(*results, strict=True):
+        np.testing.assert_array_equal(one, same)
+
+
+@pytest.mark.parametrize(
+    ("detail", "pixels", "half_size"),
+    [(0.5, 0.2, True), (0.25, 1.0, True), (0.51, 1.0, False), (0.3, 0.19, False)],
+)
+def test_soft_images_with_imprecise_poses_are_matched_at_half_size(detail, pixels, half_size):
+    assert suits_half_size(detail, pixels) == half_size
+    assert OPTIONS.images_used(9, half_size=half_size) == (9 / 4 if half_size else 9)

@@ -191,17 +191,19 @@ class Keys:
         stations: Sequence[int],
         residuals: Sequence[float],
         sights: SparseSights,
+        half_size: bool,
         cut: Sequence[object] = (),
     ) -> str:
         """Of the geometric maps of a view, from its own vote and its partners' votes, stations and row residuals.
 
-        `cut` says where they are cut off. The sparse points have a part in what is known of the maps.
+        `cut` says where they are cut off, and `half_size` how they are refined. The sparse points have a part in
+        what is known of the maps.
         """
         # The votes' keys stand for the images of the view and its partners, which are looked at, too, and for
         # whether blank pixels are kept.
         options = (self._options.confirm, self._options.normals, self._options.refinement, *self._depths)
         options += tuple(cut)
-        return self._key("geometric", vote, partner_votes, stations, residuals, sights, *options)
+        return self._key("geometric", vote, partner_votes, stations, residuals, sights, half_size, *options)
 
     def range_map(self, maps: Sequence[str], cuts: Sequence[object]) -> str:
         """Of the range map of a wide image, from the keys of its views' geometric maps and how they were cut."""

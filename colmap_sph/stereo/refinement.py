@@ -30,6 +30,10 @@ _FEW_PARTNERS = 3
 _ELSEWHERE = 1e-6
 # Standard deviation of a match on a smooth surface, pixels.
 _MATCH_SIGMA = 0.2
+# Images that hold no more detail than those of half their size may be matched at that size. Windows are as large
+# as four there, so that planes have less in common with the maps of others where they are as free.
+_HALF_DETAIL = 0.5
+_HALF_FREEDOM = 0.6
 # Arrays of equations, and sources of one call; see `depth.h`.
 _EQUATIONS = 12
 _SOURCES = 32
@@ -89,10 +93,23 @@ class RefinementOptions:
             return self
         return replace(self, rounds=min(self.rounds, 1), max_partners=min(self.max_partners, _FEW_PARTNERS))
 
-    def images_used(self, partners: int) -> int:
-        """In how many images a pixel is matched, all rounds together, where there are so many partners."""
+    def images_used(self, partners: int, *, half_size: bool = False) -> float:
+        """In how many images a pixel is matched, all rounds together, where there are so many partners.
+
+        The mean of all pixels: at half size but a quarter are matched.
+        """
         last = min(partners, self.max_partners)
-        return (self.rounds - 1) * min(last, _FEW_PARTNERS) + last if self.rounds else 0
+        used = (self.rounds - 1) * min(last, _FEW_PARTNERS) + last if self.rounds else 0
+        return used / 4 if half_size else used
+
+
+def suits_half_size(detail: float, pixels: float) -> bool:
+    """Whether a view is refined at half its size as well as at its own.
+
+    It is where its image has little detail, see `image_detail`, and where its rows disagree with its partners' by
+    so many pixels that poses, not images, limit what can be known.
+    """
+    return detail <= _HALF_DETAIL and pixels >= _MATCH_SIGMA
 
 
 def refine_maps(
@@ -104,6 +121,8 @@ def refine_maps(
     sources: Sequence[tuple[View, NDArray[np.uint8]]],
     options: RefinementOptions,
     residual: float = 0.0,
+    *,
+    half_size: bool = False,
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Refine a view's maps, in place, on the images of its partners.
 
@@ -123,16 +142,106 @@ def refine_maps(
         Row residual of the view's pairs, radians: imprecise poses pull planes to where the images of this view's
         partners meet, and not those of the next view's. The freer a plane the less it has in common with the maps
         of others, so it gets less freedom.
+    half_size : bool
+        Match images at half their size, in a quarter of the time, see `suits_half_size`; unless one is small.
 
     Returns
     -------
     normals, depth
         The parameters; where there was none, there is none.
     """
+    if not sources or not options.rounds:
+        return normals, depth
+    given = (view, image, estimate, normals, depth, sources, options, residual)
+    smallest = min(*image.shape, *(side for _, source in sources for side in source.shape))
+    if half_size and smallest >= 2 * _TILE:
+        _refine_at_half_size(*given)
+    else:
+        _refine(*given)
+    return normals, depth
+
+
+def _refine_at_half_size(
+    view: View,
+    image: NDArray[np.uint8],
+    estimate: DepthEstimate,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    sources: Sequence[tuple[View, NDArray[np.uint8]]],
+    options: RefinementOptions,
+    residual: float,
+) -> None:
+    """As `_refine`, on images of half the size; all planes move as those of every second row and column do."""
+    half_view, half_image = _halved(view, image)
+    height, width = half_image.shape
+    corners = (slice(0, 2 * height, 2), slice(0, 2 * width, 2))  # which both sizes have
+    half_estimate = DepthEstimate(
+        np.ascontiguousarray(estimate.depth[corners]),
+        np.ascontiguousarray(estimate.sigma[corners]),
+        np.ascontiguousarray(estimate.support[corners]),
+    )
+    half_maps = (np.ascontiguousarray(normals[corners]), np.ascontiguousarray(depth[corners]))
+    rows = slice(0, height, 1)
+    planes = _planes_of_maps(half_view, *half_maps, rows)
+    half_options = replace(options, depth_freedom=_HALF_FREEDOM * options.depth_freedom)
+    halves = [_halved(*source) for source in sources]
+    _refine(half_view, half_image, half_estimate, *half_maps, halves, half_options, residual)
+    there = planes[:1] > 0
+    moves = np.where(there, _planes_of_maps(half_view, *half_maps, rows) - planes, 0)
+    moves[1:] /= 2  # by pixels of full size
+    _move_planes(view, np.concatenate([moves, there]), normals, depth)
+
+
+def _halved(view: View, image: NDArray[np.uint8]) -> tuple[View, NDArray[np.uint8]]:
+    """A view and its image at half the size, without the last row or column where their number is odd."""
+    height, width = (side // 2 for side in image.shape)
+    even = np.ascontiguousarray(image[: 2 * height, : 2 * width])
+    half = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
+    return view.cropped(0, 0, 2 * width, 2 * height).resized(width, height), np.asarray(half, np.uint8)
+
+
+def _move_planes(
+    view: View, moves: NDArray[np.float32], normals: NDArray[np.float32], depth: NDArray[np.float32]
+) -> None:
+    """Move the planes of maps, in place, as those of every second row and column moved.
+
+    `moves` are (4, H / 2, W / 2): of inverse depth and its changes per column and row, and whether there is a
+    plane.
+    """
+    K = np.ascontiguousarray(view.K)
+    for first in range(0, view.height, _TILE):
+        rows = slice(first, min(first + _TILE, view.height), 1)
+        around = moves[:, first // 2 : rows.stop // 2 + 1]
+        *moved, share = _doubled(around, (rows.stop - first, view.width))
+        planes = _planes_of_maps(view, normals, depth, rows)
+        step = np.divide(moved, share, out=np.zeros_like(planes), where=share > 0)
+        planes += np.where((planes[0] > 0) & (planes[0] + step[0] > 0), step, 0)
+        _native.maps_of_planes(planes, K, first, normals, depth)
+
+
+def _doubled(values: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.float32]:
+    """(n, *shape) values from those of every second row and column, linear between these and constant beyond."""
+    for axis, size in enumerate(shape, start=1):
+        places = np.arange(size)
+        last = values.shape[axis] - 1
+        before, after = (values.take(np.minimum(half, last), axis) for half in (places // 2, (places + 1) // 2))
+        values = (before + after) / 2
+    return values
+
+
+def _refine(
+    view: View,
+    image: NDArray[np.uint8],
+    estimate: DepthEstimate,
+    normals: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    sources: Sequence[tuple[View, NDArray[np.uint8]]],
+    options: RefinementOptions,
+    residual: float,
+) -> None:
+    """As `refine_maps`, where there is something to do, and on the images as they are."""
     options = replace(options, depth_freedom=options.depth_freedom * _trust(residual * float(view.K[0, 0])))
     partners = [(_paired(source_image), pixel_transfer(view, source)) for source, source_image in sources]
-    if not partners or not options.rounds:
-        return normals, depth
     rank = _ranks(view, image, estimate, normals, depth, partners, options)
     K = np.ascontiguousarray(view.K)
     for done in range(options.rounds):
@@ -155,7 +264,6 @@ def refine_maps(
             slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
             _native.refine_planes(equations, sigma, slope_sigma, planes)
             _native.maps_of_planes(planes, K, first, normals, depth)
-    return normals, depth
 
 
 def _paired(image: NDArray[np.uint8]) -> NDArray[np.uint16]:

@@ -29,7 +29,7 @@ from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.photographs.fringes import drop_fringes
-from colmap_sph.stereo.refinement import RefinementOptions, refine_maps
+from colmap_sph.stereo.refinement import RefinementOptions, refine_maps, suits_half_size
 from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside, is_inside
 from colmap_sph.stereo.region.shown import count_shown
@@ -84,7 +84,7 @@ class ConfirmTask:
     """A view and its partners, its sparse points and mask, and where its geometric maps go.
 
     `matched` are the images that it was matched with, also where these tell nothing of it. With `keep_blank` no
-    depth is doubted for what the image shows.
+    depth is doubted for what the image shows, and with `half_size` it is refined at half its size.
     """
 
     reference: EstimateFile
@@ -100,6 +100,7 @@ class ConfirmTask:
     depths: Depths | None
     focus: Focus | None
     matched: tuple[str, ...]
+    half_size: bool
     maps: MapFiles
     key: str
 
@@ -118,9 +119,9 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
         options = _refinement(task.refinement_options, view, task.residuals)
-        planes = refine_maps(
-            view, _image(task.reference), confirmed, *planes, sources, options, _usual(task.residuals)
-        )
+        image = _image(task.reference)
+        usual = _usual(task.residuals)
+        planes = refine_maps(view, image, confirmed, *planes, sources, options, usual, half_size=task.half_size)
     if view.original:
         drop_fringes(planes[1])
     drop_other_depths(planes[1], task.depths)
@@ -169,10 +170,12 @@ def _faint(file: EstimateFile, mask: NDArray[np.uint8] | None) -> NDArray[np.uin
     return file.window.part(faint_rays(faint))
 
 
-def confirm_seconds(partners: int, normals: NormalOptions, refinement: RefinementOptions) -> float:
+def confirm_seconds(
+    partners: int, normals: NormalOptions, refinement: RefinementOptions, *, half_size: bool = False
+) -> float:
     """Processor seconds per megapixel of an image that has so many partners."""
     seconds = normals_seconds(normals) + _FAINT_SECONDS + _CONFIRM_SECONDS * partners
-    return seconds + _REFINE_SECONDS * refinement.images_used(partners)
+    return seconds + _REFINE_SECONDS * refinement.images_used(partners, half_size=half_size)
 
 
 class ConfirmStage(RememberingStage[str, ConfirmTask]):
@@ -219,7 +222,10 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         sights = self.context.sparse_tracks.sights(item).between(options.rectification.depths)
         residuals = self._residuals_with(item, partners)
         cut = self.context.cut(item)
-        key = self.context.keys.geometric(self._vote_keys[item], votes, stations, residuals, sights, cut)
+        half_size = self._half_size(item, residuals)
+        key = self.context.keys.geometric(
+            self._vote_keys[item], votes, stations, residuals, sights, half_size, cut
+        )
         maps = self.context.map_files(item, "geometric")
         task = ConfirmTask(
             self._estimate_file(item),
@@ -235,6 +241,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
             options.rectification.depths,
             self.context.focus,
             tuple(self._matched(item)),
+            half_size,
             maps,
             key,
         )
@@ -269,7 +276,9 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         partners = self._partners(name)
         residuals = self._residuals_with(name, partners)
         refinement = _refinement(self.context.options.refinement, self.context.scene.view(name), residuals)
-        seconds = confirm_seconds(len(partners), self.context.options.normals, refinement)
+        seconds = confirm_seconds(
+            len(partners), self.context.options.normals, refinement, half_size=self._half_size(name, residuals)
+        )
         memory = _CONFIRM_BYTES * pixels
         if refinement.rounds:
             of_partners = (_IMAGE_BYTES + _PAIRED_BYTES) * sum(map(self._pixels, partners))
@@ -277,6 +286,11 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         memory += bytes_to_reduce(*map(self.context.scene.view, [name, *partners]))
         maps = MAP_BYTES * self.context.scene.view(name).num_pixels
         return Cost(seconds * pixels / 1e6, memory + maps - MAP_BYTES * pixels, maps)
+
+    def _half_size(self, name: str, residuals: Sequence[float]) -> bool:
+        """Whether a view is refined at half its size; one whose image is not there yet is taken for sharp."""
+        pixels = _usual(residuals) * float(self.context.scene.view(name).K[0, 0])
+        return suits_half_size(self.context.details.get(name, 1.0), pixels)
 
     def _pixels(self, name: str) -> int:
         return self.context.window(name).num_pixels
