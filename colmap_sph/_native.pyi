@@ -445,6 +445,19 @@ def fit_planes(
     fitted_depth : (H, W) float32, written
     """
 
+def add_relief(
+    depth: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    fitted_depth: NDArray[np.float32],
+    /,
+) -> None:
+    """Put back what fitted planes cut off where they bend: move them towards the depths they were fitted to.
+
+    depth : (H, W) float32
+    sigma : (H, W) float32
+    fitted_depth : (H, W) float32, written
+    """
+
 def add_patch_equations(
     backend: str,
     image: NDArray[np.uint8],

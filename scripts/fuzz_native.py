@@ -399,6 +399,11 @@ def fit_planes(rng: Random) -> Arguments:
     return [backend(rng), *inputs, support, K, int(rng.integers(1, 17)), number(rng), *gates, *outputs]
 
 
+def add_relief(rng: Random) -> Arguments:
+    shape = size(rng)
+    return [filled(rng, shape, np.float32) for _ in range(3)]
+
+
 def confirm_depth(rng: Random) -> Arguments:
     shape = size(rng)
     maps = [filled(rng, shape, np.float32) for _ in range(2)]
@@ -506,6 +511,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         draw_heights,
         confirm_depth,
         fit_planes,
+        add_relief,
         add_patch_equations,
         planes_of_maps,
         maps_of_planes,

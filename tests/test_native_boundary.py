@@ -277,6 +277,11 @@ def arguments(function):
             "out normals": np.zeros((H, W, 3), f32),
             "out fitted_depth": np.zeros((H, W), f32),
         },
+        "add_relief": {
+            "depth": np.ones((H, W), f32),
+            "sigma": np.ones((H, W), f32),
+            "out fitted_depth": np.ones((H, W), f32),
+        },
         "add_patch_equations": {
             "backend": "scalar",
             "image": np.zeros((H, W), u8),
@@ -480,6 +485,7 @@ FUNCTIONS = [
     "draw_heights",
     "confirm_depth",
     "fit_planes",
+    "add_relief",
     "add_patch_equations",
     "planes_of_maps",
     "maps_of_planes",

@@ -49,6 +49,17 @@ def estimate(inverse, noise, seed=None):
     return DepthEstimate(depth, sigma * depth**2, np.ones(depth.shape, np.uint8))
 
 
+def planes_of(given, options=OPTIONS):
+    """(H, W) depths of fitted planes alone, without their relief."""
+    inverse = np.where(given.depth > 0, 1 / np.maximum(given.depth, 1e-9), 0).astype(np.float32)
+    sigma = (given.sigma * inverse**2).astype(np.float32)
+    normals, fitted = np.zeros((*inverse.shape, 3), np.float32), np.zeros_like(inverse)
+    gates = (options.max_shift, 2, np.cos(np.radians(options.max_incidence)), 3)
+    fit = (VIEW.K, options.radius, options.tolerance, *gates)
+    _native.fit_planes("scalar", inverse, sigma, given.support, *fit, normals, fitted)
+    return fitted
+
+
 def angles(normals, truth):
     """Degrees between fitted and true normals, (H, W)."""
     cross = np.linalg.norm(np.cross(normals, truth), axis=-1)
@@ -185,9 +196,36 @@ def fitted_slowly(inverse, sigma, row, column, options):
     return centre * (plane + np.array([1, 0, 0])) if solved else None
 
 
+def with_relief_slowly(own, sigma, planes):
+    """Inverse depths of planes moved towards those of their pixels where planes bend, pixel by pixel; 0 = none."""
+    height, width = planes.shape
+    there = planes > 0
+
+    def around(row, column, reach):
+        rows = range(max(row - reach, 0), min(row + reach + 1, height))
+        columns = range(max(column - reach, 0), min(column + reach + 1, width))
+        return [(y, x) for y in rows for x in columns if there[y, x]]
+
+    def bend(row, column):
+        bends = [0.0]
+        for before, after in (((row - 2, column), (row + 2, column)), ((row, column - 2), (row, column + 2))):
+            if min(before) >= 0 and after[0] < height and after[1] < width and there[before] and there[after]:
+                bends.append(abs(planes[before] + planes[after] - 2 * planes[row, column]) / sigma[row, column])
+        return min(max(bends), 50)
+
+    moved = planes.copy()
+    for row, column in np.argwhere(there):
+        near = around(row, column, 1)
+        bent = np.mean([bend(*place) for place in near])
+        residual = np.mean([own[place] - planes[place] for place in near])
+        most = own[row, column] - planes[row, column]
+        moved[row, column] += np.clip(residual, min(most, 0), max(most, 0)) * bent**2 / (bent**2 + 16)
+    return moved
+
+
 @pytest.mark.parametrize("radius", [2, 3, 4])
 def test_planes_are_those_of_a_slow_fit(radius):
-    """Noise, a step between two surfaces, and holes between which few neighbours are left."""
+    """Noise, a step between two surfaces, and holes between which few neighbours are left; then their relief."""
     rng = np.random.default_rng(radius)
     view = replace(VIEW, width=24, height=20)
     inverse = inverse_depth(plane_normal(40, 30), view=view)
@@ -197,18 +235,21 @@ def test_planes_are_those_of_a_slow_fit(radius):
     options = replace(OPTIONS, radius=radius, max_shift=1e9)
     normals, depth = fit_normals(view, given, options)
     inverse = np.where(given.depth > 0, 1 / np.maximum(given.depth, 1e-9), 0)
-    found = 0
+    sigma = given.sigma * inverse**2
+    planes = np.zeros(inverse.shape)
     for row, column in np.argwhere(given.depth > 0):
-        plane = fitted_slowly(inverse, given.sigma * inverse**2, row, column, options)
+        plane = fitted_slowly(inverse, sigma, row, column, options)
         if plane is None or plane[0] <= 0:
             assert depth[row, column] == 0
             continue
-        found += 1
+        planes[row, column] = plane[0]
         value, right, down = plane
         expected = view.K.T @ [right, down, value - right * column - down * row]
-        assert depth[row, column] == pytest.approx(1 / value, rel=1e-4)
         np.testing.assert_allclose(normals[row, column], -expected / np.linalg.norm(expected), atol=2e-3)
-    assert found > 150
+    found = planes > 0
+    assert found.sum() > 150
+    np.testing.assert_allclose(depth[found], 1 / with_relief_slowly(inverse, sigma, planes)[found], rtol=1e-4)
+    assert not np.allclose(depth[found], 1 / planes[found], rtol=1e-3)
 
 
 def test_neighbours_off_the_coarse_rounds_are_enough_for_a_plane():
@@ -220,6 +261,33 @@ def test_neighbours_off_the_coarse_rounds_are_enough_for_a_plane():
     normals, _ = fit_normals(VIEW, estimate(np.where(lone, inverse, 0), 0.1), OPTIONS)
     assert (normals.any(axis=-1) == lone).all()
     assert angles(normals, normal)[lone].max() < 0.5
+
+
+def test_ridges_are_not_cut_off():
+    """Two roofs that meet in a line: planes near it cut it off, and their relief puts it back."""
+    ridge = np.maximum(inverse_depth(plane_normal(50, 0)), inverse_depth(plane_normal(50, 180)))
+    planes_alone, errors = {}, {}
+    for seed in (None, 7):
+        given = estimate(ridge, noise=0.1, seed=seed)
+        given.support[:] = 3
+        _, fitted = fit_normals(VIEW, given, OPTIONS)
+        column = round(VIEW.K[0, 2])
+        near = np.s_[5:-5, column - 2 : column + 3]
+        errors[seed] = np.abs(fitted - 1 / ridge)[near].mean()
+        planes_alone[seed] = np.abs(planes_of(given) - 1 / ridge)[near].mean()
+    assert errors[None] < 0.75 * planes_alone[None]
+    assert errors[7] < 0.75 * planes_alone[7]
+
+
+def test_flat_surfaces_have_no_relief():
+    """Where planes do not bend, the noise of the depths stays away."""
+    normal = plane_normal(30, 70)
+    noisy = estimate(inverse_depth(normal), noise=0.3, seed=2)
+    exact = 1 / inverse_depth(normal)
+    inner = np.s_[5:-5, 5:-5]
+    _, fitted = fit_normals(VIEW, noisy, OPTIONS)
+    error = np.sqrt(np.square(fitted - exact)[inner].mean())
+    assert error < 1.01 * np.sqrt(np.square(planes_of(noisy) - exact)[inner].mean())
 
 
 def test_too_few_neighbours_give_no_normal():

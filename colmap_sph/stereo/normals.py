@@ -69,7 +69,8 @@ def fit_normals(
     normals : (H, W, 3) float32 ndarray
         Unit vectors in the camera frame, towards the camera; (0, 0, 0) where no plane fits.
     depth : (H, W) float32 ndarray
-        Depth of each plane at its pixel; 0 where no plane fits.
+        Depth of each plane at its pixel, and where planes bend, at ridges and steps, nearer to the pixel's own;
+        0 where no plane fits.
 
     Examples
     --------
@@ -93,6 +94,7 @@ def fit_normals(
         band_normals, band_fitted = _fit_rows(view, estimate, low, high, options)
         normals[first:end] = band_normals[kept]
         fitted[first:end] = band_fitted[kept]
+    _native.add_relief(estimate.depth, estimate.sigma, fitted)
     return normals, fitted
 
 

@@ -61,6 +61,9 @@ static void run_planes_and_maps(const kernel_table *k, image_size size) {
     maps_of_planes(planes, size.height, size.width, K, 0, normals, depth);
     add_floats_to_hash(normals, 3 * PIXELS);
     add_floats_to_hash(depth, PIXELS);
+    FILL(float, confirmed, PIXELS, depth_of(x) * real_between(0.99f, 1.01f))
+    add_relief(confirmed, sigma, size.height, size.width, depth);
+    add_floats_to_hash(depth, PIXELS);
 }
 
 static void run_fusion(const kernel_table *k, image_size size) {

@@ -153,6 +153,11 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
                    const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
                    uint8_t *contradicting, float *weighted_depth, float *weight);
 
+/* Moves the depths of fitted planes towards those they were fitted to, where neighbouring planes bend by more than
+ * the depths' standard deviation tells: by the mean by which the 3 x 3 depths around lie off their planes, no
+ * farther than to the pixel's own depth. What has no depth stays. */
+int add_relief(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width, float *fitted);
+
 /* The planes (see `add_patch_equations_fn`) of normals (interleaved x, y, z) and depths of some rows of a map;
  * zeros where there is none. */
 void planes_of_maps(const float *normals, const float *depth, ptrdiff_t width, const double *inverse_K,

@@ -203,6 +203,20 @@ static int run_fit_planes(void *arguments) {
 FUNCTION(fit_planes, FIT_PLANES, check_fit_planes,
          "Normals and depths of planes fitted to each pixel's neighbours; zeros where none fits.");
 
+#define ADD_RELIEF(X) \
+    X(IN, float32, depth, H, W) \
+    X(IN, float32, sigma, H, W) \
+    X(OUT, float32, fitted_depth, H, W)
+ARGUMENTS(add_relief, ADD_RELIEF);
+
+static int run_add_relief(void *arguments) {
+    const add_relief_arguments *a = arguments;
+    return add_relief(a->depth, a->sigma, a->size.H, a->size.W, a->fitted_depth);
+}
+
+FUNCTION(add_relief, ADD_RELIEF, any,
+         "Put back what fitted planes cut off where they bend: move them towards the depths they were fitted to.");
+
 #define ADD_PATCH_EQUATIONS(X) \
     X(VALUE, backend, backend) \
     X(IN, uint8, image, H, W) \
@@ -324,14 +338,8 @@ static int run_refine_planes(void *arguments) {
 
 FUNCTION(refine_planes, REFINE_PLANES, any, "Move planes by the solution of their equations.");
 
-native_function *const depth_functions[] = {&transfer_disparity_function,
-                                            &depth_candidates_function,
-                                            &vote_depth_function,
-                                            &compare_depths_function,
-                                            &confirm_depth_function,
-                                            &fit_planes_function,
-                                            &add_patch_equations_function,
-                                            &planes_of_maps_function,
-                                            &maps_of_planes_function,
-                                            &refine_planes_function,
-                                            NULL};
+native_function *const depth_functions[] = {
+    &transfer_disparity_function, &depth_candidates_function,    &vote_depth_function,
+    &compare_depths_function,     &confirm_depth_function,       &fit_planes_function,
+    &add_relief_function,         &add_patch_equations_function, &planes_of_maps_function,
+    &maps_of_planes_function,     &refine_planes_function,       NULL};
