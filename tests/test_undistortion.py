@@ -67,6 +67,20 @@ def make_project(
     return sparse
 
 
+def test_points_behind_all_images_are_told_before_anything_is_made(tmp_path: Path) -> None:
+    """Of the model as it was given, and not of the one in the workspace."""
+    sparse = make_project(tmp_path)
+    model = pycolmap.Reconstruction(sparse)
+    for image in model.images.values():
+        assert image.frame is not None
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+        image.frame.rig_from_world = turn * image.cam_from_world()
+    model.write_binary(sparse)
+    with pytest.raises(InputError, match=f"sparse points of the model in {sparse} lie behind the images"):
+        prepare(sparse, tmp_path / "dense")
+    assert not (tmp_path / "dense").exists()
+
+
 @pytest.mark.parametrize("text", [False, True])
 def test_workspace_of_undistorted_images(tmp_path: Path, text: bool) -> None:
     sparse = make_project(tmp_path, text=text)
