@@ -575,6 +575,12 @@ def test_images_are_found(tmp_path: Path, folder: str) -> None:
     assert find_images(model_dir, NAMES) == tmp_path / folder
 
 
+def test_images_of_a_workspace_are_its_own(tmp_path: Path) -> None:
+    """They are as its model says; the originals of the same names may be distorted, and as large."""
+    workspace = prepare(make_project(tmp_path), tmp_path / "dense")
+    assert find_images(workspace.sparse_dir, NAMES) == workspace.images_dir
+
+
 def test_images_are_found_from_a_relative_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     make_project(tmp_path)
     monkeypatch.chdir(tmp_path / "sparse")

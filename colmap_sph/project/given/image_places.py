@@ -38,8 +38,9 @@ _SLASHES = (
 def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     """Find the image folder of a model by COLMAP's usual layouts.
 
-    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
-    folder that holds most of the model's images is taken, the first among equals.
+    For the model ``X/sparse/0`` these are ``X/sparse/0/images``, ``X/sparse/images`` and ``X/images``. The folder
+    that holds most of the model's images is taken, the first among equals: for the model ``X/dense/sparse`` of a
+    workspace its own undistorted images, and not the originals in ``X/images``.
 
     Raises
     ------
@@ -49,7 +50,7 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     """
     # Of a link to a model both where it is and where it leads to.
     places = (Path.cwd() / model_dir, real_path(model_dir))
-    parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
+    parents = [p for model in places for p in (model, model.parent, model.parent.parent)]
     folders = list(dict.fromkeys(parent / "images" for parent in parents))
     found = [sum((folder / name).is_file() for name in names) for folder in folders]
     if max(found) > 0:
