@@ -63,6 +63,15 @@ def judge_agreement(report: RunReport, *, misplaced: float) -> None:
         _doubt(report, _doubts(doubted))
 
 
+def misplaced_views(scene: Scene) -> dict[str, float]:
+    """Images whose sparse points do not project to where they observe them, and by how many pixels (median)."""
+    return {
+        view.name: view.reprojection_error
+        for view in scene.views
+        if view.reprojection_error > max(_FAR_PIXELS, _FAR_SHARE * max(view.width, view.height))
+    }
+
+
 def judge_reprojection(report: RunReport, scene: Scene) -> float:
     """Warn of images whose sparse points do not project to where the model says that they observe them.
 
@@ -77,11 +86,7 @@ def judge_reprojection(report: RunReport, scene: Scene) -> float:
     float
         The share of such images, 0 to 1.
     """
-    far = {
-        view.name: view.reprojection_error
-        for view in scene.views
-        if view.reprojection_error > max(_FAR_PIXELS, _FAR_SHARE * max(view.width, view.height))
-    }
+    far = misplaced_views(scene)
     if far:
         shown = [f"{name} ({error:.0f} px)" for name, error in sorted(far.items(), key=lambda item: -item[1])]
         words = (

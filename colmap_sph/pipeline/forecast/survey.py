@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from colmap_sph.errors import ColmapSphError, OptionError
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.input.good_images import with_good_images
+from colmap_sph.pipeline.input.good_images import with_good_images, without_misplaced
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions
@@ -218,6 +218,7 @@ def foresee(
     context = with_good_images(
         Context(dense, scene, options, keys, report=report).in_region(), survey, to_come=to_come
     )
+    context = without_misplaced(context)
     there = None if foreseen is not None else dense
     key = context.keys.stage("selection", context.scene_key)
     selection = choose_pairs(there, context.scene, context.options, project.database(), scene_key=key)
