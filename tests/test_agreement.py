@@ -258,7 +258,7 @@ def test_an_image_in_a_wrong_place_is_left_out(project, capsys):
     )
     assert list(report.skipped_images) == [wrong.name]
     assert re.match(r"sparse points project \d\d pixels from where", report.skipped_images[wrong.name])
-    assert report.doubts == "" and report.overall_agreement > 0.9
+    assert report.doubts == "" and report.overall_agreement is not None and report.overall_agreement > 0.9
     model.deregister_frame(wrong.frame_id)
     (project / "without").mkdir()
     model.write_binary(project / "without")

@@ -22,6 +22,7 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.pipeline.reconstruct import check_input
 from colmap_sph.pipeline.stages.match import PhotoFile
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.images.reading import image_problem
@@ -563,6 +564,17 @@ def test_output_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "dense").write_text("a file in the way")
     with pytest.raises(OutputError, match="dense"):
         prepare(sparse, tmp_path / "dense")
+
+
+def test_output_where_nobody_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sparse = make_project(tmp_path)
+    monkeypatch.setattr("os.access", lambda path, _: Path(path) != tmp_path)
+    project = Project(sparse, output=tmp_path / "new" / "dense")
+    with pytest.raises(
+        OutputError, match=f"dense cannot be created: {tmp_path} may not be written; give another --output"
+    ):
+        check_input(project, RunOptions())
+    check_input(Project(sparse, output=tmp_path / "sparse" / "dense"), RunOptions())
 
 
 @pytest.mark.parametrize("folder", ["images", "sparse/images", "sparse/0/images"])
