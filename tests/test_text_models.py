@@ -199,6 +199,14 @@ def test_quaternions_of_any_length_are_rotations(tmp_path: Path, text: bool, len
     np.testing.assert_array_equal(found[:, 3], [0.1, 0.0, 0.0])
 
 
+def test_observations_of_points_that_are_not_there(tmp_path: Path) -> None:
+    """As of exporters that have thinned out their points: the others count."""
+    sparse = make_project(tmp_path, text=True)
+    change(sparse / "points3D.txt", lambda lines: lines[::2])
+    workspace = prepare(sparse, tmp_path / "dense")
+    assert len(read_scene(workspace.sparse_dir).points) == 10
+
+
 def test_newer_text_beside_a_binary_model_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """COLMAP reads the binary one, whatever was edited in the text."""
     sparse = make_project(tmp_path)

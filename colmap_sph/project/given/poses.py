@@ -39,7 +39,8 @@ def check_points_in_front(model: pycolmap.Reconstruction, sparse_dir: Path) -> N
         pose = image.cam_from_world().matrix()
         places = image.get_observation_point2D_idxs()
         places = places[:: -(-len(places) // _MOST_OBSERVATIONS) or 1]
-        points = [model.point3D(image.points2D[place].point3D_id).xyz for place in places]
+        seen = [image.points2D[place].point3D_id for place in places]
+        points = [model.point3D(point_id).xyz for point_id in seen if model.exists_point3D(point_id)]
         if not points or not np.isfinite(pose).all():
             continue
         with np.errstate(all="ignore"):  # impossible coordinates are told later
