@@ -17,10 +17,12 @@ from colmap_sph.app.run_command import print_summary
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, refuse_disagreement
 from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
@@ -238,6 +240,35 @@ def test_one_wrong_image_is_named(project):
     report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
     assert wrong in report.doubts
     assert not any(name in report.doubts for name in FOUR_NAMES if name != wrong)
+
+
+def test_an_image_in_a_wrong_place_is_left_out(project, capsys):
+    """It spoils no other: their maps are those of a model without it. The dry run knows it, too."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    wrong = next(image for image in model.images.values() if image.name == FOUR_NAMES[2])
+    taken = next(image for image in model.images.values() if image.name == FOUR_NAMES[1])
+    assert wrong.frame is not None
+    wrong.frame.rig_from_world = taken.cam_from_world()
+    (project / "wrong").mkdir()
+    model.write_binary(project / "wrong")
+    plan = make_plan(Project(project / "wrong", project / "images", output=project / "dense"), OPTIONS)
+    assert (plan.images, plan.pairs) == (3, 3)
+    report = colmap_sph.run(
+        project / "wrong", images=project / "images", output=project / "dense", options=OPTIONS
+    )
+    assert list(report.skipped_images) == [wrong.name]
+    assert re.match(r"sparse points project \d\d pixels from where", report.skipped_images[wrong.name])
+    assert report.doubts == "" and report.overall_agreement is not None and report.overall_agreement > 0.9
+    model.deregister_frame(wrong.frame_id)
+    (project / "without").mkdir()
+    model.write_binary(project / "without")
+    colmap_sph.run(project / "without", images=project / "images", output=project / "other", options=OPTIONS)
+    for name in (*FOUR_NAMES[:2], FOUR_NAMES[3]):
+        found, expected = (
+            read_depth_map(Workspace(project / folder).depth_map_path(name, "geometric"))
+            for folder in ("dense", "other")
+        )
+        assert np.count_nonzero(expected) and np.isclose(found, expected, rtol=1e-3).mean() > 0.95
 
 
 def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):

@@ -286,6 +286,18 @@ def test_refuses_options_that_contradict_each_other(folder, capsys):
     assert "its folder does not exist" in sentence(capsys)
 
 
+def test_only_results_are_replaced_by_results(folder, capsys):
+    cloud = folder / "deep.ply"
+    before = cloud.read_bytes()
+    assert evaluate(cloud, "--reference", cloud, "--json", cloud) == 3
+    assert "deep.ply is there already, and no evaluation wrote it; name another for --json" in sentence(capsys)
+    assert cloud.read_bytes() == before
+    (folder / "scores.json").touch()
+    for _ in range(2):
+        assert evaluate(cloud, "--reference", cloud, "--json", folder / "scores.json") == 0
+        assert json.loads((folder / "scores.json").read_text())["reference"] == str(cloud)
+
+
 def test_refuses_what_is_not_exact_depth(folder, capsys):
     options = ("--model", folder / "sparse", "--depth-scale", 0.0005)
     first = folder / "depth" / "a.png"

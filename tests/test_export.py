@@ -443,6 +443,19 @@ def test_mvsnet_reads_cameras_and_pairs(workspace: Workspace, tmp_path: Path) ->
     assert position == len(words)
 
 
+@pytest.mark.parametrize("place", ["originals", "originals/a"])
+def test_no_product_lies_among_the_original_images(workspace: Workspace, tmp_path: Path, place: str) -> None:
+    """They are nowhere in the workspace; a new folder below theirs is the user's own wish."""
+    for name in NAMES:
+        path = tmp_path / "originals" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(b"original")
+    with pytest.raises(OutputError, match=r"originals.* has images of the model, such as \w\.png; choose another"):
+        exported(workspace, tmp_path / place, "las")
+    exported(workspace, tmp_path / place / "new", "las")
+    exported(workspace, tmp_path / "a", "las")
+
+
 # ---- bad input ----------------------------------------------------------------------------------------------
 
 

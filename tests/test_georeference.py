@@ -103,6 +103,25 @@ def test_camera_positions_give_the_similarity(workspace: Workspace, tmp_path: Pa
     assert kept.crs == "EPSG:25832" and kept.residuals == found.residuals
 
 
+@pytest.mark.parametrize("is_exchanged", [False, True])
+def test_a_model_on_its_head_is_told(
+    workspace: Workspace, tmp_path: Path, caplog: pytest.LogCaptureFixture, is_exchanged: bool
+) -> None:
+    """Cameras at one height fit as well with x and y exchanged: with the ground above them."""
+    places = centers()
+    places[:, 2] = ALTITUDE
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    for image in model.images.values():
+        assert image.frame is not None
+        place = places[NAMES.index(image.name)]
+        image.frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(LOOKING_DOWN), -LOOKING_DOWN @ place)
+    model.write_binary(workspace.sparse_dir)
+    told = places[:, [1, 0, 2]] if is_exchanged else places
+    found = align(workspace, write_lines(tmp_path / "cameras.csv", "image,x,y,z", *position_lines(told)))
+    assert max(each.length for each in found.residuals) < 1e-6
+    assert ("cameras.csv the model stands on its head: its images look up." in caplog.text) == is_exchanged
+
+
 def test_gross_errors_are_left_out_and_told(workspace: Workspace, tmp_path: Path) -> None:
     places = on_map(centers()) + np.random.default_rng(2).normal(0, 0.01, (6, 3))
     places[3] += [40.0, -10.0, 5.0]

@@ -251,9 +251,26 @@ def test_all_images_are_turned(tmp_path: Path) -> None:
 def test_sizes_without_a_rule_are_told_one_by_one(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     sparse = make_project(tmp_path)
     folder = resized(tmp_path, WIDTH // 2, HEIGHT // 2 + 9)
-    with pytest.raises(InputError, match=r"None of the model's 4 images in .* is usable; check --images"):
+    with pytest.raises(InputError, match=r"None of the model's 4 images in .* is usable; give the images that"):
         prepare_with(sparse, folder)
     assert caplog.text.count("but its camera 96 x 64; left out") == 4
+
+
+@pytest.mark.parametrize(
+    ("problems", "remedy"),
+    [
+        ([WrongSize((96, 55), (96, 64))] * 3, "give the images that the model was made from as --images"),
+        (["is damaged or no image (cut off)", "is damaged or no image (?)", "is missing"], "copy them again from"),
+        (["is empty"] * 3, "copy them again from where they came from"),
+        (["cannot be read (Permission denied)"] * 3, "check their permissions"),
+        (["is missing"] * 3, "check --images"),
+        (["is not a regular file"] * 3, "check --images"),
+    ],
+)
+def test_what_to_do_when_no_image_is_usable(tmp_path: Path, problems: list[str], remedy: str) -> None:
+    named = {f"{number}.png": problem for number, problem in enumerate(problems)}
+    with pytest.raises(InputError, match=rf"None of the model's 3 images in .* is usable; {remedy}"):
+        tell_problems(tmp_path / "sparse", tmp_path, named, 3, undistorted=False)
 
 
 @pytest.mark.parametrize("num_whole", [0, 1])
@@ -267,7 +284,9 @@ def test_many_of_one_wrong_size_are_told_together(
     if num_whole:
         tell_problems(sparse, tmp_path, problems, len(names), undistorted=False)
     else:
-        with pytest.raises(InputError, match=r"None of the model's 9 images in .* is usable; check --images"):
+        with pytest.raises(
+            InputError, match=r"None of the model's 9 images in .* is usable; give the images that"
+        ):
             tell_problems(sparse, tmp_path, problems, len(names), undistorted=False)
     first = ", ".join(names[num_whole : num_whole + 4])
     assert caplog.messages == [

@@ -198,6 +198,16 @@ def test_masks_beside_their_images(tmp_path: Path, caplog: pytest.LogCaptureFixt
     assert not caplog.records
 
 
+def test_images_are_no_masks_of_themselves(tmp_path: Path) -> None:
+    """Their dark pixels would be left out. Those that are no PNGs have none, which is told."""
+    sparse = make_project(tmp_path)
+    with pytest.raises(
+        InputError, match=r"--masks .*images is the folder of the images, and has no mask of a\.png"
+    ):
+        prepare(sparse, tmp_path / "dense", masks=tmp_path / "images")
+    assert not (tmp_path / "dense").exists()
+
+
 def test_a_damaged_mask_is_named(tmp_path: Path) -> None:
     """Half of one would ignore the other half."""
     path = tmp_path / "mask.png"

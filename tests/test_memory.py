@@ -2,13 +2,18 @@
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from projects import make_context, prepare
+from test_undistortion import NAMES, make_project
 
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline import memory
+from colmap_sph.pipeline.forecast.survey import Survey
 from colmap_sph.pipeline.memory import MemoryGate, budget, format_memory, parse_memory, resident
+from colmap_sph.pipeline.stages.match import MatchStage
 
 GIB = 1 << 30
 
@@ -111,3 +116,27 @@ def test_what_earlier_work_has_left_behind_refuses_nothing(monkeypatch: pytest.M
     assert began.is_set()
     with pytest.raises(OptionError, match=r"4096MiB .* is too little for the pair e - f; 4\d{3}MiB would do"):
         gate.check(3 * GIB, "the pair e - f")
+
+
+def test_a_dry_run_refuses_no_images_that_it_has_not_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Soft ones are matched in less memory than sharp ones: a run that sees them goes through."""
+    monkeypatch.setattr(memory, "_at_start", lambda: 0)
+    monkeypatch.setattr(memory, "resident", lambda: 0)
+    context = make_context(prepare(make_project(tmp_path), tmp_path / "dense"))
+    pair = (NAMES[0], NAMES[1])
+
+    def needed(detail: float | None) -> float:
+        details = {} if detail is None else dict.fromkeys(NAMES, detail)
+        return MatchStage(replace(context, details=details), [pair]).job(pair).cost.memory
+
+    assert needed(0.3) < 0.7 * needed(None) and needed(1.0) == pytest.approx(needed(None), rel=1e-6)
+    small = replace(context, options=replace(context.options, memory=str(int(0.9 * needed(None))), threads=1))
+    survey = Survey(is_bounded=True)
+    assert len(survey(MatchStage(replace(small, details=dict.fromkeys(NAMES, 0.3)), [pair]))) == 1
+    assert caplog.text == ""
+    with pytest.raises(OptionError, match="is too little for the pair"):
+        survey(MatchStage(replace(small, details=dict.fromkeys(NAMES, 1.0)), [pair]))
+    assert len(survey(MatchStage(small, [pair]))) == 1
+    assert "is too little for the pair" in caplog.text and "This is for sharp images; soft ones" in caplog.text

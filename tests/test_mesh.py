@@ -1,6 +1,7 @@
 """Meshes of exact maps and clouds against the solids, read back by other programs, and what is refused."""
 
 import json
+import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from colmap_sph.errors import InputError, OptionError
 from colmap_sph.evaluation import read_geometry
 from colmap_sph.evaluation.geometry_io import Mesh
 from colmap_sph.products.georeference import Georeference
-from colmap_sph.products.mesh import tsdf
+from colmap_sph.products.mesh import make, tsdf
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.options import MeshOptions
@@ -258,6 +259,15 @@ def test_a_library_that_open3d_needs_is_named(workspace, tmp_path, monkeypatch):
     ) as refused:
         made(workspace, tmp_path)
     assert "\n" not in str(refused.value)
+
+
+def test_a_mesh_coarser_than_the_pixels_is_told(cloudy, tmp_path, monkeypatch, caplog):
+    """Of a large block, or of two blocks far apart."""
+    made(cloudy, tmp_path / "fine", method="poisson", trim=0.0)
+    assert caplog.text == ""
+    monkeypatch.setattr(make, "_DEPTHS", (3, 4))
+    made(cloudy, tmp_path / "coarse", method="poisson", trim=0.0)
+    assert re.search(r"poisson has 16 cells along a side at most, not 1\d\d;", caplog.text)
 
 
 def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):

@@ -1,5 +1,6 @@
 """Text models: COLMAP's own numbers for what it reads, and everything that it would lose without a word."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,8 +11,11 @@ from projects import prepare
 from test_undistortion import NAMES, make_project
 
 from colmap_sph.errors import InputError
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.undistortion.originals import read_originals
 
 
 @pytest.fixture
@@ -130,11 +134,14 @@ def word(number: int, value: str) -> Callable[[list[str]], list[str]]:
         ("images", word(5, "0,2"), "line 3.*this is not IMAGE_ID QW"),
         ("images", word(5, "nan"), "line 3.*this is not IMAGE_ID QW"),
         ("images", word(0, "1"), "line 3.*the number 1 is that of line 1"),
+        ("images", word(0, str(2**32)), "line 3.*its number is too large, as COLMAP's end at 4294967294"),
+        ("points3D", word(0, str(2**64 - 1)), "line 3.*its number is too large"),
+        ("cameras", lambda _: ["4294967295 PINHOLE 96 64 90 90 48 32"], "line 1.*its number is too large"),
         ("images", word(8, "7"), r"line 3.*its camera 7 is not in cameras\.txt"),
         ("images", lambda lines: [lines[0], lines[1] + " 5", *lines[2:]], "line 2.*this is not X Y POINT3D_ID"),
         ("images", lambda lines: [lines[0], "abc " + lines[1], *lines[2:]], "line 2.*this is not X Y POINT3D_ID"),
-        ("images", lambda lines: lines[:-2], "line 5.*image 4 in images.txt has no feature 1"),
-        ("points3D", word(8, "77"), "line 3.*image 77 in images.txt has no feature 2"),
+        ("images", lambda lines: lines[:-2], r"line 5.*images\.txt has no image 4, which"),
+        ("points3D", word(8, "77"), r"line 3.*images\.txt has no image 77, which"),
         ("points3D", word(9, "777"), "line 3.*image 1 in images.txt has no feature 777"),
         ("points3D", word(0, "1"), "line 3.*the number 1 is that of line 1"),
         ("points3D", word(4, "7.5"), "line 3.*this is not POINT3D_ID"),
@@ -170,6 +177,62 @@ def test_edited_poses_beside_frames_are_told(tmp_path: Path) -> None:
     (sparse / "frames.txt").unlink()
     (sparse / "rigs.txt").unlink()
     assert load_model(sparse).image(2).cam_from_world().translation[0] == 0.7
+
+
+@pytest.mark.parametrize("length", [1.2, -3e4, 1e-4])
+@pytest.mark.parametrize("text", [True, False])
+def test_quaternions_of_any_length_are_rotations(tmp_path: Path, text: bool, length: float) -> None:
+    """As COLMAP read them until 3.11; now it takes them as they are, and scales what they turn."""
+    sparse = make_project(tmp_path, text=text)
+    model = pycolmap.Reconstruction(sparse)
+    turned = pycolmap.Rotation3d(np.array([0.1, 0.7, 0.0, 0.7]) / np.sqrt(0.99))
+    frame = model.image(2).frame
+    assert frame is not None
+    frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(length * turned.quat), np.array([0.1, 0.0, 0.0]))
+    (model.write_text if text else model.write_binary)(sparse)
+    for name in ("rigs.txt", "frames.txt"):
+        (sparse / name).unlink(missing_ok=True)
+    rotation = pycolmap.Reconstruction(sparse).image(2).cam_from_world().rotation
+    assert np.linalg.norm(rotation.quat) == pytest.approx(abs(length))  # what is guarded against
+    found = load_model(sparse).image(2).cam_from_world().matrix()
+    np.testing.assert_allclose(found[:, :3], turned.matrix(), rtol=0, atol=1e-12)
+    np.testing.assert_array_equal(found[:, 3], [0.1, 0.0, 0.0])
+
+
+def test_observations_of_points_that_are_not_there(tmp_path: Path) -> None:
+    """As of exporters that have thinned out their points: the others count."""
+    sparse = make_project(tmp_path, text=True)
+    change(sparse / "points3D.txt", lambda lines: lines[::2])
+    workspace = prepare(sparse, tmp_path / "dense")
+    assert len(read_scene(workspace.sparse_dir).points) == 10
+
+
+def test_newer_text_beside_a_binary_model_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """COLMAP reads the binary one, whatever was edited in the text."""
+    sparse = make_project(tmp_path)
+    pycolmap.Reconstruction(sparse).write_text(sparse)
+    for path in sparse.iterdir():
+        os.utime(path, (1000, 2000 if path.name == "cameras.txt" else 1000))
+    read_originals(Project(sparse), RunOptions().undistortion)
+    (message,) = caplog.messages
+    assert message.startswith(f"{sparse} has binary and text files")
+    assert "though newer are cameras.txt; delete the binary ones" in message
+    os.utime(sparse / "cameras.bin", (1000, 2000))
+    read_originals(Project(sparse), RunOptions().undistortion)
+    assert len(caplog.messages) == 1
+
+
+def test_rigs_of_another_model_are_told(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path)
+    model = pycolmap.Reconstruction(sparse)
+    frame_id = model.image(3).frame_id
+    model.deregister_frame(frame_id)
+    (tmp_path / "other").mkdir()
+    model.write_binary(tmp_path / "other")
+    for name in ("rigs.bin", "frames.bin"):
+        (tmp_path / "other" / name).replace(sparse / name)
+    with pytest.raises(InputError, match=r"or delete rigs\.bin and frames\.bin if they are of another model\."):
+        load_model(sparse)
 
 
 def test_a_line_of_any_length_is_looked_at_once(text: Path) -> None:

@@ -22,6 +22,7 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
+from colmap_sph.pipeline.reconstruct import check_input
 from colmap_sph.pipeline.stages.match import PhotoFile
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.images.reading import image_problem
@@ -65,6 +66,20 @@ def make_project(
     sparse.mkdir(parents=True)
     (model.write_text if text else model.write_binary)(sparse)
     return sparse
+
+
+def test_points_behind_all_images_are_told_before_anything_is_made(tmp_path: Path) -> None:
+    """Of the model as it was given, and not of the one in the workspace."""
+    sparse = make_project(tmp_path)
+    model = pycolmap.Reconstruction(sparse)
+    for image in model.images.values():
+        assert image.frame is not None
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+        image.frame.rig_from_world = turn * image.cam_from_world()
+    model.write_binary(sparse)
+    with pytest.raises(InputError, match=f"sparse points of the model in {sparse} lie behind the images"):
+        prepare(sparse, tmp_path / "dense")
+    assert not (tmp_path / "dense").exists()
 
 
 @pytest.mark.parametrize("text", [False, True])
@@ -551,6 +566,17 @@ def test_output_that_cannot_be_made(tmp_path: Path) -> None:
         prepare(sparse, tmp_path / "dense")
 
 
+def test_output_where_nobody_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    sparse = make_project(tmp_path)
+    monkeypatch.setattr("os.access", lambda path, _: Path(path) != tmp_path)
+    project = Project(sparse, output=tmp_path / "new" / "dense")
+    with pytest.raises(
+        OutputError, match=f"dense cannot be created: {tmp_path} may not be written; give another --output"
+    ):
+        check_input(project, RunOptions())
+    check_input(Project(sparse, output=tmp_path / "sparse" / "dense"), RunOptions())
+
+
 @pytest.mark.parametrize("folder", ["images", "sparse/images", "sparse/0/images"])
 def test_images_are_found(tmp_path: Path, folder: str) -> None:
     model_dir = tmp_path / "sparse" / "0"
@@ -559,6 +585,12 @@ def test_images_are_found(tmp_path: Path, folder: str) -> None:
     (tmp_path / folder / "cam").mkdir(parents=True)
     (tmp_path / folder / "cam" / "c.png").touch()
     assert find_images(model_dir, NAMES) == tmp_path / folder
+
+
+def test_images_of_a_workspace_are_its_own(tmp_path: Path) -> None:
+    """They are as its model says; the originals of the same names may be distorted, and as large."""
+    workspace = prepare(make_project(tmp_path), tmp_path / "dense")
+    assert find_images(workspace.sparse_dir, NAMES) == workspace.images_dir
 
 
 def test_images_are_found_from_a_relative_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -39,6 +39,8 @@ from colmap_sph.project.workspace import MapKind, Workspace
 
 logger = logging.getLogger(__name__)
 
+_BEGIN = b'{\n  "reference": '
+"""What every file of results begins with."""
 _SAME_CAMERA = 1e-6
 """Largest relative difference of the calibrations of one camera in two files."""
 
@@ -89,10 +91,21 @@ class EvaluateCommand:
             if not cloud.is_file():
                 lack = "is not a regular file" if cloud.exists() else "does not exist"
                 raise InputError(f"The cloud {cloud} {lack}; check its path.")
-        if self.json is not None and not self.json.absolute().parent.is_dir():
-            raise OutputError(f"{self.json} cannot be written: its folder does not exist; create it first.")
-        if self.json is not None and self.json.exists() and not self.json.is_file():
-            raise OutputError(f"{self.json} cannot be written: it is not a regular file; name another.")
+        if self.json is not None:
+            _check_target(self.json)
+
+
+def _check_target(path: Path) -> None:
+    """Raise `OutputError` where results cannot go to a file, or would replace one that no evaluation wrote."""
+    if not path.absolute().parent.is_dir():
+        raise OutputError(f"{path} cannot be written: its folder does not exist; create it first.")
+    if not path.exists():
+        return
+    if not path.is_file():
+        raise OutputError(f"{path} cannot be written: it is not a regular file; name another.")
+    with path.open("rb") as file:
+        if file.read(len(_BEGIN)) not in (_BEGIN, b""):
+            raise OutputError(f"{path} is there already, and no evaluation wrote it; name another for --json.")
 
 
 def evaluate_command(command: EvaluateCommand, terminal: Terminal) -> int:

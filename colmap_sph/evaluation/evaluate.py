@@ -139,7 +139,7 @@ def check_overlap(cloud: PointCloud, reference: Reference, reach: float) -> None
         if _looks_projected(crs, centre) and not _looks_projected(None, other):
             raise InputError(
                 f"{name} is in map coordinates ({crs or 'far from the origin'}), the other in a local frame: "
-                "subtract the offset that was taken off when the model was made local (reference_shift "
+                "subtract the offset that was taken off when the model was made local (--reference-shift "
                 f"x y z does it for the reference); no rotation or scale may remain; {places}"
             )
     raise InputError(

@@ -90,7 +90,7 @@ def register(cloud: Points, reference: Points, *, max_distance: float, threads: 
     if min(len(source), len(target)) < _MIN_POINTS:
         raise InputError(
             f"registration needs {_MIN_POINTS} points of the cloud and of the reference within "
-            f"{max_distance:g} m of each other: align them first, or switch registration off"
+            f"{max_distance:g} m of each other: align them first, or give --register False"
         )
     motion = _generalised_icp(source, target, max_distance)
     index = PointIndex(target)

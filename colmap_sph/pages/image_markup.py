@@ -99,7 +99,7 @@ def _image_row(place: int, content: Content, run: RunFacts, pairs: list[PairFact
         cell(image.found, percent(image.found)),
         cell(told.agreement, percent(told.agreement, "")),
         cell(told.row_residual, plain(told.row_residual, ".2f")),
-        cell(image.gsd, plain(image.gsd, ".3g")),
+        cell(image.gsd, plain(image.gsd, "#.3g").rstrip(".")),
         cell(told.points, plain(told.points, ",")),
         cell(len(pairs), str(len(pairs))),
         {"value": None, "text": f"{WORDS[lost[1]][0]} {percent(lost[0])}" if lost[0] > 0 else ""},

@@ -47,13 +47,12 @@ def map_values(content: Content) -> dict[str, Any]:
     """Values of the template for the map, but for what belongs to each image."""
     frame = content.frame
     width, height = (max(round(side), 1) for side in _drawing_size(frame))
-    step = 10 ** math.floor(math.log10(max(frame.width / 3, 1e-300)))
     return {
         "map_width": width,
         "map_height": height,
         "layers": _layers(content),
         "footprints_shown": len(content.images) <= _MOST_FOOTPRINTS,
-        "map_words": f"The map is {frame.width:.4g} units wide, {frame.width / step:.1f} times {step:g}. "
+        "map_words": f"The map is {frame.width:.4g} units wide. "
         + (
             "North is up. "
             if content.scene.origin.any()

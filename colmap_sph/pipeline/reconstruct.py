@@ -119,7 +119,7 @@ def run_project(
     started : float, optional
         When the run began, as `time.monotonic` tells; default: now.
     """
-    started = time.monotonic() if started is None else started
+    report = RunReport(started=started or time.monotonic())
     check_input(project, options, limit)
     if limit is not None:
         options = with_affordable_size(project, options, limit, overwrite=overwrite)
@@ -127,7 +127,7 @@ def run_project(
         project = project.absolute()  # workers have other current folders
     program_digests()  # kept from here on: an update meanwhile has no part in this run
     progress = Silent() if progress is None else progress
-    report = RunReport(command=command_of(project, options))
+    report.command = command_of(project, options)
     dense = open_workspace(project) if project.model is None else Workspace(project.root)
     with claimed(dense), executor_of(options, dense) as executor:
         prepared = prepare(
@@ -145,7 +145,6 @@ def run_project(
             overwrite=overwrite,
             verify=verify,
             limit=limit,
-            started=started,
         )
 
 
@@ -184,7 +183,6 @@ def reconstruct(
     pair_list: Path | None = None,
     needs_all: bool = False,
     limit: TimeLimit | None = None,
-    started: float | None = None,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
 
@@ -216,14 +214,11 @@ def reconstruct(
         Whether an image that is missing or damaged ends the run (`InputError`) before anything is made.
     limit : TimeLimit, optional
         The time to end within.
-    started : float, optional
-        When the run began, as `time.monotonic` tells; default: now.
 
     Returns
     -------
     RunReport
     """
-    started = time.monotonic() if started is None else started
     progress = Silent() if progress is None else progress
     report = report or RunReport()
     report.until = until
@@ -251,7 +246,7 @@ def reconstruct(
         else:
             context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), executor)
         judge_agreement(report, misplaced=misplaced)
-    write_report(context, started)
+    write_report(context)
     keep_or_make_page(context)
     refuse_disagreement(report)
     if until == "cloud" and not report.points:

@@ -1,5 +1,6 @@
 """What a run tells while it works and when it is done."""
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
@@ -75,6 +76,8 @@ class RunReport:
 
     Attributes
     ----------
+    started : float
+        When the command began, as `time.monotonic` tells; not in ``report.json``.
     command : str
         What to type to do the same again.
     images : int
@@ -159,6 +162,7 @@ class RunReport:
         Largest resident set of the process, or of a worker on another machine, bytes.
     """
 
+    started: float = field(default_factory=time.monotonic)
     command: str = ""
     images: int = 0
     skipped_images: dict[str, str] = field(default_factory=dict)

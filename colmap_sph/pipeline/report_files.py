@@ -56,21 +56,23 @@ def command_of(project: Project, options: RunOptions) -> str:
     return " ".join(map(shell_word, words))
 
 
-def write_report(context: Context, started: float) -> None:
-    """Write `report.json`: versions, options, and what the run, begun at `started`, tells of itself."""
+def write_report(context: Context) -> None:
+    """Write `report.json`: versions, options, and what the run tells of itself."""
     report = context.report
-    report.total_seconds = time.monotonic() - started
+    report.total_seconds = time.monotonic() - report.started
     report.peak_memory = max(report.peak_memory, most_resident())
     with atomic_file(context.workspace.report_path) as file:
         file.write(json.dumps(_content(context), indent=1, default=str).encode())
 
 
 def _content(context: Context) -> dict[str, Any]:
+    told = asdict(context.report)
+    del told["started"]
     return {
         "versions": versions(),
         "kernels": backend(),
         "options": asdict(context.options),
-        **asdict(context.report),
+        **told,
     }
 
 

@@ -46,21 +46,30 @@ def judge_agreement(report: RunReport, *, misplaced: float) -> None:
         Share of the images in which sparse points do not project to their observations, see `judge_reprojection`.
     """
     total = report.sparse_points
-    least = _REFUSED_SHARE_OF_MISPLACED if misplaced > 0.5 else _REFUSED_SHARE
+    is_enough = total.tested >= _FEWEST
     shares = {name: share for name, share in report.agreement.items() if share is not None}
     doubted = {name: share for name, share in shares.items() if share < _DOUBTED_SHARE}
     if not total.tested:
         logger.info("There are no sparse points to check the depth maps against")
-    elif total.tested >= _FEWEST and total.agreeing < least * total.tested:
+    elif is_enough and misplaced > 0.5 and total.agreeing < _REFUSED_SHARE_OF_MISPLACED * total.tested:
+        report.refusal = _refusal_of_misplaced(total)
+    elif is_enough and total.agreeing < _REFUSED_SHARE * total.tested:
         is_right = total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found
-        if misplaced > 0.5:
-            report.refusal = _refusal_of_misplaced(total)
-        elif is_right and total.agreeing >= _LEAST_SHARE * total.tested:
+        if is_right and total.agreeing >= _LEAST_SHARE * total.tested:
             _doubt(report, _hardly_matched(total))
         else:
             report.refusal = _refusal(total)
     elif doubted:
         _doubt(report, _doubts(doubted))
+
+
+def misplaced_views(scene: Scene) -> dict[str, float]:
+    """Images whose sparse points do not project to where they observe them, and by how many pixels (median)."""
+    return {
+        view.name: view.reprojection_error
+        for view in scene.views
+        if view.reprojection_error > max(_FAR_PIXELS, _FAR_SHARE * max(view.width, view.height))
+    }
 
 
 def judge_reprojection(report: RunReport, scene: Scene) -> float:
@@ -77,11 +86,7 @@ def judge_reprojection(report: RunReport, scene: Scene) -> float:
     float
         The share of such images, 0 to 1.
     """
-    far = {
-        view.name: view.reprojection_error
-        for view in scene.views
-        if view.reprojection_error > max(_FAR_PIXELS, _FAR_SHARE * max(view.width, view.height))
-    }
+    far = misplaced_views(scene)
     if far:
         shown = [f"{name} ({error:.0f} px)" for name, error in sorted(far.items(), key=lambda item: -item[1])]
         words = (

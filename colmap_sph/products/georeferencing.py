@@ -16,6 +16,7 @@ from colmap_sph.products.crs import from_gps, is_in_area, read_crs, utm_zone_of,
 from colmap_sph.products.georeference import Georeference, Residual, read_georeference, write_georeference
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.scene import Scene
 
 if TYPE_CHECKING:
     import pyproj
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _SHOWN = 12
+# Images look up, or are upside down, where the mean of their axes points so far from the right side.
+_MOSTLY = 0.5
 
 
 @dataclass(frozen=True)
@@ -109,7 +112,20 @@ def _aligned(workspace: Workspace, options: GeoreferenceOptions, source: Path) -
             )
         name = options.crs or ""
         found = align_by_points(workspace, table, options.marked_in, source)
+    _tell_head_stand(scene, found, source)
     return replace(found, crs=name, wkt="" if crs is None else wkt_of(crs))
+
+
+def _tell_head_stand(scene: Scene, found: Georeference, source: Path) -> None:
+    """Warn where images look up, or are upside down: places in one plane fit as well with x and y exchanged."""
+    looking = float(np.mean([found.rotation[2] @ view.R[2] for view in scene.views]))
+    upright = float(np.mean([found.rotation[2] @ -view.R[1] for view in scene.views]))
+    if looking > _MOSTLY or upright < -_MOSTLY:
+        logger.warning(
+            "By %s the model stands on its head: its images %s. Are x and y, or the sign of z, exchanged there?",
+            source,
+            "look up" if looking > _MOSTLY else "are upside down",
+        )
 
 
 def _on_map(

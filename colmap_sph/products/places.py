@@ -23,7 +23,7 @@ def check_places(workspace: Workspace, folder: Path, names: Iterable[str], *, ov
 
 
 def check_no_input(workspace: Workspace, folder: Path) -> None:
-    """Raise `OutputError` where products would lie among images, models, maps or records of a workspace."""
+    """Raise `OutputError` where products would lie among a workspace's files, or among the original images."""
     inputs = (
         workspace.images_dir,
         workspace.sparse_dir,
@@ -36,3 +36,12 @@ def check_no_input(workspace: Workspace, folder: Path) -> None:
     for place in inputs:
         if real.is_relative_to(real_path(place)):
             raise OutputError(f"{folder} lies in {place}, whose files are read; choose another --output.")
+    for path in workspace.images_dir.rglob("*"):
+        parts = path.relative_to(workspace.images_dir).parts
+        for levels in range(len(parts)):
+            # The folder may be one of those below the folder of all images.
+            is_below = real.parts[len(real.parts) - levels :] == parts[:levels]
+            if is_below and real.joinpath(*parts[levels:]).is_file():
+                raise OutputError(
+                    f"{folder} has images of the model, such as {path.name}; choose another --output."
+                )

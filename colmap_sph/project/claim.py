@@ -56,10 +56,14 @@ def shared(workspace: Workspace) -> Iterator[None]:
 
 
 def check_folder(root: Path) -> None:
-    """Raise `OutputError` where something that is no folder is in a workspace's place, or above it."""
+    """Raise `OutputError` where something that is no folder, or may not be written, is in a workspace's way."""
     there = next((path for path in (root, *root.parents) if os.path.lexists(path)), None)
     if there is not None and not there.is_dir():
         raise OutputError(f"{there} is no folder; choose another --output.")
+    if there not in (None, root) and not os.access(there, os.W_OK | os.X_OK):
+        raise OutputError(
+            f"The folder {root} cannot be created: {there.absolute()} may not be written; give another --output."
+        )
 
 
 def check_links(workspace: Workspace, *, is_given: bool) -> None:

@@ -96,11 +96,13 @@ def check_masks(
     Raises
     ------
     InputError
-        The folder does not exist or holds no mask for any of the images, or a mask cannot be read or is not of
-        its image's size.
+        The folder does not exist or holds no mask for any of the images, or a mask cannot be read, is not of its
+        image's size, or is the image itself.
     """
     if not folder.is_dir():
         raise InputError(f"The mask folder {folder} does not exist; check --masks.")
+    if real_path(folder) == real_path(image_dir):
+        _refuse_images(folder, cameras)
     masked = [
         name
         for name, camera in cameras.items()
@@ -115,6 +117,16 @@ def check_masks(
         they_are = "it is" if len(bare) == 1 else "they are"
         logger.warning("No mask in %s for %s: %s used whole", folder, _told(bare, "image"), they_are)
     return masked
+
+
+def _refuse_images(folder: Path, names: Iterable[str]) -> None:
+    """Raise `InputError` where images in a folder would be taken for their own masks: PNGs without any."""
+    for name in names:
+        if mask_path(folder, name) == folder / name:
+            raise InputError(
+                f"--masks {folder} is the folder of the images, and has no mask of {name}, which would count as "
+                "its own; give a folder of masks alone."
+            )
 
 
 def warn_of_unused_masks(folder: Path, names: Iterable[str], image_dir: Path) -> None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import is_pinhole
 from colmap_sph.project.given.binary_arrays import Observations, read_observations, read_points
+from colmap_sph.project.given.poses import check_points_in_front
 from colmap_sph.project.map_coordinates import is_plausible, local_origin
 from colmap_sph.project.sparse_model import is_text, load_model, model_files
 from colmap_sph.project.wide.cuts import Cut
@@ -23,9 +24,6 @@ logger = logging.getLogger(__name__)
 
 # A table has so many times as many places as there are points, at most.
 _MOST_GAPS = 8
-# Fewer observations of points say nothing of a model; of sound ones, nearly all points are in front of the image.
-_FEWEST = 30
-_LEAST_IN_FRONT = 0.1
 
 
 def read_scene(sparse_dir: Path) -> Scene:
@@ -119,21 +117,9 @@ def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse, cu
             logger.warning("%s: the pose or calibration in %s is impossible; left out", view.name, sparse_dir)
     if not usable:
         raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
-    _refuse_points_behind(usable, points, sparse_dir)
+    check_points_in_front(model, sparse_dir)
     views_by_name = tuple(sorted(usable, key=lambda view: view.name))
     return Scene(views_by_name, points, origin, image_ids=tuple(model.reg_image_ids()))
-
-
-def _refuse_points_behind(views: Sequence[View], points: NDArray[np.float64], sparse_dir: Path) -> None:
-    """Raise `InputError` where hardly any point is in front of the images that observe it."""
-    depths = [points[view.point_indices] @ view.R[2] + view.t[2] for view in views]
-    observed = sum(map(len, depths))
-    in_front = sum(int((depth > 0).sum()) for depth in depths)
-    if observed >= _FEWEST and in_front < _LEAST_IN_FRONT * observed:
-        raise InputError(
-            f"The sparse points of the model in {sparse_dir} lie behind the images that observe them: its poses "
-            "are not COLMAP's (camera from world, z forward) or not those of its points; export the model again."
-        )
 
 
 def _read_view(

@@ -46,8 +46,10 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
             "rename the image, and export the model from COLMAP again."
         ) from error
     except (RuntimeError, ValueError, IndexError, KeyError, MemoryError) as error:
+        rigs = " and ".join(path.name for path in files if path.stem in RIG_FILES)
+        stale = f", or delete {rigs} if they are of another model" if rigs else ""
         raise InputError(
-            f"The model in {sparse_dir} is damaged ({reason_of(error)}); export it from COLMAP again."
+            f"The model in {sparse_dir} is damaged ({reason_of(error)}); export it from COLMAP again{stale}."
         ) from error
     if not registered:
         raise InputError(

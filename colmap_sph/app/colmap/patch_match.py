@@ -1,5 +1,6 @@
 """`patch_match_stereo` in COLMAP's place: depth and normal maps of a dense workspace."""
 
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -51,9 +52,8 @@ def make_maps(
             workspace,
             options,
             progress=progress,
-            report=RunReport(command=command),
+            report=RunReport(command=command, started=started or time.monotonic()),
             until="geometric" if chosen.get("geom_consistency", True) else "photometric",
             pair_list=pair_list,
             needs_all=not chosen.get("allow_missing_files", False),
-            started=started,
         )

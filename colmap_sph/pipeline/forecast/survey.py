@@ -1,27 +1,32 @@
 """Stages → what there is of their results, and what the rest takes; nothing is made."""
 
+import logging
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from heapq import nlargest
 from typing import TypeVar
 
-from colmap_sph.errors import ColmapSphError
+from colmap_sph.errors import ColmapSphError, OptionError
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.input.good_images import with_good_images
+from colmap_sph.pipeline.input.good_images import with_good_images, without_misplaced
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.pipeline.stages.stage import Cost, Kept, Result, Stage
+from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.polishing.polished import starting_model
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairs import PairSelection
+
+logger = logging.getLogger(__name__)
 
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
@@ -125,12 +130,22 @@ class Survey:
 
 
 def _refuse_too_little(stage: Stage[Item, Task], costs: Mapping[Item, Cost]) -> None:
-    """Raise `OptionError` where the costliest job would never fit beside what the stage keeps."""
-    options = stage.context.options
+    """Raise `OptionError` where the costliest job would never fit beside what the stage keeps.
+
+    Images that nobody has looked at yet are taken to be sharp. Soft ones are matched in less memory, so it is only
+    told what sharp ones would take.
+    """
+    context = stage.context
     most = max(costs, key=lambda item: costs[item].memory)
-    gate = MemoryGate(options.memory_budget, options.num_threads)
-    with gate.keeping(stage.kept_memory(gate).total(gate.threads)):
-        gate.check(costs[most].memory, stage.label(most))
+    gate = MemoryGate(context.options.memory_budget, context.options.num_threads)
+    try:
+        with gate.keeping(stage.kept_memory(gate).total(gate.threads)):
+            gate.check(costs[most].memory, stage.label(most))
+    except OptionError as error:
+        is_looked_at = context.details.keys() >= context.scene.index_of.keys()
+        if is_looked_at or not isinstance(stage, MatchStage | VoteStage):
+            raise
+        logger.warning("%s This is for sharp images; soft ones take less, which the run will see.", error)
 
 
 def _memory_of(stage: Stage[Item, Task], costs: list[Cost]) -> float:
@@ -203,6 +218,7 @@ def foresee(
     context = with_good_images(
         Context(dense, scene, options, keys, report=report).in_region(), survey, to_come=to_come
     )
+    context = without_misplaced(context)
     there = None if foreseen is not None else dense
     key = context.keys.stage("selection", context.scene_key)
     selection = choose_pairs(there, context.scene, context.options, project.database(), scene_key=key)

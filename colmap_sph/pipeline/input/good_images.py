@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.self_check import misplaced_views
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.stage import keys_of
 from colmap_sph.stereo.rectification import sampling_of
@@ -20,6 +21,8 @@ logger = logging.getLogger(__name__)
 # Views cut from a wide photograph are finer than it towards their borders, and seem soft for that: together they
 # hold so many times what each says.
 _CUT_DETAIL = 1.3
+# Fewer points say nothing of an image's pose.
+_ENOUGH = 10
 
 
 def with_good_images(
@@ -55,6 +58,27 @@ def with_good_images(
         _report_detail(context, details)
     keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
     return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
+
+
+def without_misplaced(context: Context) -> Context:
+    """Leave out a few images of which the model contradicts itself: their depth would be wrong, and spoil others'.
+
+    Where half of the images are such, it may be the points or the image coordinates, see `judge_reprojection`.
+    """
+    views = context.scene.views
+    misplaced = {
+        name: error
+        for name, error in misplaced_views(context.scene).items()
+        if len(context.scene.view(name).point_indices) >= _ENOUGH
+    }
+    if not misplaced or len(misplaced) >= len(views) / 2:
+        return context
+    for name, error in misplaced.items():
+        reason = (
+            f"sparse points project {error:.0f} pixels from where it observes them: its camera or pose is wrong"
+        )
+        context.skip_view(name, reason)
+    return replace(context, scene=context.scene.only({view.name for view in views} - misplaced.keys()))
 
 
 def _report_detail(context: Context, details: Mapping[str, float]) -> None:

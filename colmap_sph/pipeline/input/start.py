@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.context import Context, Until, timed_stage
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
-from colmap_sph.pipeline.input.good_images import with_good_images
+from colmap_sph.pipeline.input.good_images import with_good_images, without_misplaced
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
@@ -74,6 +74,7 @@ def start(
     if needs_all and report.skipped_images:
         reason = next(iter(sorted(report.skipped_images.items())))[1]
         raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
+    context = without_misplaced(context)
     workspace.create_stereo_dirs(context.scene.index_of)
     selection = _selection(context, database, pair_list)
     context = replace(context, scene=wanted_scene(context.scene, selection))

@@ -1,5 +1,6 @@
 """A workspace → its mesh as PLY and GLB, by the method that is asked for."""
 
+import logging
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ from colmap_sph.project.meshing import poisson_mesh, simplify
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.region.map_axes import map_axes
+
+logger = logging.getLogger(__name__)
 
 _DEPTHS = (6, 13)
 # Depths of one surface, as the mesh and a view have it, differ by no more than this many pixels on it.
@@ -149,7 +152,15 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
     cloud = (workspace.local_dir / "fused.ply") if scene.origin.any() else workspace.fused_path
     if not cloud.is_file():
         raise InputError(f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run first.")
-    depth = int(np.clip(round(math.log2(max(_size(seen) / cell, 1.0))), *_DEPTHS))
+    wanted = round(math.log2(max(_size(seen) / cell, 1.0)))
+    depth = int(np.clip(wanted, *_DEPTHS))
+    if wanted > depth:
+        logger.warning(
+            "The mesh is coarser than the images, as poisson has %d cells along a side at most, not %d; give "
+            "--method tsdf, which has no such bound, for finer ones",
+            2**depth,
+            _size(seen) / cell,
+        )
     mesh = scratch / "poisson.ply"
     poisson_mesh(cloud, mesh, depth=depth, trim=request.options.trim, threads=request.threads)
     return read_ply(mesh)

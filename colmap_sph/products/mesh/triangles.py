@@ -89,7 +89,7 @@ def read_ply(path: Path) -> Triangles:
         count, corner = re.findall(r"property list (\w+) (\w+) ", header)[0]
         face = np.dtype([("count", _TYPES[count]), ("corners", _TYPES[corner], 3)])
         if not counts.get("vertex") or not counts.get("face"):
-            raise NoResultError("The mesh has no faces: there are too few points for a surface.")
+            raise NoResultError("The mesh has no faces: there are too few points for a surface; try --trim 0.")
         file.seek(end)
         vertices = np.fromfile(file, np.dtype(fields), counts["vertex"])
         faces = np.fromfile(file, face, counts["face"])

@@ -192,7 +192,7 @@ def _check_space(folder: Path, placement: Placement) -> None:
     free = free_space(folder)
     if needed > free:
         raise OutputError(
-            f"{folder} has room for {free >> 20} MiB, and {needed >> 20} MiB may be needed; make room, choose "
+            f"{folder} has room for {free >> 20} MiB, and may need {(needed >> 20) + 1} MiB; make room, choose "
             "another --output, or a larger --cell."
         )
 

@@ -15,6 +15,7 @@ import pycolmap
 
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import open_regular
+from colmap_sph.project.given.poses import normalize_rotations
 
 _POSE_BYTES = 7 * 8
 
@@ -39,6 +40,7 @@ def read_binary_model(files: list[Path]) -> pycolmap.Reconstruction:
         _check_file(path)
     model = pycolmap.Reconstruction()
     model.read_binary(files[0].parent)
+    normalize_rotations(model)
     return model
 
 

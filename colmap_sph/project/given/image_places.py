@@ -3,6 +3,7 @@
 import logging
 import os
 import unicodedata
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
@@ -21,6 +22,12 @@ _MAX_FACTOR = 16
 # Of images with the same problem so many are told one by one; of more the first in one sentence.
 _MOST_TOLD = 4
 _UNDISTORT = "give the sparse model with --model to have them undistorted anew"
+_REMEDIES: dict[object, str] = {
+    WrongSize: "give the images that the model was made from as --images",
+    "is damaged": "copy them again from where they came from",
+    "is empty": "copy them again from where they came from",
+    "cannot be": "check their permissions",
+}
 _SHARES = {2: "half", 3: "a third of", 4: "a quarter of", 8: "an eighth of"}
 _SLASHES = (
     'python -c "import pycolmap; m = pycolmap.Reconstruction({model!r}); '
@@ -31,8 +38,9 @@ _SLASHES = (
 def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     """Find the image folder of a model by COLMAP's usual layouts.
 
-    For the model ``X/sparse/0`` these are ``X/images``, ``X/sparse/images`` and ``X/sparse/0/images``. The
-    folder that holds most of the model's images is taken, the first among equals.
+    For the model ``X/sparse/0`` these are ``X/sparse/0/images``, ``X/sparse/images`` and ``X/images``. The folder
+    that holds most of the model's images is taken, the first among equals: for the model ``X/dense/sparse`` of a
+    workspace its own undistorted images, and not the originals in ``X/images``.
 
     Raises
     ------
@@ -42,7 +50,7 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     """
     # Of a link to a model both where it is and where it leads to.
     places = (Path.cwd() / model_dir, real_path(model_dir))
-    parents = [p for model in places for p in (model.parent.parent, model.parent, model)]
+    parents = [p for model in places for p in (model, model.parent, model.parent.parent)]
     folders = list(dict.fromkeys(parent / "images" for parent in parents))
     found = [sum((folder / name).is_file() for name in names) for folder in folders]
     if max(found) > 0:
@@ -105,8 +113,17 @@ def tell_problems(
                 "%d images in %s, each of which %s; left out: %s, …", len(names), folder, problem, first
             )
     if len(problems) == num_images:
-        remedy = _UNDISTORT if undistorted else "check --images"
+        remedy = _UNDISTORT if undistorted else _remedy(problems.values())
         raise InputError(f"None of the model's {num_images} images in {folder} is usable; {remedy}.")
+
+
+def _remedy(problems: Iterable[str]) -> str:
+    """What to do about the most frequent kind of problem."""
+    kinds = Counter(
+        WrongSize if isinstance(problem, WrongSize) else " ".join(problem.split()[:2]) for problem in problems
+    )
+    kind = kinds.most_common(1)[0][0]
+    return _REMEDIES.get(kind, "check --images")
 
 
 def other_spellings(files: Iterable[str], names: Iterable[str]) -> dict[str, str]:

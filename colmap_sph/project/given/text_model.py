@@ -20,6 +20,7 @@ import pycolmap
 
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import open_regular
+from colmap_sph.project.given.poses import normalize_rotations
 
 logger = logging.getLogger(__name__)
 
@@ -29,6 +30,9 @@ _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _SHOWN = 60
 _SAME_POSE = 1e-4
+# COLMAP's numbers of cameras and images have 32 bits, those of points 64; the last one stands for none.
+_END_OF_IDS = 2**32 - 1
+_END_OF_POINT_IDS = 2**64 - 1
 
 # Possessive, so that a line of any length is looked at once.
 _COUNT = rb"\d++"
@@ -106,7 +110,7 @@ def read_text_model(files: list[Path]) -> pycolmap.Reconstruction:
     lines = {path.name: _lines_of(path) for path in files}
     camera_ids = _checked_ids(lines["cameras.txt"], _CAMERA, _CAMERA_LINE)
     _check_parameters(lines["cameras.txt"])
-    point_ids = _checked_ids(lines["points3D.txt"], _POINT, _POINT_LINE)
+    point_ids = _checked_ids(lines["points3D.txt"], _POINT, _POINT_LINE, end=_END_OF_POINT_IDS)
     images, is_whole = _read_images(lines["images.txt"], camera_ids)
     model = pycolmap.Reconstruction()
     try:
@@ -117,6 +121,7 @@ def read_text_model(files: list[Path]) -> pycolmap.Reconstruction:
     except (IndexError, KeyError):
         _check_tracks(lines["points3D.txt"], images)
         raise
+    normalize_rotations(model)
     folder = files[0].parent
     _check_count(folder, "images", len(images), model.num_images())
     _check_count(folder, "points", len(point_ids), model.num_points3D())
@@ -145,18 +150,22 @@ def _has_mark(path: Path) -> bool:
         return file.read(len(_BYTE_ORDER_MARK)) == _BYTE_ORDER_MARK
 
 
-def _checked_ids(lines: list[_Line], pattern: re.Pattern[bytes], wanted: str) -> dict[int, int]:
+def _checked_ids(
+    lines: list[_Line], pattern: re.Pattern[bytes], wanted: str, *, end: int = _END_OF_IDS
+) -> dict[int, int]:
     """Return the number of the line of each id; every line but comments must be as the pattern says."""
     ids: dict[int, int] = {}
     for line in filter(_Line.is_told, lines):
         match = pattern.fullmatch(line.text)
         if match is None:
             raise line.refusal(f"this is not {wanted}")
-        _add_id(ids, int(match[1]), line)
+        _add_id(ids, int(match[1]), line, end=end)
     return ids
 
 
-def _add_id(ids: dict[int, int], key: int, line: _Line) -> None:
+def _add_id(ids: dict[int, int], key: int, line: _Line, *, end: int = _END_OF_IDS) -> None:
+    if key >= end:
+        raise line.refusal(f"its number is too large, as COLMAP's end at {end - 1}")
     if key in ids:
         raise line.refusal(f"the number {key} is that of line {ids[key]}, too")
     ids[key] = line.number
@@ -244,7 +253,9 @@ def _check_tracks(lines: list[_Line], images: list[_Image]) -> None:
     for line in filter(_Line.is_told, lines):
         words = line.text.split()[8:]
         for image_id, feature in zip(map(int, words[::2]), map(int, words[1::2]), strict=True):
-            if feature >= num_features.get(image_id, 0):
+            if image_id not in num_features:
+                raise line.refusal(f"images.txt has no image {image_id}, which observes it")
+            if feature >= num_features[image_id]:
                 raise line.refusal(f"image {image_id} in images.txt has no feature {feature}")
 
 

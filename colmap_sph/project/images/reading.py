@@ -63,6 +63,8 @@ def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -
             if is_link(path) and not path.exists():
                 return "is a link to a file that is missing"
             return "is not a regular file" if path.exists() else "is missing"
+        if not path.stat().st_size:
+            return "is empty"
         header = read_header(path)
         # Before anything is decoded: a small file can hold a huge image.
         if (header.width, header.height) != (width, height):

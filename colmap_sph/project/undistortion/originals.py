@@ -1,6 +1,7 @@
 """What is to be undistorted: a sparse model, its images and their masks, found."""
 
 import hashlib
+import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -10,6 +11,7 @@ import pycolmap
 from colmap_sph.errors import InputError
 from colmap_sph.project.files import real_path
 from colmap_sph.project.given.image_places import find_images
+from colmap_sph.project.given.poses import check_points_in_front
 from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.files import LENS_FIELDS_NAME, read_lens_fields
 from colmap_sph.project.project import Project
@@ -17,6 +19,8 @@ from colmap_sph.project.sparse_model import image_names, load_model, model_files
 from colmap_sph.project.undistortion.options import UndistortionOptions
 from colmap_sph.project.wide.cuts import NO_CUTS, Cuts
 from colmap_sph.project.workspace import Workspace, checked_name, mask_path
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +107,12 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
     Raises
     ------
     InputError
-        No readable model, a camera that is no lens, damaged lens fields, or no images.
+        No readable model, points behind its images, a camera that is no lens, damaged lens fields, or no images.
     """
     assert project.model is not None
     model = load_model(project.model)
+    check_points_in_front(model, project.model)
+    _tell_newer_text(project.model)
     images = project.images
     if images is None:
         images = find_images(project.model, image_names(model))
@@ -117,3 +123,18 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
         )
     fields = read_lens_fields(project.model)
     return Originals(project.model, images, project.masks, model, fields, options.cuts(model, project.model))
+
+
+def _tell_newer_text(model_dir: Path) -> None:
+    """Warn of text files, maybe edited, that are not read, as there are binary ones."""
+    binary = [path for path in model_files(model_dir) if path.suffix == ".bin"]
+    text = [path.with_suffix(".txt") for path in binary if path.with_suffix(".txt").is_file()]
+    newest = max((path.stat().st_mtime for path in binary), default=0.0)
+    newer = [path.name for path in text if path.stat().st_mtime > newest]
+    if newer:
+        logger.warning(
+            "%s has binary and text files, and as by COLMAP the binary ones are read, though newer are %s; delete "
+            "the binary ones if the text is meant",
+            model_dir,
+            ", ".join(newer),
+        )
