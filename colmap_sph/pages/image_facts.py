@@ -118,7 +118,7 @@ def facts_of_image(
     return ImageFacts(
         view.name,
         tuple((counts / reasons.size).tolist()),
-        int((samples.photometric > 0).sum()) / max(reasons.size - int(counts[Reason.OUTSIDE]), 1),
+        int(((samples.photometric > 0) & (reasons != Reason.OUTSIDE)).sum()) / max(reasons.size - int(counts[Reason.OUTSIDE]), 1),
         gsd,
         samples.has_maps,
         pictures,
