@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 # Processor seconds per megapixel of the image: per pair that votes; and of the normals of one kind of maps, for
 # each pixel of the radius of their windows.
-_SECONDS = 0.033
+_SECONDS = 0.027
 _NORMALS_SECONDS = 0.027
 # Estimates reach so many pixels beyond the region that maps are cut to: what windows at its border look at.
 REGION_MARGIN = 24
