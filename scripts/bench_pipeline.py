@@ -63,9 +63,9 @@ def command() -> list[str]:
 
 
 def depth_map_pixels(workspace: Path) -> int:
-    """Pixels of all photometric depth maps, from the headers ``width&height&channels&``."""
+    """Pixels of all geometric depth maps, from the headers ``width&height&channels&``."""
     pixels = 0
-    for path in (workspace / "stereo" / "depth_maps").rglob("*.photometric.bin"):
+    for path in (workspace / "stereo" / "depth_maps").rglob("*.geometric.bin"):
         with path.open("rb") as file:
             width, height = file.read(64).split(b"&")[:2]
         pixels += int(width) * int(height)

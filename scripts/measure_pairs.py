@@ -23,7 +23,7 @@ from colmap_sph.app.evaluate_command import exact_depth_views
 from colmap_sph.errors import ColmapSphError
 from colmap_sph.evaluation import DepthView
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.stages.pair_files import read_pair
+from colmap_sph.pipeline.stages.pair_files import read_estimate, read_pair
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -121,7 +121,7 @@ def map_table(workspace: Workspace, exact: list[DepthView], scene: Scene, covera
     empty = {view.name: view.read_depth() == 0 for view in exact}
     rows = []
     for kind in ("photometric", "geometric"):
-        depths = {view.name: read_depth_map(workspace.depth_map_path(view.name, kind)) for view in scene.views}
+        depths = {view.name: _depth_of(workspace, view, kind) for view in scene.views}
         counts = [_count_map(view, depths[view.name], maps.known(view)) for view in scene.views]
         known, covered, percent, gsd = np.sum(counts, axis=0)
         cells = [covered / max(known, 1), percent / max(covered, 1), gsd / max(covered, 1)]
@@ -130,6 +130,13 @@ def map_table(workspace: Workspace, exact: list[DepthView], scene: Scene, covera
         rows.append([kind, f"{coverage:.3f}" if kind == "geometric" else "-", *(f"{cell:.3f}" for cell in cells)])
     header = ["maps", "coverage", "found of truth", "of found: < 1 %", "< 1 GSD", "found where nothing is"]
     return table(header, rows)
+
+
+def _depth_of(workspace: Workspace, view: View, kind: str) -> found.Map:
+    """The depth that a view's pairs voted for, or its geometric map."""
+    if kind == "photometric":
+        return read_estimate(workspace.photometric_dir / f"{view.name}.sph", view).depth
+    return read_depth_map(workspace.depth_map_path(view.name, "geometric"))
 
 
 def _count_map(view: View, depth: found.Map, truth: found.Map) -> tuple[int, int, int, int]:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import SMALL_BLOCK
 
-from colmap_sph.app import cli
+from colmap_sph.app import cli, demo
 from colmap_sph.app.demo import DemoResult, run_demo
 from colmap_sph.errors import OutputError
 from colmap_sph.evaluation import mean_of_depth_maps
@@ -51,7 +51,7 @@ def test_cloud_against_exact_surface(result: DemoResult) -> None:
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(cli, "run_demo", partial(run_demo, block=TINY))
+    monkeypatch.setattr(demo, "run_demo", partial(run_demo, block=TINY))
     for _ in range(2):  # an earlier demo is replaced
         assert cli.main(["demo", "--output", str(tmp_path / "demo"), "--threads", "2"]) == 0
         captured = capsys.readouterr()

@@ -161,6 +161,39 @@ def test_rays_are_found_in_the_map_to_a_millionth_of_a_pixel(scale, flatness):
             assert read == pytest.approx(0.6 if along_rows else 0.3, abs=1e-6 * finer)
 
 
+@pytest.mark.parametrize("flatness", [0.0, 0.7])
+@pytest.mark.parametrize(
+    ("focal_length", "angle"),
+    [(3000.0, 0.3), (3000.0, 1.3), (400.0, 0.3), (400.0, 1.2), (60.0, 0.3), (60.0, 1.2), (60.0, 1.6), (60.0, 2.2)],
+)
+def test_rays_between_others_are_found_to_a_ten_thousandth_of_a_pixel(focal_length, angle, flatness):
+    """Most of an image's rays are interpolated, but not where they turn fast, as at an epipole: a ramp tells."""
+    width, height, scale = 300, 12, focal_length
+    turn = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+    matrix = turn @ np.linalg.inv([[focal_length, 0, width / 2], [0, focal_length, 5.3], [0, 0, 1.0]])
+    columns, rows = np.meshgrid(np.arange(width), np.arange(height))
+    x, y, z = np.einsum("ij,jhw->ihw", matrix, np.stack([columns, rows, np.ones_like(rows)]))
+    across = np.hypot(y, z)
+    angles = np.arctan2(x, across)
+    flattened = np.tan(flatness * angles) / flatness if flatness else angles
+    u, v = flattened * scale, np.arctan2(y, z) * scale
+    # Around the middle of all rays, as much as there is room for.
+    origins = (np.median(u) - 250.3, np.median(v) - 250.6)
+    u, v = u - origins[0], v - origins[1]
+    ramp = (1 + 0.2 * np.arange(500) + 0.1 * np.arange(500)[:, None]).astype(np.float32)
+    depth, sigma = np.empty((height, width), np.float32), np.empty((height, width), np.float32)
+    geometry = ramp, matrix, (scale, scale), origins, 0.0, 1.0, 1.0, 5.0, True, flatness, True, 0
+    _native.depth_candidates(backend(), *geometry, depth, sigma)
+    inside = (u > 0) & (u < 499) & (v > 0) & (v < 499) & (depth > 0)
+    inside &= across > 0.2 * np.hypot(x, across)  # next to the epipole 32-bit depths do not tell as much
+    assert inside.sum() > 50
+    there = angles - np.arctan2(across, depth * (x**2 + across**2) - x)
+    seen = np.tan(flatness * there) / flatness if flatness else there
+    read, expected = ((flattened - seen) * scale)[inside], (1 + 0.2 * u + 0.1 * v)[inside]
+    finer = 1 / np.cos(flatness * angles[inside]) ** 2
+    np.testing.assert_array_less(np.abs(read - expected), 5e-5 * finer)
+
+
 @pytest.mark.parametrize("options", [SPHERE, ANGLES, FRAME], ids=["sphere", "equal angles", "frame"])
 def test_candidates_do_not_depend_on_the_backend(options, monkeypatch):
     synthetic = RENDERED["convergent"]

@@ -38,6 +38,7 @@ from colmap_sph.project.state.records import invalidate
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import NO_SCENE
 from colmap_sph.stereo.anchor import anchored
+from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.partners.pairs import select_pairs
 
 GIB = 1 << 30
@@ -148,7 +149,7 @@ def test_a_result_half_done_is_not_begun_anew(tmp_path: Path) -> None:
     render_four_images(tmp_path)
     workspace = prepare(tmp_path / "sparse/0", tmp_path / "dense")
     workspace.create_stereo_dirs(FOUR_NAMES)
-    options = RunOptions(threads=2)
+    options = RunOptions(threads=2, fusion=FusionOptions(input="photometric"))
     scene = anchored(read_scene(workspace.sparse_dir))
     context = with_good_images(Context(workspace, scene, options, Keys(workspace, options)), execute)
     pairs = select_pairs(scene, options.pairs).unique_pairs()

@@ -28,6 +28,7 @@ from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.cloud_files import join_parts, write_part
 from colmap_sph.project.colmap_fusion import fuse_by_colmap
+from colmap_sph.project.files import whole_digest
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.pair_lists import write_fusion_cfg
 from colmap_sph.project.scene_reader import read_scene
@@ -200,7 +201,8 @@ def test_parts_are_joined_in_the_order_given(tmp_path):
         assert write_part(stem, bands) == number
         bodies.append(body.tobytes())
         words.append(listed.tobytes())
-    join_parts(stems[::-1], tmp_path, 3)
+    digests = join_parts(stems[::-1], tmp_path, 3)
+    assert digests == (whole_digest(tmp_path / "fused.ply"), whole_digest(tmp_path / "fused.ply.vis"))
     assert read_fused(tmp_path / "fused.ply").tobytes() == b"".join(bodies[::-1])
     visible = (tmp_path / "fused.ply.vis").read_bytes()
     assert visible == np.array(3, "<u8").tobytes() + b"".join(words[::-1])

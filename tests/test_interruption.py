@@ -144,7 +144,7 @@ def test_stages_of_file_operations(scripts_on_path: None) -> None:
     ("moment", "number", "code"),
     [
         ("colmap_sph/pairs/*/*.sph", *STOPS[0]),
-        ("stereo/depth_maps/*.photometric.bin", *STOPS[1]),
+        ("colmap_sph/photometric/*.sph", *STOPS[1]),
         ("stereo/depth_maps/*.geometric.bin", *STOPS[0]),
     ],
 )
@@ -263,7 +263,7 @@ def size_of(dense: Path, *patterns: str) -> int:
 WRITTEN = [
     ("undistort", ["images/*", "sparse/*"]),
     ("pairs", ["colmap_sph/pairs/*/*"]),
-    ("photometric maps", ["colmap_sph/photometric/*", "stereo/*/*.photometric.bin"]),
+    ("photometric depth", ["colmap_sph/photometric/*"]),
     ("geometric maps", ["stereo/*/*.geometric.bin"]),
     ("cloud", ["fused*"]),
 ]

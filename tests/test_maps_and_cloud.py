@@ -74,7 +74,7 @@ def test_a_run_that_was_ended_before_fusion(dense: Path, finished: FinishedRun) 
     names = sorted(finished.report.coverage)
     assert is_cloud_of(workspace, [(name, "geometric") for name in names])
     path = workspace.depth_map_path(names[0], "geometric")
-    path.write_bytes(workspace.depth_map_path(names[0], "photometric").read_bytes())
+    path.write_bytes(workspace.depth_map_path(names[1], "geometric").read_bytes())
     assert is_cloud_of(workspace, [(name, "geometric") for name in names]) is False
     assert "the cloud is of other depth maps" in write_page(workspace)
     assert not shows_cloud(page_of(dense))

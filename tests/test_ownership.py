@@ -27,7 +27,7 @@ from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.normals import NormalOptions
 
-REFUSED = r"depth_maps/N_0_0\.jpg\.photometric\.bin and 17 more files were not made by this program.*--overwrite"
+REFUSED = r"depth_maps/N_0_0\.jpg\.geometric\.bin and 9 more files were not made by this program.*--overwrite"
 OTHER_FUSION: dict[str, Any] = {"fusion": FusionOptions(max_reproj_error=0.7)}
 
 
@@ -79,11 +79,11 @@ def test_overwrite_keeps_what_others_made_under_other_names(
     (foreign / "meshed.ply").write_text("of the user")
     whole = files_in(foreign)
     make_plan(Project(workspace=foreign), OPTIONS, overwrite=True)
-    assert "Would get another name" in caplog.text and "and 15 more files" in caplog.text
+    assert "Would get another name" in caplog.text and "and 7 more files" in caplog.text
     assert files_in(foreign) == whole
     caplog.clear()
     assert cli.main(["run", "--workspace", str(foreign), "--threads", "2", "--overwrite"]) == 0
-    assert "and 15 more files were not made by this program" in " ".join(capsys.readouterr().err.split())
+    assert "and 7 more files were not made by this program" in " ".join(capsys.readouterr().err.split())
     assert backups(foreign) == {f"{name}.backup": content for name, content in before.items()}
     assert (foreign / "meshed.ply").read_text() == "of the user"
     # From now on they are ours.
@@ -381,7 +381,6 @@ def test_a_map_damaged_deep_inside_is_noticed_as_it_is_read(name: str, method: A
 DAMAGED = {
     f"stereo/{MAPS[0]}": {"confirm depth": 1},
     f"stereo/{MAPS[1]}": {"confirm depth": 1},
-    "stereo/normal_maps/N_0_1.jpg.photometric.bin": {"vote on depth": 1},
     "fused.ply": {"fuse": 1},
 }
 

@@ -28,10 +28,13 @@ from colmap_sph.pages.words import duration
 from colmap_sph.pipeline import report_files
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report_files import command_of
+from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.pair_files import write_estimate
 from colmap_sph.project.map_files import read_depth_map, write_depth_map, write_normal_map
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.partners.pairs import PairOptions
 
@@ -418,6 +421,28 @@ def test_samples_are_pixels_of_the_maps(tmp_path: Path) -> None:
         whole = read_depth_map(workspace.depth_map_path("a.png", kind))  # type: ignore[arg-type]
         assert np.array_equal(found, whole[np.ix_(samples.rows, samples.columns)])
     assert 40 <= found.shape[1] <= 50
+
+
+@pytest.mark.parametrize("corner", [(0, 0), (7, 5)])
+def test_samples_of_what_was_voted_where_there_is_no_map_of_it(tmp_path: Path, corner: tuple[int, int]) -> None:
+    """Of all of the image, or of the part of it that shows a region."""
+    workspace = ground_workspace(tmp_path / "dense", NAMES[:1])
+    (view,) = read_scene(workspace.sparse_dir).views
+    left, top = corner
+    voted = np.zeros((view.height, view.width), np.float32)
+    voted[top:, left:] = 1 + np.random.default_rng(0).random((view.height - top, view.width - left), np.float32)
+    part = np.ascontiguousarray(voted[top:, left:])
+    estimate = DepthEstimate(part, part, np.ones(part.shape, np.uint8))
+    path = workspace.photometric_dir / "a.png.sph"
+    path.parent.mkdir(parents=True)
+    workspace.depth_map_path("a.png", "photometric").unlink()
+    assert not read_samples(workspace, view, 50).photometric.any()
+    write_estimate(path, estimate, "key", Facts(), corner=corner)
+    samples = read_samples(workspace, view, 50)
+    assert np.array_equal(samples.photometric, voted[np.ix_(samples.rows, samples.columns)])
+    assert not samples.has_photometric
+    write_estimate(path, estimate, "key", Facts(), corner=(left + 1, top))  # it reaches beyond the image
+    assert not read_samples(workspace, view, 50).photometric.any()
 
 
 def test_reduced_maps_are_shown(tmp_path: Path) -> None:

@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from colmap_sph.errors import DamageError, InputError, OutputError
+from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import (
+    facts_of_estimate,
     facts_of_pair,
-    is_estimate_there,
     read_estimate,
     read_pair,
     write_estimate,
@@ -258,9 +259,10 @@ def test_arrays_of_another_size_are_not_allocated(tmp_path: Path) -> None:
     view = View(1, "a.jpg", 9, 6, np.eye(3), np.eye(3), np.zeros(3), np.zeros(0, np.int64))
     zeros = np.zeros((6, 9), np.float32)
     estimate = DepthEstimate(zeros, zeros, zeros.astype(np.uint8))
-    write_estimate(path, estimate, "key")
-    assert is_estimate_there(path, "key", view)
-    assert not is_estimate_there(path, "other", view)
+    facts = Facts(coverage=0.25, in_region=0.5)
+    write_estimate(path, estimate, "key", facts)
+    assert facts_of_estimate(path, "key", view) == facts
+    assert facts_of_estimate(path, "other", view) is None
     assert read_estimate(path, view).support.shape == (6, 9)
     with path.open("r+b") as file:
         bomb = [(np.dtype(kind), (20000, 20000)) for kind in ("<f4", "<f4", "<u1")]
@@ -268,7 +270,7 @@ def test_arrays_of_another_size_are_not_allocated(tmp_path: Path) -> None:
         size = file.write(array_file._packed(head))
         file.truncate(size + 9 * 20000**2)
     assert read_head(path) is not None
-    assert not is_estimate_there(path, "key", view)
+    assert facts_of_estimate(path, "key", view) is None
 
     def read() -> None:
         with pytest.raises(DamageError, match="of the size expected"):

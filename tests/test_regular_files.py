@@ -73,7 +73,7 @@ def test_a_regular_file_is_read_and_nothing_else(tmp_path: Path) -> None:
         # What this program made is made again.
         ("stereo/fusion.cfg", 0, ""),
         (f"stereo/depth_maps/{NAMES[0]}.geometric.bin", 0, ""),
-        (f"stereo/normal_maps/{NAMES[0]}.photometric.bin", 0, ""),
+        (f"colmap_sph/photometric/{NAMES[0]}.sph", 0, ""),
         ("colmap_sph/cloud.json", 0, ""),
         (f"colmap_sph/state/{NAMES[0]}.geometric.json", 0, ""),
         ("colmap_sph/report.json", 0, ""),

@@ -84,7 +84,7 @@ def results(dense: Path) -> dict[str, tuple[int, bytes]]:
     """Time stamp and content of everything that a stage wrote, but for the cloud's and the maps' records."""
     files = [*dense.glob("stereo/*_maps/*.bin"), *Workspace(dense).cloud_paths]
     files += [*dense.glob("colmap_sph/pairs/*/*"), *dense.glob("colmap_sph/photometric/*")]
-    assert len(files) == 4 * 4 + 2 + 6 + 4
+    assert len(files) == 2 * 4 + 2 + 6 + 4
     return {str(path.relative_to(dense)): (path.stat().st_mtime_ns, path.read_bytes()) for path in files}
 
 
@@ -93,11 +93,10 @@ def rewritten(before: dict[str, tuple[int, bytes]], dense: Path) -> set[str]:
     return {name for name in before if after[name][0] != before[name][0]}
 
 
-def expected_files(*, pairs: int, votes: int, photometric: int, geometric: int, cloud: bool) -> dict[str, int]:
+def expected_files(*, pairs: int, votes: int, geometric: int, cloud: bool) -> dict[str, int]:
     return {
         "pairs": pairs,
         "votes": votes,
-        "photometric maps": 2 * photometric,
         "geometric maps": 2 * geometric,
         "cloud": 2 * cloud,
     }
@@ -107,7 +106,6 @@ def counted(files: set[str]) -> dict[str, int]:
     return {
         "pairs": sum(name.startswith("colmap_sph/pairs/") for name in files),
         "votes": sum(name.startswith("colmap_sph/photometric/") for name in files),
-        "photometric maps": sum(name.endswith(".photometric.bin") for name in files),
         "geometric maps": sum(name.endswith(".geometric.bin") for name in files),
         "cloud": sum(name.startswith("fused") for name in files),
     }
@@ -139,33 +137,29 @@ def test_time_stamps_threads_and_place_do_not_matter(finished: Finished) -> None
 
 # ---- options and inputs that changed -----------------------------------------------------------------------
 
-EVERYTHING = expected_files(pairs=6, votes=4, photometric=4, geometric=4, cloud=True)
+EVERYTHING = expected_files(pairs=6, votes=4, geometric=4, cloud=True)
 CHANGES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "matching": ({"matching": MatchingOptions(p1=12)}, EVERYTHING),
     "rectification": ({"rectification": RectificationOptions(near_margin=2.2)}, EVERYTHING),
     "depth": (
         {"vote": VoteOptions(tolerance=2.5)},
-        expected_files(pairs=0, votes=4, photometric=4, geometric=4, cloud=True),
+        expected_files(pairs=0, votes=4, geometric=4, cloud=True),
     ),
     "consistency": (
         {"confirm": ConfirmOptions(max_contradiction=0.7)},
-        expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
+        expected_files(pairs=0, votes=0, geometric=4, cloud=True),
     ),
     "normals": (
         {"normals": NormalOptions(radius=3)},
-        expected_files(pairs=0, votes=0, photometric=4, geometric=4, cloud=True),
+        expected_files(pairs=0, votes=0, geometric=4, cloud=True),
     ),
     "refinement": (
         {"refinement": RefinementOptions(rounds=1)},
-        expected_files(pairs=0, votes=0, photometric=0, geometric=4, cloud=True),
+        expected_files(pairs=0, votes=0, geometric=4, cloud=True),
     ),
     "fusion": (
         {"fusion": FusionOptions(max_reproj_error=0.7)},
-        expected_files(pairs=0, votes=0, photometric=0, geometric=0, cloud=True),
-    ),
-    "fusion input": (
-        {"fusion": FusionOptions(input="photometric")},
-        expected_files(pairs=0, votes=0, photometric=0, geometric=0, cloud=True),
+        expected_files(pairs=0, votes=0, geometric=0, cloud=True),
     ),
 }
 
@@ -183,6 +177,25 @@ def test_changed_options_redo_what_depends_on_them(what: str, finished: Finished
     finished.rerun()
     after = results(finished.dense)
     assert {name for name in before if after[name][1] != before[name][1]} == set()
+
+
+def test_photometric_maps_are_made_only_where_they_are_fused(finished: Finished) -> None:
+    """From the votes that are there; and they do not outlive these."""
+
+    def maps() -> list[Path]:
+        return sorted(finished.dense.glob("stereo/*/*.photometric.bin"))
+
+    fused: dict[str, Any] = {"fusion": FusionOptions(input="photometric")}
+    assert maps() == []
+    report = finished.rerun(**fused)
+    assert report.made == NOTHING | {"vote on depth": 4, "fuse": 1}
+    assert len(maps()) == 2 * 4
+    before = [path.read_bytes() for path in maps()]
+    assert finished.rerun(**fused).made == NOTHING
+    assert finished.rerun().made == NOTHING | {"fuse": 1}
+    assert [path.read_bytes() for path in maps()] == before
+    assert finished.rerun(vote=VoteOptions(tolerance=2.5)).made["vote on depth"] == 4
+    assert maps() == []
 
 
 def test_fewer_pairs_keep_their_disparity_maps(finished: Finished) -> None:
@@ -207,7 +220,7 @@ def test_a_changed_image_redoes_its_pairs(finished: Finished) -> None:
     assert {name for name in files if "pairs/" in name} == {
         name for name in before if "pairs/" in name and number in name
     }
-    assert counted(files) == expected_files(pairs=3, votes=4, photometric=4, geometric=4, cloud=True)
+    assert counted(files) == expected_files(pairs=3, votes=4, geometric=4, cloud=True)
 
 
 def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> None:
@@ -295,7 +308,6 @@ def alter(path: Path) -> None:
 DAMAGED = {
     "disparity map": ("colmap_sph/pairs/*/*.sph", {"match pairs": 1}),
     "estimate": ("colmap_sph/photometric/*.sph", {"vote on depth": 1}),
-    "photometric map": ("stereo/depth_maps/*.photometric.bin", {"vote on depth": 1}),
     "geometric map": ("stereo/normal_maps/*.geometric.bin", {"confirm depth": 1}),
     "cloud": ("fused.ply", {"fuse": 1}),
     "visibility": ("fused.ply.vis", {"fuse": 1}),
@@ -379,7 +391,7 @@ def test_a_spoilt_disparity_map_costs_its_images_and_is_made_again(finished: Fin
 
 @pytest.mark.parametrize(
     "what",
-    ["match.match_pair", "vote.vote_depth", "confirm.confirm_depth", "vote.fit_normals", "confirm.refine_maps"],
+    ["match.match_pair", "vote.vote_depth", "confirm.confirm_depth", "confirm.fit_normals", "confirm.refine_maps"],
 )
 def test_memory_refused_once(what: str, finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:
     """One item fails, the rest goes on, and the next run completes the work."""

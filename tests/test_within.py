@@ -188,7 +188,7 @@ def test_it_arrives_whatever_the_speed(factor: float, share: float, context: Con
     asked = least + share * (most - least)
     simulation = Simulation(context, steady(factor))
     settings = simulation.run(asked)
-    assert simulation.now == pytest.approx(asked, rel=0.15)
+    assert simulation.now == pytest.approx(asked, rel=0.17)  # the rungs of so few images are a sixth apart
     assert LADDER[0] != settings != BEST
 
 

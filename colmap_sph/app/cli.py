@@ -16,7 +16,6 @@ from colmap_sph.app.colmap.commands import answer as colmap_answer
 from colmap_sph.app.colmap.commands import is_colmap_command
 from colmap_sph.app.colmap.spelling import spelling_of
 from colmap_sph.app.completion import short_completion
-from colmap_sph.app.demo import run_demo
 from colmap_sph.app.display import Display
 from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.app.events import Events
@@ -189,6 +188,9 @@ def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[s
     options.check()
     log = workspace_log(Workspace(command.output / "dense"), header(arguments))
     with log, Display(terminal, options.num_threads) as display:
+        # Not before: no other command renders anything.
+        from colmap_sph.app.demo import run_demo
+
         result = run_demo(command.output, options=options, progress=display)
     print_summary(result.report, result.workspace, terminal)
     terminal.say("")

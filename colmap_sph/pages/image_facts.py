@@ -114,11 +114,12 @@ def facts_of_image(
     """Count what became of a view's samples; see `ImageFacts`."""
     counts = np.bincount(reasons.ravel(), minlength=len(Reason))
     confirmed = samples.geometric > 0
+    voted = (samples.photometric > 0) & (reasons != Reason.OUTSIDE)
     gsd = float(np.median(samples.geometric[confirmed]) / view.K[0, 0]) if confirmed.any() else None
     return ImageFacts(
         view.name,
         tuple((counts / reasons.size).tolist()),
-        int((samples.photometric > 0).sum()) / max(reasons.size - int(counts[Reason.OUTSIDE]), 1),
+        int(voted.sum()) / max(reasons.size - int(counts[Reason.OUTSIDE]), 1),
         gsd,
         samples.has_maps,
         pictures,

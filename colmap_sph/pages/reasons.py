@@ -103,7 +103,7 @@ def find_reasons(
     reasons[has_own & unseen] = Reason.ONE_IMAGE
     reasons[samples.ignored] = Reason.MASKED
     if region is not None:
-        reasons[~_shows(region, view, samples, depth) & ~has_own] = Reason.OUTSIDE
+        reasons[~_shows(region, view, samples, depth)] = Reason.OUTSIDE
     reasons[samples.geometric > 0] = Reason.CONFIRMED
     return reasons, depth
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.project.map_files import map_size, read_some_pixels
 from colmap_sph.project.masks import read_mask
+from colmap_sph.project.state.array_file import SUFFIX, first_array
 from colmap_sph.project.wide.projection import Lens
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import View
@@ -42,7 +43,7 @@ class MapSamples:
     photometric, geometric : (h, w) float32 ndarray
         Depths, 0 = none.
     has_photometric, has_geometric : bool
-        Whether there are such maps.
+        Whether there are such maps. Where there is no photometric map, the depths are those that were voted.
     ignored : (h, w) bool ndarray
         Under the mask.
     """
@@ -61,8 +62,8 @@ class MapSamples:
 
     @property
     def has_maps(self) -> bool:
-        """Whether there is any map of the view."""
-        return self.has_photometric or self.has_geometric
+        """Whether there is any depth of the view to show."""
+        return self.has_photometric or self.has_geometric or bool(self.photometric.any())
 
 
 def grid_of(view: View | Lens, per_side: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -93,10 +94,11 @@ def read_samples(
         _depth(workspace, view, kind, rows, columns) if kind in kinds else None for kind in get_args(MapKind)
     )
     none = np.zeros((len(rows), len(columns)), np.float32)
+    voted = _voted(workspace, view, rows, columns) if photometric is None and "photometric" in kinds else None
     return MapSamples(
         rows,
         columns,
-        none if photometric is None else photometric,
+        next(depth for depth in (photometric, voted, none) if depth is not None),
         none if geometric is None else geometric,
         photometric is not None,
         geometric is not None,
@@ -131,6 +133,29 @@ def _depth(
         depth = _read(path, view, 1, rows, columns)
     except InputError:
         return None
+    return _sound(depth)
+
+
+def _voted(
+    workspace: Workspace, view: View, rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float32] | None:
+    """What was voted for pixels of a view, maybe in a part of it only; None where there is nothing of it."""
+    try:
+        head, voted = first_array(workspace.photometric_dir / f"{view.name}{SUFFIX}", "estimate")
+        left, top = map(int, head.numbers[:2])
+        height, width = voted.shape
+    except (OSError, ValueError, OverflowError):
+        return None
+    if left < 0 or top < 0 or left + width > view.width or top + height > view.height:
+        return None
+    depth = np.zeros((len(rows), len(columns)), np.float32)
+    in_rows = (rows >= top) & (rows < top + height)
+    in_columns = (columns >= left) & (columns < left + width)
+    depth[np.ix_(in_rows, in_columns)] = voted[np.ix_(rows[in_rows] - top, columns[in_columns] - left)]
+    return _sound(depth)
+
+
+def _sound(depth: NDArray[np.float32]) -> NDArray[np.float32]:
     depth[~((depth > 0) & (depth < _FARTHEST))] = 0
     return depth
 

@@ -7,7 +7,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -201,16 +201,16 @@ class Context:
     @property
     def places(self) -> list[Place]:
         """All that the run writes in COLMAP's formats."""
-        names = [view.name for view in self.scene.views]
-        maps = [map_place(self.workspace, name, kind) for name in names for kind in get_args(MapKind)]
-        return [*maps, self.cloud_place]
+        until = self.report.until
+        kinds: list[MapKind] = ["photometric"] if self.wants_photometric else []
+        kinds += ["geometric"] if until != "photometric" else []
+        maps = [map_place(self.workspace, view.name, kind) for view in self.scene.views for kind in kinds]
+        return [*maps, self.cloud_place] if until == "cloud" else maps
 
-    def places_until(self, last: str) -> list[Place]:
-        """All that a run writes in COLMAP's formats, up to "photometric" or "geometric" maps, or the "cloud"."""
-        if last == "cloud":
-            return self.places
-        kinds: tuple[MapKind, ...] = ("photometric",) if last == "photometric" else get_args(MapKind)
-        return [map_place(self.workspace, view.name, kind) for view in self.scene.views for kind in kinds]
+    @property
+    def wants_photometric(self) -> bool:
+        """Whether photometric maps are made: where they are fused, or a run ends with maps, as COLMAP's do."""
+        return self.report.until != "cloud" or self.options.fusion.input == "photometric"
 
     def stage(self, name: str, total: int) -> AbstractContextManager[None]:
         """Announce a stage of `total` steps, and report its wall time."""

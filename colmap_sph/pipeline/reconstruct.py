@@ -235,7 +235,6 @@ def reconstruct(
             given=given,
             overwrite=overwrite,
             verify=verify,
-            until=until,
             pair_list=pair_list,
             needs_all=needs_all,
         )

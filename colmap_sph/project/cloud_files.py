@@ -3,7 +3,10 @@
 import os
 import shutil
 from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
+from contextvars import copy_context
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +21,8 @@ from colmap_sph.project.map_coordinates import move_cloud, move_model
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES
 from colmap_sph.project.workspace import Workspace
 
+# Copied at a time: what a cache holds.
+_COPY_BYTES = 1 << 18
 _HEADER = "\n".join(
     [
         "ply",
@@ -66,8 +71,10 @@ def ply_header(count: int) -> bytes:
     return _HEADER.format(count=count).encode()
 
 
-def join_parts(stems: Sequence[Path], folder: Path, count: int, *, with_visibility: bool = True) -> None:
-    """Join parts of a cloud, and remove them one by one: the disk never holds more than one part twice.
+def join_parts(
+    stems: Sequence[Path], folder: Path, count: int, *, with_visibility: bool = True
+) -> tuple[str, ...]:
+    """Join parts of a cloud, and remove them one by one: the disk never holds more than one part of each twice.
 
     Parameters
     ----------
@@ -80,24 +87,34 @@ def join_parts(stems: Sequence[Path], folder: Path, count: int, *, with_visibili
     with_visibility : bool
         Whether to make the second file.
 
+    Returns
+    -------
+    tuple of str
+        Digest of each of the two files, see `whole_digest`; empty for one that is not made.
+
     Raises
     ------
     OutputError
         A file cannot be written.
     """
     cloud, visible = Workspace(folder).cloud_paths
-    _join(stems, ".points", cloud, ply_header(count))
+    files = [(".points", cloud, ply_header(count))]
     if with_visibility:
-        _join(stems, ".vis", visible, np.array(count, "<u8").tobytes())
+        files.append((".vis", visible, np.array(count, "<u8").tobytes()))
+    with ThreadPoolExecutor(len(files)) as pool:
+        joined = [pool.submit(copy_context().run, partial(_join, stems, *file)) for file in files]
+    digests = [each.result() for each in joined]
+    return *digests, *([] if with_visibility else [""])
 
 
-def _join(stems: Sequence[Path], suffix: str, target: Path, start: bytes) -> None:
+def _join(stems: Sequence[Path], suffix: str, target: Path, start: bytes) -> str:
     with atomic_file(target, sync=False) as file:  # until it is in its place
         file.write(start)
         for stem in stems:
             with stem.with_suffix(suffix).open("rb") as part:
-                shutil.copyfileobj(part, file)
+                shutil.copyfileobj(part, file, _COPY_BYTES)
             stem.with_suffix(suffix).unlink()
+        return file.digest
 
 
 def check_places(workspace: Workspace) -> None:

@@ -35,7 +35,8 @@ class FusionOptions:
     method: Literal["best-pixel", "colmap"] = "best-pixel"
     """Our own, a point from the pixel that sees a piece of surface best; or COLMAP's stereo_fusion."""
     input: Literal["geometric", "photometric"] = "geometric"
-    """Maps to fuse: those that other views confirm, or the unchecked ones, fuller and with more outliers."""
+    """Maps to fuse: those that other views confirm, or the unchecked ones, fuller and with more outliers, which
+    are made only then."""
     min_num_pixels: int = 2
     """Pixels, of different images, that must agree on a point (COLMAP: 5). In our own fusion images that stand
     side by side count as one."""

@@ -42,10 +42,11 @@ def _pair(task: match.MatchTask) -> Facts:
 
 def _photometric(task: vote.VoteTask) -> Facts:
     shape = (task.view.height, task.view.width)
-    normals, depth = _flat(shape)
+    depth = np.full(shape, _DEPTH, np.float32)
     estimate = DepthEstimate(depth, np.ones(shape, np.float32), np.full(shape, 2, np.uint8))
-    write_estimate(task.estimate, estimate, task.vote_key)
-    return task.maps.write(normals, depth, task.maps_key, partners=task.matched)
+    facts = Facts(coverage=1.0)
+    write_estimate(task.estimate, estimate, task.vote_key, facts)
+    return facts
 
 
 def _geometric(task: confirm.ConfirmTask) -> Facts:

@@ -23,7 +23,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.confirm import ConfirmStage, confirm_seconds
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage
-from colmap_sph.pipeline.stages.vote import VoteStage, vote_seconds
+from colmap_sph.pipeline.stages.vote import VoteStage, normals_seconds, vote_seconds
 from colmap_sph.stereo.partners.pairing import Pair, partners_of
 from colmap_sph.stereo.partners.pairs import PairSelection
 
@@ -146,7 +146,8 @@ class Within:
             normals, refinement = (options.normals, options.refinement)
             known = estimated_fusion(self._context).seconds
             for name, others in partners.items():
-                seconds = vote_seconds(len(others), normals) + confirm_seconds(len(others), normals, refinement)
+                seconds = vote_seconds(len(others)) + confirm_seconds(len(others), normals, refinement)
+                seconds += normals_seconds(normals) if self._context.wants_photometric else 0.0
                 views = self._context.scene.photograph(name).views
                 known += seconds * sum(self._context.window(view.name).num_pixels for view in views) / 1e6
             self._later_works[case] = known

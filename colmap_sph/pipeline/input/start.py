@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from colmap_sph.errors import InputError
-from colmap_sph.pipeline.context import Context, Until, timed_stage
+from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.input.good_images import with_good_images, without_misplaced
 from colmap_sph.pipeline.keys import Keys
@@ -43,7 +43,6 @@ def start(
     given: GivenModel | None = None,
     overwrite: bool = False,
     verify: bool = False,
-    until: Until = "cloud",
     pair_list: Path | None = None,
     needs_all: bool = False,
 ) -> tuple[Context, PairSelection]:
@@ -51,7 +50,7 @@ def start(
 
     Parameters
     ----------
-    workspace, options, executor, progress, report, database, expected, given, overwrite, verify, until, pair_list
+    workspace, options, executor, progress, report, database, expected, given, overwrite, verify, pair_list
         See `reconstruct`.
     needs_all
         See `reconstruct`.
@@ -78,7 +77,7 @@ def start(
     workspace.create_stereo_dirs(context.scene.index_of)
     selection = _selection(context, database, pair_list)
     context = replace(context, scene=wanted_scene(context.scene, selection))
-    take_places(context.places_until(until), overwrite=overwrite)
+    take_places(context.places, overwrite=overwrite)
     if verify:
         _verify(context)
     if given is not None and is_polishing:

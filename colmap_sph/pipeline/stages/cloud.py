@@ -78,7 +78,13 @@ def begin_cloud(context: "Context") -> None:
 
 
 def vouch_for_cloud(
-    context: "Context", key: str, facts: CloudFacts, names: Sequence[str], *, is_complete: bool
+    context: "Context",
+    key: str,
+    facts: CloudFacts,
+    names: Sequence[str],
+    *,
+    is_complete: bool,
+    digests: Sequence[str] = (),
 ) -> None:
     """Record that the cloud is ours, and that it is complete, if it is: otherwise the next run makes it again.
 
@@ -93,12 +99,17 @@ def vouch_for_cloud(
         Images that were fused.
     is_complete : bool
         Whether nothing that belongs to it could not be read.
+    digests : sequence of str
+        Of the first of its files, as far as they are known.
     """
     place = tiles_place(context.workspace) if facts.tiles else context.cloud_place
-    digests = {path: whole_digest(path) if path.exists() else "" for path in place.files}
+    known = dict(zip(place.files, digests, strict=False))
+    digests_of = {
+        path: known[path] if path in known else whole_digest(path) if path.exists() else "" for path in place.files
+    }
     kind = context.options.fusion.input
     facts = replace(facts, of_maps=tuple(map_mark(context.workspace, name, kind) for name in names))
-    vouch_when_on_disk(place.record, key, digests, facts, state="done" if is_complete else "void")
+    vouch_when_on_disk(place.record, key, digests_of, facts, state="done" if is_complete else "void")
 
 
 def list_fused_images(context: "Context", names: Sequence[str]) -> None:

@@ -173,12 +173,14 @@ class FuseStage(PartsStage):
             if not results:
                 raise NoResultError(f"No image could be fused ({context.report.skipped_images[self._names[0]]})")
             points = sum(result.facts.points for result in results.values())
-            tiles = self._put_together(results, points)
+            tiles, digests = self._put_together(results, points)
             facts = facts_of_cloud(context, list(results), points, self._partners_among(results))
             of_images = tuple(result.facts.points for result in results.values())
             self._known = replace(facts, of_images=of_images, tiles=tiles)
             is_complete = not self._report_unread(results) and len(results) == len(self.items)
-            vouch_for_cloud(context, self._key, self._known, list(results), is_complete=is_complete)
+            vouch_for_cloud(
+                context, self._key, self._known, list(results), is_complete=is_complete, digests=digests
+            )
         report_cloud(context, self._known, list(results))
 
     def _partners_among(self, results: Mapping[str, Result]) -> dict[str, tuple[list[str], list[int]]]:
@@ -191,26 +193,35 @@ class FuseStage(PartsStage):
             among[name] = ([other for other, _ in kept], [number for _, number in kept])
         return among
 
-    def _put_together(self, results: Mapping[str, Result], points: int) -> int:
-        """Make the cloud of its parts, and move it to its place; return the number of its tiles, 0: one file."""
+    def _put_together(self, results: Mapping[str, Result], points: int) -> tuple[int, tuple[str, ...]]:
+        """Make the cloud of its parts, and move it to its place.
+
+        Returns
+        -------
+        tiles : int
+            Their number; 0: one file.
+        digests : tuple of str
+            Of the cloud's files, as far as they are known.
+        """
         workspace = self.context.workspace
         most = self.context.options.fusion.max_points_per_file
         try:
             if 0 < most < points:
-                return self._put_together_tiles(results, most)
-            self._put_together_file(self._stems(results), points)
+                return self._put_together_tiles(results, most), ()
+            return 0, self._put_together_file(self._stems(results), points)
         except (OSError, RuntimeError) as error:
             raise unwritable(workspace.fused_path, error) from error
-        return 0
 
-    def _put_together_file(self, stems: list[Path], points: int) -> None:
+    def _put_together_file(self, stems: list[Path], points: int) -> tuple[str, ...]:
         workspace = self.context.workspace
         origin = self.context.scene.origin
-        join_parts(stems, self._scratch, points, with_visibility=self.context.options.fusion.visibility)
+        with_visibility = self.context.options.fusion.visibility
+        digests = join_parts(stems, self._scratch, points, with_visibility=with_visibility)
         if origin.any():
             link_workspace(workspace, load_model(workspace.sparse_dir), origin, self._scratch)
         begin_cloud(self.context)  # not before: it may take hours, in which the one that is there is whole
         move_cloud_into_place(self._scratch, workspace, origin)
+        return () if origin.any() else digests  # in map coordinates it is another file
 
     def _put_together_tiles(self, results: Mapping[str, Result], most: int) -> int:
         context = self.context

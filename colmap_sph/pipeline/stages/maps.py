@@ -1,5 +1,6 @@
 """A view's depth and normal map on disk, vouched for by a record."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
+from colmap_sph.project.state.ownership import Place, remove_place
 from colmap_sph.project.state.records import (
     begin,
     recorded_facts,
@@ -99,6 +101,11 @@ class MapFiles:
         """What is known of the maps, or None where they must be made."""
         known = vouched_facts(self.record, key, [self.depth, self.normals], MapFacts)
         return None if known is None else known.as_facts()
+
+    def remove(self) -> None:
+        """Remove maps that this program made, where there are any."""
+        if os.path.lexists(self.record):
+            remove_place(Place(self.record, (self.depth, self.normals)))
 
     def partners(self) -> tuple[str, ...]:
         """Names of the images that the view was matched with, as far as that is known."""

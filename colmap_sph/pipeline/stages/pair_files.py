@@ -34,6 +34,8 @@ _WHOLE_NUMBERS = ("height", "left_width", "right_width")
 _OWN_NUMBERS = 4
 _UNKNOWN = -1.0
 _TIE_COLUMNS = 5
+# Of an estimate: its corner, and its facts.
+_ESTIMATE_NUMBERS = 4
 
 
 def write_pair(
@@ -135,7 +137,9 @@ def disparity_bytes(path: Path) -> int:
         return 0
 
 
-def write_estimate(path: Path, estimate: DepthEstimate, key: str) -> None:
+def write_estimate(
+    path: Path, estimate: DepthEstimate, key: str, facts: Facts, *, corner: tuple[int, int] = (0, 0)
+) -> None:
     """Write a photometric depth with its standard deviation and support; `OutputError` where that fails.
 
     Parameters
@@ -144,9 +148,14 @@ def write_estimate(path: Path, estimate: DepthEstimate, key: str) -> None:
         Target file; its folder exists.
     estimate : DepthEstimate
     key : str
-        What `is_estimate_there` shall find.
+        What `facts_of_estimate` shall find.
+    facts : Facts
+        What it shall say: `coverage` and `in_region`.
+    corner : (int, int)
+        Column and row of the image where the estimate begins, for `pages/samples.py`.
     """
-    write_arrays(path, _ESTIMATE, key, [estimate.depth, estimate.sigma, estimate.support])
+    numbers = (*map(float, corner), facts.coverage, facts.in_region)
+    write_arrays(path, _ESTIMATE, key, [estimate.depth, estimate.sigma, estimate.support], numbers=numbers)
 
 
 def read_estimate(path: Path, view: View, key: str | None = None) -> DepthEstimate:
@@ -164,14 +173,21 @@ def _check_key(path: Path, head: Head, key: str | None) -> None:
         )
 
 
-def is_estimate_there(path: Path, key: str, view: View) -> bool:
-    """Whether a file holds the estimate of a view, made under this key; only its head is read."""
+def facts_of_estimate(path: Path, key: str, view: View) -> Facts | None:
+    """Say what is known of the estimate of a view, made under this key; None where it must be made.
+
+    Only the head of the file is read.
+    """
     head = read_head(path)
-    return (
-        head is not None
-        and (head.kind, head.key) == (_ESTIMATE, key)
-        and head.arrays == tuple(_estimate_types(view))
-    )
+    if (
+        head is None
+        or (head.kind, head.key) != (_ESTIMATE, key)
+        or head.arrays != tuple(_estimate_types(view))
+        or len(head.numbers) != _ESTIMATE_NUMBERS
+    ):
+        return None
+    *_, coverage, in_region = head.numbers
+    return Facts(coverage, in_region) if 0 <= coverage <= 1 and 0 <= in_region <= 1 else None
 
 
 def _estimate_types(view: View) -> list[ArrayType]:

@@ -7,13 +7,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import (
     disparity_bytes,
-    is_estimate_there,
+    facts_of_estimate,
     read_estimate,
     read_pair,
     residuals_of,
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
 
 # Processor seconds per megapixel of the image: per pair that votes; and of the normals of one kind of maps, for
 # each pixel of the radius of their windows.
-_SECONDS = 0.033
+_SECONDS = 0.027
 _NORMALS_SECONDS = 0.027
 # Estimates reach so many pixels beyond the region that maps are cut to: what windows at its border look at.
 REGION_MARGIN = 24
@@ -52,7 +54,10 @@ _DISPARITY_BYTES = 4.0
 
 @dataclass(frozen=True, eq=False)
 class VoteTask:
-    """A view's pairs, or its estimate where only the maps are to be made from it, and where the results go."""
+    """A view's pairs, or its estimate where only the maps are to be made from it, and where the results go.
+
+    The photometric maps are made where they are wanted: confirmation needs none.
+    """
 
     view: View
     lead: str
@@ -60,7 +65,6 @@ class VoteTask:
     pair_keys: tuple[str, ...]
     mask: Path
     estimate: Path
-    is_voted: bool
     stations: tuple[int, ...]
     residuals: tuple[float, ...]
     vote_options: VoteOptions
@@ -70,6 +74,7 @@ class VoteTask:
     focus: Focus | None
     matched: tuple[str, ...]
     maps: MapFiles
+    wants_maps: bool
     vote_key: str
     maps_key: str
 
@@ -78,8 +83,13 @@ def make_photometric_maps(task: VoteTask) -> Facts:
     """Vote on the depth of a view; writes it with its standard deviation and support, and the photometric maps."""
     view = task.window.view(task.view)
     # A worker that was lost may have come so far.
-    is_voted = task.is_voted or is_estimate_there(task.estimate, task.vote_key, view)
-    estimate = read_estimate(task.estimate, view, task.vote_key) if is_voted else _vote(task, view)
+    facts = facts_of_estimate(task.estimate, task.vote_key, view)
+    if not task.wants_maps:
+        if facts is not None:
+            return facts
+        task.maps.remove()  # of an earlier vote
+        return _vote(task, view)[1]
+    estimate = _vote(task, view)[0] if facts is None else read_estimate(task.estimate, view, task.vote_key)
     normals, depth = fit_normals(view, estimate, task.normal_options)
     drop_other_depths(depth, task.depths)
     drop_outside(view, depth, region_of(task.focus))
@@ -88,7 +98,7 @@ def make_photometric_maps(task: VoteTask) -> Facts:
     return task.maps.write(normals, depth, task.maps_key, partners=task.matched, shown=shown)
 
 
-def _vote(task: VoteTask, view: View) -> DepthEstimate:
+def _vote(task: VoteTask, view: View) -> tuple[DepthEstimate, Facts]:
     pairs = (read_pair(file, key) for file, key in zip(task.pairs, task.pair_keys, strict=True))
     estimate = vote_depth(view, pairs, task.vote_options, task.stations, task.residuals, task.lead)
     mask = read_view_mask(task.mask, task.view)
@@ -97,8 +107,19 @@ def _vote(task: VoteTask, view: View) -> DepthEstimate:
         estimate.depth[task.window.part(mask) == 0] = 0
     drop_other_depths(estimate.depth, task.depths)
     drop_outside(view, estimate.depth, region_of(task.focus), REGION_MARGIN)
-    write_estimate(task.estimate, estimate, task.vote_key)
-    return estimate
+    facts = _facts_of(task, view, estimate)
+    write_estimate(task.estimate, estimate, task.vote_key, facts, corner=task.window[:2])
+    return estimate, facts
+
+
+def _facts_of(task: VoteTask, view: View, estimate: DepthEstimate) -> Facts:
+    pixels = task.view.num_pixels
+    if task.focus is None:
+        return Facts(float(np.count_nonzero(estimate.depth)) / pixels)
+    depth = estimate.depth.copy()
+    drop_outside(view, depth, region_of(task.focus))
+    shown = count_shown(view, estimate.depth, depth, task.focus.near)
+    return Facts(float(np.count_nonzero(depth)) / max(shown, 1), shown / pixels)
 
 
 def report_photometric(context: "Context", votes: Mapping[str, Result]) -> None:
@@ -127,9 +148,9 @@ def normals_seconds(options: NormalOptions) -> float:
     return _NORMALS_SECONDS * options.radius
 
 
-def vote_seconds(pairs: int, normals: NormalOptions) -> float:
+def vote_seconds(pairs: int) -> float:
     """Processor seconds per megapixel of an image on whose depth so many pairs vote."""
-    return normals_seconds(normals) + _SECONDS * pairs
+    return _SECONDS * pairs
 
 
 class VoteStage(RememberingStage[str, VoteTask]):
@@ -142,8 +163,8 @@ class VoteStage(RememberingStage[str, VoteTask]):
     @staticmethod
     def found(task: VoteTask) -> Facts | None:
         """See `Stage.found`."""
-        is_voted = is_estimate_there(task.estimate, task.vote_key, task.window.view(task.view))
-        return task.maps.facts(task.maps_key) if is_voted else None
+        voted = facts_of_estimate(task.estimate, task.vote_key, task.window.view(task.view))
+        return voted if voted is None or not task.wants_maps else task.maps.facts(task.maps_key)
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result]) -> None:
         super().__init__(context, context.order.sorted(context.scene.index_of))
@@ -155,23 +176,23 @@ class VoteStage(RememberingStage[str, VoteTask]):
         """See `RememberingStage`."""
         context = self.context
         options = context.options
-        given = (options.pairs, options.rectification, options.vote, options.normals)
+        given = (options.pairs, options.rectification, options.vote, options.normals, context.wants_photometric)
         matched = sorted((*pair, key, self._residuals[pair]) for pair, key in self._pair_keys.items())
         return context.keys.stage("vote", context.scene_key, given, matched)
 
     def files(self, item: str) -> list[str]:
         """See `RememberingStage`."""
-        maps = self.context.map_files(item, "photometric")
-        return [*maps.paths, str(self.context.estimate_path(item))]
+        maps = self.context.map_files(item, "photometric").paths if self.context.wants_photometric else []
+        return [*maps, str(self.context.estimate_path(item))]
 
     def is_there(self, item: str, key: str) -> bool:
         """See `RememberingStage`."""
         window = self.context.window(item)
         view = window.view(self.context.scene.view(item))
         maps = self.context.map_files(item, "photometric")
-        if not is_estimate_there(self.context.estimate_path(item), key, view):
+        if facts_of_estimate(self.context.estimate_path(item), key, view) is None:
             return False
-        return maps.facts(self.context.keys.photometric(key)) is not None
+        return not self.context.wants_photometric or maps.facts(self.context.keys.photometric(key)) is not None
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""
@@ -196,7 +217,7 @@ class VoteStage(RememberingStage[str, VoteTask]):
         estimate = context.estimate_path(item)
         window = context.window(item)
         maps = context.map_files(item, "photometric")
-        is_voted = is_estimate_there(estimate, key, window.view(view))
+        is_voted = facts_of_estimate(estimate, key, window.view(view)) is not None
         task = VoteTask(
             view.without_points(),
             lead,
@@ -204,7 +225,6 @@ class VoteStage(RememberingStage[str, VoteTask]):
             tuple(keys),
             context.workspace.mask_path(item),
             estimate,
-            is_voted,
             tuple(stations),
             tuple(residuals),
             context.options.vote,
@@ -214,6 +234,7 @@ class VoteStage(RememberingStage[str, VoteTask]):
             context.focus,
             tuple(matched),
             maps,
+            context.wants_photometric,
             key,
             maps_key,
         )
@@ -221,9 +242,13 @@ class VoteStage(RememberingStage[str, VoteTask]):
 
     def _cost(self, view: View, pixels: int, files: tuple[Path, ...], is_voted: bool) -> Cost:
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
-        seconds = vote_seconds(0 if is_voted else len(files), self.context.options.normals)
-        disk = MAP_BYTES * view.num_pixels + (0 if is_voted else _ESTIMATE_BYTES * pixels)
-        maps = MAP_BYTES * (view.num_pixels - pixels)
+        seconds = vote_seconds(len(files))
+        disk = _ESTIMATE_BYTES * pixels
+        maps = 0.0
+        if self.context.wants_photometric:
+            seconds = normals_seconds(self.context.options.normals) + (0.0 if is_voted else seconds)
+            disk = MAP_BYTES * view.num_pixels + (0.0 if is_voted else disk)
+            maps = MAP_BYTES * (view.num_pixels - pixels)
         return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities + maps, disk)
 
     @contextmanager

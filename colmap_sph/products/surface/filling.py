@@ -5,7 +5,6 @@ What cameras do not see beside a building is ground: a hole is filled from the l
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_dilation, distance_transform_edt
 
 from colmap_sph.stereo.surface.heights import Surface
 
@@ -37,6 +36,7 @@ def filled(surface: Surface, reach: int, cell: float, tolerance: float) -> Surfa
     if not reach or is_known.all() or not is_known.any():
         return surface
     from rasterio.fill import fillnodata  # of the extra
+    from scipy.ndimage import distance_transform_edt  # which takes long to load
 
     is_source = lower_rims(surface.height, reach, _STEEPEST * cell, tolerance)
     # Only rims are shown to GDAL: it would look for a height behind those that do not count.
@@ -65,6 +65,8 @@ def lower_rims(height: NDArray[np.float32], reach: int, step: float, tolerance: 
     -------
     (h, w) bool ndarray
     """
+    from scipy.ndimage import binary_dilation
+
     is_hole = np.isnan(height)
     is_rim = ~is_hole & binary_dilation(is_hole, np.ones((3, 3), bool))
     # How high the ground of each hole's cell may be, as it rises from the rims around.

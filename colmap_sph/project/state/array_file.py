@@ -163,6 +163,22 @@ def read_head(path: Path) -> Head | None:
         return None
 
 
+def first_array(path: Path, kind: str) -> tuple[Head, NDArray[Any]]:
+    """The head of a file, and its first array, of which only what is looked at is read, and nothing checked.
+
+    Raises
+    ------
+    ValueError, OSError
+        It is missing or cannot be read, it is cut off, or it is of another kind.
+    """
+    with open_regular(path, follow=False) as file:
+        head = _read_head(file)
+        if head.kind != kind or not head.arrays:
+            raise ValueError(f"it is no {kind}")
+        dtype, shape = head.arrays[0]
+        return head, np.memmap(file, dtype, "r", head.size, shape)
+
+
 def is_whole(path: Path) -> bool:
     """Whether a file is one of ours, and every byte as it was written; reads it piece by piece."""
     try:

@@ -235,17 +235,19 @@ def remove_undistorted(workspace: Workspace) -> None:
 
 def _remove(places: Iterable[Place]) -> list[Path]:
     """Remove files that are as we left them; return the others."""
-    altered: list[Path] = []
-    for place in places:
-        others = altered_files(read_record(place.record), place.files, every_byte=True)
-        for path in place.files:
-            if path not in others and (path.is_file() or is_link(path)):
-                remove(path)
-        # Last, as only it says whose they are; it stays where some of them do.
-        if not others:
-            remove(place.record)
-        altered += others
-    return altered
+    return [path for place in places for path in remove_place(place)]
+
+
+def remove_place(place: Place) -> list[Path]:
+    """Remove files of a place that are as we left them, and their record; return the others."""
+    others = altered_files(read_record(place.record), place.files, every_byte=True)
+    for path in place.files:
+        if path not in others and (path.is_file() or is_link(path)):
+            remove(path)
+    # Last, as only it says whose they are; it stays where some of them do.
+    if not others:
+        remove(place.record)
+    return others
 
 
 def remove_empty_folders(*roots: Path) -> None:
