@@ -25,10 +25,22 @@ int selection_begin(selection_buffers *buffers, match_size size) {
     return 0;
 }
 
+/* Whether target pixels are those of the source, which was not warped. Each then stands for itself. */
+static int are_the_source(const int32_t *columns, match_size size, int32_t *rival) {
+    int32_t w = 0;
+    for (; w < (int32_t)size.target_width && columns[w] == w; w++) {
+        rival[w] = w;
+    }
+    return w == (int32_t)size.target_width && size.target_width <= size.source_width;
+}
+
 void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, const selection_buffers *buffers) {
     /* Where a surface is stretched, its target pixels skip columns of the source: they stand for these, too. */
     enum { MAX_STRETCH = 4 };
     const int32_t source_width = (int32_t)size.source_width, target_width = (int32_t)size.target_width;
+    if (are_the_source(columns, size, buffers->rival)) {
+        return;
+    }
     uint32_t *best = buffers->best;
     memset(best, UINT8_MAX, (size_t)source_width * sizeof *best);
     for (int32_t w = 0; w < target_width; w++) {

@@ -108,16 +108,39 @@ slope_counts count_slopes(const int32_t *offset, ptrdiff_t height, ptrdiff_t wid
     return counts;
 }
 
-void disparity_range(const float *disparity, ptrdiff_t pixels, float ends[2]) {
-    float least = INFINITY, most = -INFINITY;
-    for (ptrdiff_t p = 0; p < pixels; p++) {
-        const float d = disparity[p];
-        const int found = isfinite(d);
-        least = found && d < least ? d : least;
-        most = found && d > most ? d : most;
+/* Of so many disparities side by side, which compilers keep in vectors. */
+enum { RANGE_LANES = 16 };
+
+static inline void widen(const float *disparity, float *restrict least, float *restrict most) {
+    for (int l = 0; l < RANGE_LANES; l++) {
+        const float d = disparity[l];
+        const float near = fabsf(d) < INFINITY ? d : INFINITY, far = fabsf(d) < INFINITY ? d : -INFINITY;
+        least[l] = near < least[l] ? near : least[l];
+        most[l] = far > most[l] ? far : most[l];
     }
-    ends[0] = least <= most ? least : 0;
-    ends[1] = least <= most ? most : 0;
+}
+
+void disparity_range(const float *disparity, ptrdiff_t pixels, float ends[2]) {
+    float least[RANGE_LANES], most[RANGE_LANES], last[RANGE_LANES];
+    for (int l = 0; l < RANGE_LANES; l++) {
+        least[l] = INFINITY;
+        most[l] = -INFINITY;
+        last[l] = NAN;
+    }
+    ptrdiff_t p = 0;
+    for (; p + RANGE_LANES <= pixels; p += RANGE_LANES) {
+        widen(disparity + p, least, most);
+    }
+    if (p < pixels) {
+        memcpy(last, disparity + p, (size_t)(pixels - p) * sizeof *last);
+        widen(last, least, most);
+    }
+    for (int l = 1; l < RANGE_LANES; l++) {
+        least[0] = least[l] < least[0] ? least[l] : least[0];
+        most[0] = most[l] > most[0] ? most[l] : most[0];
+    }
+    ends[0] = least[0] <= most[0] ? least[0] : 0;
+    ends[1] = least[0] <= most[0] ? most[0] : 0;
 }
 
 void code_disparity(const float *disparity, ptrdiff_t pixels, float least, float step, uint16_t *codes) {
