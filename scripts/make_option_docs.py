@@ -47,7 +47,8 @@ def _presets(plain: list[Option], stages: list[OptionGroup]) -> str:
     rows = [f"| option | {' | '.join(PRESETS)} |", "|---" * (1 + len(PRESETS)) + "|"]
     for place in places:
         option = known[place]
-        chosen = (f"`{values.get(place, option.default)}`" for values in PRESETS.values())
+        values = (quality.get(place, option.default) for quality in PRESETS.values())
+        chosen = ("as always" if value == "" else f"`{value}`" for value in values)
         rows.append(f"| `{option.flag}` | {' | '.join(chosen)} |")
     return "\n".join(rows)
 

@@ -257,7 +257,7 @@ def test_map_coordinates_against_a_local_model_say_what_to_do():
     utm = PointCloud("lidar.laz", plane() + offset, crs="projected (UTM 33N)", z_is_up=True)
     cloud = PointCloud("fused.ply", plane())
     with pytest.raises(
-        InputError, match=r"lidar\.laz is in map coordinates \(projected \(UTM 33N\)\).*reference_shift"
+        InputError, match=r"lidar\.laz is in map coordinates \(projected \(UTM 33N\)\).*--reference-shift"
     ):
         evaluate_cloud(cloud, make_reference(utm, FIXED), FIXED)
     shifted = replace(FIXED, reference_shift=tuple(offset))

@@ -17,7 +17,11 @@ PRESETS: Mapping[Quality, Mapping[str, Any]] = {
         "refinement.rounds": 0,
     },
     "normal": {},
-    "best": {"pairs.num_pairs": 15, "rectification.sampling": 1.3},
+    "best": {
+        "pairs.num_pairs": 15,
+        "rectification.sampling": 1.3,
+        "fusion.max_reproj_error": 0.25,
+    },
 }
 """What each sets, by the options' place in the records; all others are as always."""
 

@@ -23,7 +23,8 @@ def normalize_rotations(model: pycolmap.Reconstruction) -> None:
         if not frame.has_pose():
             continue
         pose = frame.rig_from_world
-        length = float(np.linalg.norm(pose.rotation.quat))
+        with np.errstate(over="ignore"):  # impossible poses are told later
+            length = float(np.linalg.norm(pose.rotation.quat))
         if abs(length - 1.0) > _FAR_FROM_ONE and 0.0 < length < np.inf:
             rotation = pycolmap.Rotation3d(pose.rotation.quat / length)
             frame.rig_from_world = pycolmap.Rigid3d(rotation, pose.translation)
