@@ -25,6 +25,7 @@ from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import check_input
 from colmap_sph.pipeline.stages.match import PhotoFile
 from colmap_sph.project.given.image_places import find_images
+from colmap_sph.project.given.poses import check_points_in_front
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -564,6 +565,17 @@ def test_output_that_cannot_be_made(tmp_path: Path) -> None:
     (tmp_path / "dense").write_text("a file in the way")
     with pytest.raises(OutputError, match="dense"):
         prepare(sparse, tmp_path / "dense")
+
+
+def test_points_behind_a_panorama_are_seen(tmp_path: Path) -> None:
+    """They lie behind its camera's plane of z = 0, as whatever is on the side that it is turned away from."""
+    sparse = make_project(tmp_path, "EQUIRECTANGULAR")
+    model = pycolmap.Reconstruction(sparse)
+    for image in model.images.values():
+        assert image.frame is not None
+        turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
+        image.frame.rig_from_world = turn * image.cam_from_world()
+    check_points_in_front(model, sparse)
 
 
 def test_output_where_nobody_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 
 from colmap_sph.errors import InputError
+from colmap_sph.project.wide.projection import PANORAMA
 
 # Quaternions in single precision are off by less, which moves nothing.
 _FAR_FROM_ONE = 1e-6
@@ -31,12 +32,17 @@ def normalize_rotations(model: pycolmap.Reconstruction) -> None:
 
 
 def check_points_in_front(model: pycolmap.Reconstruction, sparse_dir: Path) -> None:
-    """Raise `InputError` where hardly any point is in front of the images that observe it."""
+    """Raise `InputError` where hardly any point is in front of the images that observe it.
+
+    Panoramas see as well what is behind them.
+    """
     ids = model.reg_image_ids()
     observed = 0
     in_front = 0
     for image_id in ids[:: -(-len(ids) // _MOST_IMAGES)]:
         image = model.image(image_id)
+        if model.camera(image.camera_id).model_name == PANORAMA:
+            continue
         pose = image.cam_from_world().matrix()
         places = image.get_observation_point2D_idxs()
         places = places[:: -(-len(places) // _MOST_OBSERVATIONS) or 1]
