@@ -32,6 +32,8 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import undistorted_place
 from colmap_sph.project.state.records import begin
 from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.undistortion.model import foreseen_scene
+from colmap_sph.project.undistortion.originals import read_originals
 from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.workspace import Workspace
 
@@ -576,6 +578,18 @@ def test_points_behind_a_panorama_are_seen(tmp_path: Path) -> None:
         turn = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag([1.0, -1.0, -1.0])), np.zeros(3))
         image.frame.rig_from_world = turn * image.cam_from_world()
     check_points_in_front(model, sparse)
+
+
+def test_features_are_foreseen_where_they_come_to_be(tmp_path: Path) -> None:
+    """A model is judged by them: by those of distorted images, a dry run would leave good images out."""
+    sparse = make_project(tmp_path, "OPENCV", (-0.3, 0.1, 0.0, 0.0))
+    options = UndistortionOptions()
+    originals = read_originals(Project(sparse), options)
+    foreseen = foreseen_scene(originals, NAMES, options)
+    made = read_scene(prepare(sparse, tmp_path / "dense").sparse_dir)
+    errors = [[view.reprojection_error for view in scene.views] for scene in (foreseen, made)]
+    assert np.allclose(errors, 0.0, atol=1e-6)
+    assert [view.K.tolist() for view in foreseen.views] == [view.K.tolist() for view in made.views]
 
 
 def test_output_where_nobody_may_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,7 +2,7 @@
 
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,6 +21,9 @@ from colmap_sph.project.wide.table import read_cuts
 from colmap_sph.scene import Scene, View
 
 logger = logging.getLogger(__name__)
+
+Moved = Callable[[pycolmap.Image, NDArray[np.float64]], NDArray[np.float64]]
+"""An image of a model and (n, 2) image coordinates in it → where these are in a view of it."""
 
 # A table has so many times as many places as there are points, at most.
 _MOST_GAPS = 8
@@ -55,13 +58,17 @@ def read_scene(sparse_dir: Path) -> Scene:
 
 
 def scene_of_model(
-    model: pycolmap.Reconstruction, sparse_dir: Path, cuts: Mapping[str, Cut] | None = None
+    model: pycolmap.Reconstruction,
+    sparse_dir: Path,
+    cuts: Mapping[str, Cut] | None = None,
+    moved: Moved | None = None,
 ) -> Scene:
     """Return the scene of a model read from `sparse_dir`, and maybe changed since; see `read_scene`.
 
-    `cuts` says from which image views were cut, by their names.
+    `cuts` says from which image views were cut, by their names, and `moved` where they observe the points, where
+    that is not where the model says.
     """
-    return _scene(model, sparse_dir, _of_library(model), cuts or {})
+    return _scene(model, sparse_dir, _of_library(model, moved), cuts or {})
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,17 +86,19 @@ def _of_files(files: Sequence[Path]) -> _Sparse:
     return _Sparse(*read_points(path_of["points3D.bin"]), read_observations(path_of["images.bin"]))
 
 
-def _of_library(model: pycolmap.Reconstruction) -> _Sparse:
+def _of_library(model: pycolmap.Reconstruction, moved: Moved | None = None) -> _Sparse:
     xyz_of = {point_id: point.xyz for point_id, point in model.points3D.items()}
     ids = sorted(xyz_of)
     points = np.array([xyz_of[i] for i in ids], dtype=np.float64).reshape(-1, 3)
-    observations = ((image_id, _observations(model.image(image_id))) for image_id in model.reg_image_ids())
+    observations = ((image_id, _observations(model.image(image_id), moved)) for image_id in model.reg_image_ids())
     return _Sparse(np.array(ids, np.int64), points, observations)
 
 
-def _observations(image: pycolmap.Image) -> Observations:
+def _observations(image: pycolmap.Image, moved: Moved | None) -> Observations:
     points2D = [image.points2D[i] for i in image.get_observation_point2D_idxs()]
     xy = np.array([point.xy for point in points2D], np.float64).reshape(-1, 2)
+    if moved is not None and len(xy):
+        xy = moved(image, xy)
     return Observations(xy, np.array([point.point3D_id for point in points2D], np.int64))
 
 

@@ -46,7 +46,20 @@ def foreseen_scene(originals: Originals, names: Collection[str], options: Undist
     model = submodel(originals.model, set(names))
     for camera_id, camera in model.cameras.items():
         change_camera(camera, straight_camera(camera, options.for_colmap(), originals.fields.get(camera_id)))
-    return scene_of_model(model, originals.model_dir)
+
+    def moved(image: pycolmap.Image, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
+        i = image.camera_id
+        return _moved(originals.model.camera(i), pixels, originals.fields.get(i), model.camera(i))
+
+    return scene_of_model(model, originals.model_dir, moved=moved)
+
+
+def _moved(
+    camera: pycolmap.Camera, pixels: NDArray[np.float64], field: LensField | None, straight: pycolmap.Camera
+) -> NDArray[np.float64]:
+    """Where (n, 2) image coordinates of an original image are in the undistorted one."""
+    rays = np.asarray(plain_camera(camera).cam_from_img(pixels), np.float64)[:, :2]
+    return ray_pixels(straight, rays if field is None else field.straightened(rays))
 
 
 @dataclass(frozen=True)
@@ -130,9 +143,7 @@ def _model_of_views(
         return made
 
     def moved(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        rays = np.asarray(plain_camera(camera).cam_from_img(pixels), np.float64)[:, :2]
-        field = fields.get(camera.camera_id)
-        return ray_pixels(straight(camera), rays if field is None else field.straightened(rays))
+        return _moved(camera, pixels, fields.get(camera.camera_id), straight(camera))
 
     return model_of_views(model, cuts, names, straight, moved)
 
