@@ -242,13 +242,20 @@ def test_one_wrong_image_is_named(project):
     assert not any(name in report.doubts for name in FOUR_NAMES if name != wrong)
 
 
+def misplace_third(model: pycolmap.Reconstruction) -> pycolmap.Image:
+    """Give the third image the pose of the second one; returns it."""
+    image_of = {image.name: image for image in model.images.values()}
+    wrong = image_of[FOUR_NAMES[2]]
+    assert wrong.frame is not None
+    wrong.frame.rig_from_world = image_of[FOUR_NAMES[1]].cam_from_world()
+    return wrong
+
+
 def test_an_image_in_a_wrong_place_is_left_out(project, capsys):
     """It spoils no other: their maps are those of a model without it. The dry run knows it, too."""
     model = pycolmap.Reconstruction(project / "sparse/0")
-    wrong = next(image for image in model.images.values() if image.name == FOUR_NAMES[2])
-    taken = next(image for image in model.images.values() if image.name == FOUR_NAMES[1])
+    wrong = misplace_third(model)
     assert wrong.frame is not None
-    wrong.frame.rig_from_world = taken.cam_from_world()
     (project / "wrong").mkdir()
     model.write_binary(project / "wrong")
     plan = make_plan(Project(project / "wrong", project / "images", output=project / "dense"), OPTIONS)
@@ -269,6 +276,19 @@ def test_an_image_in_a_wrong_place_is_left_out(project, capsys):
             for folder in ("dense", "other")
         )
         assert np.count_nonzero(expected) and np.isclose(found, expected, rtol=1e-3).mean() > 0.95
+
+
+def test_maps_of_an_image_that_comes_to_be_in_a_wrong_place_are_removed(project):
+    """Surfaces, meshes and later fusions are made of all maps that are there."""
+    workspace = Workspace(project / "dense")
+    colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    wrong = misplace_third(model)
+    model.write_binary(workspace.sparse_dir)
+    report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    assert list(report.skipped_images) == [wrong.name]
+    maps = [workspace.depth_map_path(name, "geometric").exists() for name in FOUR_NAMES]
+    assert maps == [name != wrong.name for name in FOUR_NAMES]
 
 
 def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):

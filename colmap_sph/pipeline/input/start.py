@@ -4,7 +4,7 @@ import logging
 from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.context import Context, timed_stage
@@ -20,7 +20,7 @@ from colmap_sph.project.files import make_dir
 from colmap_sph.project.polishing.polished import starting_model
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import damaged_files, named, results_of, take_places
-from colmap_sph.project.workspace import Workspace
+from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairs import PairSelection
@@ -73,7 +73,7 @@ def start(
     if needs_all and report.skipped_images:
         reason = next(iter(sorted(report.skipped_images.items())))[1]
         raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
-    context = without_misplaced(context)
+    context = _without_misplaced(context)
     workspace.create_stereo_dirs(context.scene.index_of)
     selection = _selection(context, database, pair_list)
     context = replace(context, scene=wanted_scene(context.scene, selection))
@@ -85,6 +85,15 @@ def start(
         progress.foresee(foreseen_stages(context, pairs, (MatchToPolishStage(context, pairs),)))
         context = with_polished_poses(context, pairs, executor, given)
     return context, selection
+
+
+def _without_misplaced(context: Context) -> Context:
+    """See `without_misplaced`; maps of these images, of runs before, are removed: more would be made of them."""
+    sound = without_misplaced(context)
+    for name in sorted(context.scene.index_of.keys() - sound.scene.index_of.keys()):
+        for kind in get_args(MapKind):
+            context.map_files(name, kind).remove()
+    return sound
 
 
 def _views_of_photographs(scene: Scene) -> dict[str, list[str]]:
