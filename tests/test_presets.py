@@ -43,6 +43,16 @@ def test_what_is_given_beside_it_wins(tmp_path: Path) -> None:
     assert (better.pairs.num_pairs, better.rectification) == (6, preset("best").rectification)
 
 
+@pytest.mark.parametrize(("method", "most"), [("best-pixel", 0.25), ("colmap", 0.5)])
+def test_the_best_quality_is_of_both_methods_of_fusion(method: str, most: float) -> None:
+    """What makes our own clouds denser keeps COLMAP's fusion from merging, and its points are less exact then."""
+    chosen = parsed("--quality", "best", "--fusion.method", method)
+    assert chosen.fusion.reprojection_error == most
+    assert chosen.pairs == preset("best").pairs
+    given = parsed("--fusion.max-reproj-error", "1", "--quality", "best", f"--fusion.method={method}")
+    assert given.fusion.reprojection_error == 1
+
+
 def test_a_report_leaves_nothing_to_a_quality(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "report.json").write_text('{"options": {}}')
     config = str(tmp_path / "report.json")

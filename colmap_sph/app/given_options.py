@@ -36,7 +36,7 @@ def all_arguments(typed: Sequence[str], command: type) -> list[str]:
     quality = last_value(arguments, "--quality")
     if quality is not None and last_value(arguments, "--within"):
         raise OptionError("--within chooses the quality by the time there is; leave out it or --quality.")
-    return [*_of_quality(quality), *arguments]
+    return [*_of_quality(quality, last_value(arguments, "--fusion.method")), *arguments]
 
 
 def _with_config(arguments: list[str], command: type) -> list[str]:
@@ -55,9 +55,12 @@ def given_places(typed: Sequence[str], command: type) -> set[str]:
     return {option.place for flag, option in known_options(command).items() if flag in flags}
 
 
-def _of_quality(quality: str | None) -> list[str]:
-    """What a quality sets; nothing for one that there is not, which the parser refuses."""
-    chosen = next((values for name, values in PRESETS.items() if name == quality), {})
+def _of_quality(quality: str | None, fusion: str | None) -> list[str]:
+    """What a quality sets for a method of fusion; nothing for one that there is not, which the parser refuses."""
+    chosen = dict(next((values for name, values in PRESETS.items() if name == quality), {}))
+    if fusion == "colmap":
+        # COLMAP's fusion merges what is as near as this: with less it finds less that agrees.
+        chosen.pop("fusion.max_reproj_error", None)
     return [f"--{place.replace('_', '-')}={value}" for place, value in chosen.items()]
 
 
