@@ -453,6 +453,9 @@ def test_no_product_lies_among_the_original_images(workspace: Workspace, tmp_pat
     with pytest.raises(OutputError, match=r"originals.* has images of the model, such as \w\.png; choose another"):
         exported(workspace, tmp_path / place, "las")
     exported(workspace, tmp_path / place / "new", "las")
+    for folder in (workspace.images_dir, tmp_path / "a"):
+        folder.mkdir(exist_ok=True)
+        (folder / ".DS_Store").touch()
     exported(workspace, tmp_path / "a", "las")
 
 

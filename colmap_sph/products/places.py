@@ -36,7 +36,8 @@ def check_no_input(workspace: Workspace, folder: Path) -> None:
     for place in inputs:
         if real.is_relative_to(real_path(place)):
             raise OutputError(f"{folder} lies in {place}, whose files are read; choose another --output.")
-    for path in workspace.images_dir.rglob("*"):
+    # File managers leave hidden files of the same names in many folders.
+    for path in workspace.images_dir.rglob("[!.]*"):
         parts = path.relative_to(workspace.images_dir).parts
         for levels in range(len(parts)):
             # The folder may be one of those below the folder of all images.
