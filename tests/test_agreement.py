@@ -16,6 +16,9 @@ import colmap_sph
 from colmap_sph.app.run_command import print_summary
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.input.good_images import without_misplaced
+from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
@@ -276,6 +279,23 @@ def test_an_image_in_a_wrong_place_is_left_out(project, capsys):
             for folder in ("dense", "other")
         )
         assert np.count_nonzero(expected) and np.isclose(found, expected, rtol=1e-3).mean() > 0.95
+
+
+@pytest.mark.parametrize(("observing", "left_out"), [(6, 2), (5, 2), (4, 0), (2, 0)])
+def test_images_that_observe_nothing_are_no_witnesses(exact, tmp_path, observing, left_out):
+    """Where half of the others are misplaced, as all are with coordinates of another size, none is left out."""
+    views = [
+        replace(
+            view,
+            point_indices=view.point_indices if place < observing else view.point_indices[:5],
+            reprojection_error=50.0 if place < 2 else view.reprojection_error,
+        )
+        for place, view in enumerate(exact[0].views)
+    ]
+    workspace = Workspace(tmp_path)
+    context = Context(workspace, replace(exact[0], views=tuple(views)), OPTIONS, Keys(workspace, OPTIONS))
+    assert len(without_misplaced(context).scene.views) == len(views) - left_out
+    assert len(context.report.skipped_images) == left_out
 
 
 def test_maps_of_an_image_that_comes_to_be_in_a_wrong_place_are_removed(project):

@@ -63,22 +63,19 @@ def with_good_images(
 def without_misplaced(context: Context) -> Context:
     """Leave out a few images of which the model contradicts itself: their depth would be wrong, and spoil others'.
 
-    Where half of the images are such, it may be the points or the image coordinates, see `judge_reprojection`.
+    Where half of the images that observe any points are such, it may be the points or the image coordinates, see
+    `judge_reprojection`.
     """
-    views = context.scene.views
-    misplaced = {
-        name: error
-        for name, error in misplaced_views(context.scene).items()
-        if len(context.scene.view(name).point_indices) >= _ENOUGH
-    }
-    if not misplaced or len(misplaced) >= len(views) / 2:
+    judged = {view.name for view in context.scene.views if len(view.point_indices) >= _ENOUGH}
+    misplaced = {name: error for name, error in misplaced_views(context.scene).items() if name in judged}
+    if not misplaced or len(misplaced) >= len(judged) / 2:
         return context
     for name, error in misplaced.items():
         reason = (
             f"sparse points project {error:.0f} pixels from where it observes them: its camera or pose is wrong"
         )
         context.skip_view(name, reason)
-    return replace(context, scene=context.scene.only({view.name for view in views} - misplaced.keys()))
+    return replace(context, scene=context.scene.only(context.scene.index_of.keys() - misplaced.keys()))
 
 
 def _report_detail(context: Context, details: Mapping[str, float]) -> None:
