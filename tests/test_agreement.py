@@ -298,6 +298,20 @@ def test_images_that_observe_nothing_are_no_witnesses(exact, tmp_path, observing
     assert len(context.report.skipped_images) == left_out
 
 
+@pytest.mark.parametrize("wrong", [1, 2])
+def test_all_views_of_a_photograph_are_in_one_place(exact, tmp_path, wrong):
+    """Of three views one observes too little; the photograph is left out where half of the others tell so."""
+    first, second, third, *others = exact[0].views
+    cut = [replace(view, original="wide.jpg", reprojection_error=50.0) for view in (first, second, third)]
+    cut[2] = replace(cut[2], point_indices=third.point_indices[:5], reprojection_error=0.1)
+    if wrong == 1:
+        cut[1] = replace(cut[1], reprojection_error=0.1)
+    workspace = Workspace(tmp_path)
+    context = Context(workspace, replace(exact[0], views=(*cut, *others)), OPTIONS, Keys(workspace, OPTIONS))
+    assert without_misplaced(context).scene.views == tuple(others)
+    assert set(context.report.skipped_images) == {view.name for view in cut}
+
+
 def test_maps_of_an_image_that_comes_to_be_in_a_wrong_place_are_removed(project):
     """Surfaces, meshes and later fusions are made of all maps that are there."""
     workspace = Workspace(project / "dense")

@@ -64,11 +64,19 @@ def without_misplaced(context: Context) -> Context:
     """Leave out a few images of which the model contradicts itself: their depth would be wrong, and spoil others'.
 
     Where half of the images that observe any points are such, it may be the points or the image coordinates, see
-    `judge_reprojection`.
+    `judge_reprojection`. All views of one photograph have its pose.
     """
-    judged = {view.name for view in context.scene.views if len(view.point_indices) >= _ENOUGH}
-    misplaced = {name: error for name, error in misplaced_views(context.scene).items() if name in judged}
-    if not misplaced or len(misplaced) >= len(judged) / 2:
+    errors_of = misplaced_views(context.scene)
+    judged = 0
+    misplaced: dict[str, float] = {}
+    for photograph in context.scene.photographs:
+        telling = [view.name for view in photograph.views if len(view.point_indices) >= _ENOUGH]
+        errors = [errors_of[name] for name in telling if name in errors_of]
+        judged += bool(telling)
+        if errors and 2 * len(errors) >= len(telling):
+            misplaced |= {view.name: max(errors) for view in photograph.views}
+    left_out = {context.scene.view(name).photograph for name in misplaced}
+    if not left_out or 2 * len(left_out) >= judged:
         return context
     for name, error in misplaced.items():
         reason = (
