@@ -169,9 +169,9 @@ def test_each_tile_of_columns_is_matched_in_its_own_sources(backend, width):
     np.testing.assert_array_equal(found.view(np.uint32), expected.view(np.uint32))
 
 
-def test_there_may_be_more_partners_than_one_call_takes(monkeypatch):
-    """What fits into one call, and in parts: the same bits."""
-    block = syn.slanted_plane_pair(30.0, focal_length=300.0, size=(160, 120))
+def slanted_plane(size):
+    """Two views of a plane, its normals in the first one, and depths there that are a little too large."""
+    block = syn.slanted_plane_pair(30.0, focal_length=300.0, size=size)
     view, other = (
         View(k, str(k), c.width, c.height, c.K, c.R, c.t, np.zeros(0, np.int64))
         for k, c in enumerate((block.left, block.right))
@@ -179,14 +179,20 @@ def test_there_may_be_more_partners_than_one_call_takes(monkeypatch):
     truth, normals, _ = syn.exact_geometry(block.surfaces, block.left, origin=0.0)
     depth = (truth * 1.002).astype(np.float32)
     estimate = DepthEstimate(depth, (0.01 * depth).astype(np.float32), np.ones(truth.shape, np.uint8))
+    return view, other, normals.astype(np.float32), estimate
+
+
+def test_there_may_be_more_partners_than_one_call_takes(monkeypatch):
+    """What fits into one call, and in parts: the same bits."""
+    view, other, normals, estimate = slanted_plane((160, 120))
     sources = [(other, texture((other.height, other.width), seed)) for seed in range(35)]
     options = replace(OPTIONS, max_partners=35, min_score=-0.9)
     results = []
     for most in (32, 3):
         monkeypatch.setattr("colmap_sph.stereo.refinement._SOURCES", most)
-        maps = normals.astype(np.float32), depth.copy()
-        results.append(refine_maps(view, texture(truth.shape, 99), estimate, *maps, sources, options))
-    assert (results[0][1] != depth).any()
+        maps = normals.copy(), estimate.depth.copy()
+        results.append(refine_maps(view, texture(estimate.depth.shape, 99), estimate, *maps, sources, options))
+    assert (results[0][1] != estimate.depth).any()
     for one, part in zip(*results, strict=True):
         np.testing.assert_array_equal(one, part)
 
@@ -602,23 +608,16 @@ def test_soft_images_are_matched_at_half_their_size(block, scene, monkeypatch, o
 @pytest.mark.parametrize(("size", "rows"), [((160, 63), 63), ((160, 120), 1)])
 def test_small_images_are_matched_as_they_are(size, rows):
     """Where the image is small, or one of its partners, which has so many rows."""
-    block = syn.slanted_plane_pair(30.0, focal_length=300.0, size=size)
-    view, other = (
-        View(k, str(k), c.width, c.height, c.K, c.R, c.t, np.zeros(0, np.int64))
-        for k, c in enumerate((block.left, block.right))
-    )
-    truth, normals, _ = syn.exact_geometry(block.surfaces, block.left, origin=0.0)
-    depth = (truth * 1.002).astype(np.float32)
-    estimate = DepthEstimate(depth, (0.01 * depth).astype(np.float32), np.ones(truth.shape, np.uint8))
+    view, other, normals, estimate = slanted_plane(size)
     small = other.cropped(0, 0, other.width, rows)
     sources = [(one, texture((one.height, one.width), 1)) for one in (other, small)]
     options = replace(OPTIONS, min_score=-0.9)
-    given = (view, texture(truth.shape, 2), estimate)
+    given = (view, texture(estimate.depth.shape, 2), estimate)
     results = [
-        refine_maps(*given, normals.astype(np.float32), depth.copy(), sources, options, half_size=half_size)
+        refine_maps(*given, normals.copy(), estimate.depth.copy(), sources, options, half_size=half_size)
         for half_size in (False, True)
     ]
-    assert (results[0][1] != depth).any()
+    assert (results[0][1] != estimate.depth).any()
     for one, same in zip(*results, strict=True):
         np.testing.assert_array_equal(one, same)
 

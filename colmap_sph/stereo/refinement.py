@@ -152,12 +152,34 @@ def refine_maps(
     """
     if not sources or not options.rounds:
         return normals, depth
-    given = (view, image, estimate, normals, depth, sources, options, residual)
     smallest = min(*image.shape, *(side for _, source in sources for side in source.shape))
     if half_size and smallest >= 2 * _TILE:
-        _refine_at_half_size(*given)
-    else:
-        _refine(*given)
+        _refine_at_half_size(view, image, estimate, normals, depth, sources, options, residual)
+        return normals, depth
+    options = replace(options, depth_freedom=options.depth_freedom * _trust(residual * float(view.K[0, 0])))
+    partners = [(_paired(source_image), pixel_transfer(view, source)) for source, source_image in sources]
+    rank = _ranks(view, image, estimate, normals, depth, partners, options)
+    K = np.ascontiguousarray(view.K)
+    for done in range(options.rounds):
+        if done:
+            smooth = NormalOptions(radius=options.smoothing_radius)
+            moved = replace(estimate, depth=depth)
+            smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
+            lone = smooth_depth == 0  # a pixel without neighbours keeps its plane
+            smooth_normals[lone] = normals[lone]
+            smooth_depth[lone] = depth[lone]
+            normals[:] = smooth_normals
+            depth[:] = smooth_depth
+        is_last = done == options.rounds - 1
+        most = options.max_partners if is_last else min(options.max_partners, _FEW_PARTNERS)
+        for tile, first in enumerate(range(0, view.height, _TILE)):
+            rows = slice(first, min(first + _TILE, view.height), 1)
+            planes = _planes_of_maps(view, normals, depth, rows)
+            equations = _equations(image, partners, rank[:, tile] < most, planes, rows, options)
+            sigma = _freedom(estimate.sigma[rows], planes, options)
+            slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
+            _native.refine_planes(equations, sigma, slope_sigma, planes)
+            _native.maps_of_planes(planes, K, first, normals, depth)
     return normals, depth
 
 
@@ -171,7 +193,7 @@ def _refine_at_half_size(
     options: RefinementOptions,
     residual: float,
 ) -> None:
-    """As `_refine`, on images of half the size; all planes move as those of every second row and column do."""
+    """As `refine_maps`, on images of half the size; all planes move as those of every second row and column do."""
     half_view, half_image = _halved(view, image)
     height, width = half_image.shape
     corners = (slice(0, 2 * height, 2), slice(0, 2 * width, 2))  # which both sizes have
@@ -185,7 +207,7 @@ def _refine_at_half_size(
     planes = _planes_of_maps(half_view, *half_maps, rows)
     half_options = replace(options, depth_freedom=_HALF_FREEDOM * options.depth_freedom)
     halves = [_halved(*source) for source in sources]
-    _refine(half_view, half_image, half_estimate, *half_maps, halves, half_options, residual)
+    refine_maps(half_view, half_image, half_estimate, *half_maps, halves, half_options, residual)
     there = planes[:1] > 0
     moves = np.where(there, _planes_of_maps(half_view, *half_maps, rows) - planes, 0)
     moves[1:] /= 2  # by pixels of full size
@@ -227,43 +249,6 @@ def _doubled(values: NDArray[np.float32], shape: tuple[int, int]) -> NDArray[np.
         before, after = (values.take(np.minimum(half, last), axis) for half in (places // 2, (places + 1) // 2))
         values = (before + after) / 2
     return values
-
-
-def _refine(
-    view: View,
-    image: NDArray[np.uint8],
-    estimate: DepthEstimate,
-    normals: NDArray[np.float32],
-    depth: NDArray[np.float32],
-    sources: Sequence[tuple[View, NDArray[np.uint8]]],
-    options: RefinementOptions,
-    residual: float,
-) -> None:
-    """As `refine_maps`, where there is something to do, and on the images as they are."""
-    options = replace(options, depth_freedom=options.depth_freedom * _trust(residual * float(view.K[0, 0])))
-    partners = [(_paired(source_image), pixel_transfer(view, source)) for source, source_image in sources]
-    rank = _ranks(view, image, estimate, normals, depth, partners, options)
-    K = np.ascontiguousarray(view.K)
-    for done in range(options.rounds):
-        if done:
-            smooth = NormalOptions(radius=options.smoothing_radius)
-            moved = replace(estimate, depth=depth)
-            smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
-            lone = smooth_depth == 0  # a pixel without neighbours keeps its plane
-            smooth_normals[lone] = normals[lone]
-            smooth_depth[lone] = depth[lone]
-            normals[:] = smooth_normals
-            depth[:] = smooth_depth
-        is_last = done == options.rounds - 1
-        most = options.max_partners if is_last else min(options.max_partners, _FEW_PARTNERS)
-        for tile, first in enumerate(range(0, view.height, _TILE)):
-            rows = slice(first, min(first + _TILE, view.height), 1)
-            planes = _planes_of_maps(view, normals, depth, rows)
-            equations = _equations(image, partners, rank[:, tile] < most, planes, rows, options)
-            sigma = _freedom(estimate.sigma[rows], planes, options)
-            slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
-            _native.refine_planes(equations, sigma, slope_sigma, planes)
-            _native.maps_of_planes(planes, K, first, normals, depth)
 
 
 def _paired(image: NDArray[np.uint8]) -> NDArray[np.uint16]:
