@@ -105,13 +105,12 @@ static inline void place_row(const pair_geometry *g, double row, double first_co
 
 /* Whether cubics through the nodes are near enough; not where there is NaN, at an epipole, or across a seam. */
 static inline int is_smooth(const double *nodes) {
-    double most = 0;
+    int smooth = 1;
     for (int j = 0; j + 4 <= LAST_NODE; j++) {
-        const double difference =
-            fabs(nodes[j] - 4 * nodes[j + 1] + 6 * nodes[j + 2] - 4 * nodes[j + 3] + nodes[j + 4]);
-        most = difference <= most ? most : difference;
+        const double difference = nodes[j] - 4 * nodes[j + 1] + 6 * nodes[j + 2] - 4 * nodes[j + 3] + nodes[j + 4];
+        smooth &= fabs(difference) <= LARGEST_DIFFERENCE;
     }
-    return most <= LARGEST_DIFFERENCE;
+    return smooth;
 }
 
 /* Values of pixels from those at nodes, the first of which lies STEP columns before the first pixel. */
