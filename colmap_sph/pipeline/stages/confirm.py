@@ -32,7 +32,7 @@ from colmap_sph.stereo.photographs.fringes import drop_fringes
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps, suits_half_size
 from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside, is_inside
-from colmap_sph.stereo.region.shown import count_shown
+from colmap_sph.stereo.region.shown import count_focus
 from colmap_sph.stereo.region.window import Window
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
         drop_fringes(planes[1])
     drop_other_depths(planes[1], task.depths)
     drop_outside(view, planes[1], region_of(task.focus))
-    shown = None if task.focus is None else count_shown(view, estimate.depth, planes[1], task.focus.near)
+    shown = count_focus(view, estimate.depth, planes[1], task.focus)
     normals, depth = (task.reference.window.padded(pixels, whole) for pixels in planes)
     agreement = Agreement(*compare_with_sparse(whole, depth, task.sights, mask))
     return task.maps.write(normals, depth, task.key, agreement, partners=task.matched, shown=shown)

@@ -88,3 +88,9 @@ class Facts:
     unread: Mapping[str, str] = field(default_factory=dict)
     row_residual: float | None = None
     polish: Polish | None = None
+
+    @staticmethod
+    def of_map(found: int, pixels: int, shown: int | None) -> "Facts":
+        """Of a map of so many pixels and depths; `shown` pixels show the region, where one is asked for."""
+        wanted = pixels if shown is None else shown
+        return Facts(found / max(wanted, 1), wanted / pixels)

@@ -87,11 +87,11 @@ class MapFiles:
         begin(self.record, [self.depth, self.normals], sync=False)
         digests = {self.depth: write_depth_map(self.depth, depth)}
         digests[self.normals] = write_normal_map(self.normals, normals)
-        wanted = depth.size if shown is None else shown
+        of_depth = Facts.of_map(int(np.count_nonzero(depth > 0)), depth.size, shown)
         facts = MapFacts(
-            int(np.count_nonzero(depth > 0)) / max(wanted, 1),
+            of_depth.coverage,
             **asdict(agreement or Agreement()),
-            in_region=wanted / depth.size,
+            in_region=of_depth.in_region,
             partners=tuple(partners),
         )
         vouch_when_on_disk(self.record, key, digests, facts)

@@ -32,7 +32,7 @@ from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
 from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside
-from colmap_sph.stereo.region.shown import count_shown
+from colmap_sph.stereo.region.shown import count_focus
 from colmap_sph.stereo.region.window import Window
 from colmap_sph.stereo.vote import VoteOptions, vote_depth
 
@@ -93,7 +93,7 @@ def make_photometric_maps(task: VoteTask) -> Facts:
     normals, depth = fit_normals(view, estimate, task.normal_options)
     drop_other_depths(depth, task.depths)
     drop_outside(view, depth, region_of(task.focus))
-    shown = None if task.focus is None else count_shown(view, estimate.depth, depth, task.focus.near)
+    shown = count_focus(view, estimate.depth, depth, task.focus)
     normals, depth = (task.window.padded(pixels, task.view) for pixels in (normals, depth))
     return task.maps.write(normals, depth, task.maps_key, partners=task.matched, shown=shown)
 
@@ -113,13 +113,10 @@ def _vote(task: VoteTask, view: View) -> tuple[DepthEstimate, Facts]:
 
 
 def _facts_of(task: VoteTask, view: View, estimate: DepthEstimate) -> Facts:
-    pixels = task.view.num_pixels
-    if task.focus is None:
-        return Facts(float(np.count_nonzero(estimate.depth)) / pixels)
-    depth = estimate.depth.copy()
+    depth = estimate.depth if task.focus is None else estimate.depth.copy()
     drop_outside(view, depth, region_of(task.focus))
-    shown = count_shown(view, estimate.depth, depth, task.focus.near)
-    return Facts(float(np.count_nonzero(depth)) / max(shown, 1), shown / pixels)
+    shown = count_focus(view, estimate.depth, depth, task.focus)
+    return Facts.of_map(int(np.count_nonzero(depth)), task.view.num_pixels, shown)
 
 
 def report_photometric(context: "Context", votes: Mapping[str, Result]) -> None:

@@ -5,6 +5,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.scene import Region, View
+from colmap_sph.stereo.region.focus import Focus
 from colmap_sph.stereo.region.inside import pixels_inside
 
 
@@ -43,3 +44,10 @@ def count_shown(view: View, found: NDArray[np.float32], kept: NDArray[np.float32
     if not known.any():
         return known.size
     return int(np.count_nonzero(pixels_inside(view, filled(known), region) | (kept > 0)))
+
+
+def count_focus(
+    view: View, found: NDArray[np.float32], kept: NDArray[np.float32], focus: Focus | None
+) -> int | None:
+    """As `count_shown`, of the region that a run is for; None where it is for all of the scene."""
+    return None if focus is None else count_shown(view, found, kept, focus.near)
