@@ -1,5 +1,6 @@
 """A dense workspace → its page ``colmap_sph/report.html``, one file that shows what came out and loads nothing."""
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -175,6 +176,7 @@ class _Block:
         region = self.facts.region
         self._region = None if region is None else region.as_region().moved(-self.scene.origin)
         self._partners = self._find_partners()
+        self._as_partner = {view.name: Partner(view, self.samples[view.name]) for view in self.scene.views}
         self._shown = self._choose_shown()
         centers = np.array([view.center for view in self.scene.views])
         axes = map_axes(self.scene.views, surface, is_georeferenced=bool(self.scene.origin.any()))
@@ -210,11 +212,10 @@ class _Block:
     def _reasons(self, view: View, picture: Bytes | None) -> tuple[Bytes, NDArray[np.float32]]:
         """See `find_reasons`."""
         samples = self.samples[view.name]
-        others = [self.scene.view(name) for name in self._partners[view.name]]
         reasons, depth = find_reasons(
             view,
             samples,
-            [Partner(other, self.samples[other.name]) for other in others],
+            [self._as_partner[name] for name in self._partners[view.name]],
             blank=find_blank(self.workspace, view.name, picture, samples.geometric.shape),
             min_angle=self.facts.min_angle,
             region=self._region,
@@ -234,14 +235,17 @@ class _Block:
         """The images that each was matched with, or else those that share most points with it."""
         if not self.pairs:
             return overlapping_views(self.scene, _GUESSED_PARTNERS)
-        facing = Facing(self.scene)
-        partners: dict[str, list[str]] = {view.name: [] for view in self.scene.views}
+        matched: dict[str, list[str]] = {photograph.name: [] for photograph in self.photographs}
         for pair in self.pairs:
-            both = [self.photographs[place] for place in (pair.left, pair.right)]
-            for own, other in (both, reversed(both)):
-                for view in own.views:
-                    partners[view.name] += facing.views(view.name, [other.lead.name])[0]
-        return partners
+            left, right = self.photographs[pair.left], self.photographs[pair.right]
+            matched[left.name].append(right.lead.name)
+            matched[right.name].append(left.lead.name)
+        facing = Facing(self.scene)
+        return {
+            view.name: list(itertools.chain(*facing.views(view.name, matched[photograph.name])))
+            for photograph in self.photographs
+            for view in photograph.views
+        }
 
     def _choose_shown(self) -> set[str]:
         """Images whose pictures the page has room for."""

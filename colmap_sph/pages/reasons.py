@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -55,6 +56,12 @@ class Partner:
 
     view: View
     samples: MapSamples
+
+    @cached_property
+    def depths_around(self) -> NDArray[np.float32]:
+        """(h, w): the largest depth at each sample and those around it; 0 where there is none."""
+        found = np.where(self.samples.photometric > 0, self.samples.photometric, self.samples.geometric)
+        return np.asarray(cv2.dilate(found, np.ones((3, 3), np.uint8)), np.float32)
 
 
 def find_reasons(
@@ -132,47 +139,43 @@ def _look_from(
     depth: NDArray[np.float32],
     min_angle: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_]]:
-    """(h, w) each: does any partner have it in view; and from another place; and has it a depth there?"""
-    columns, rows = np.meshgrid(samples.columns, samples.rows)
-    pixels = np.stack([columns, rows, np.ones_like(rows)]).reshape(3, -1).astype(np.float64)
-    points = depth.reshape(1, -1) * pixels
+    """(h, w) each: does any partner have it in view; and from another place; and has it a depth there?
+
+    Of samples without a confirmed depth, for which alone it matters; the others are in nobody's view.
+    """
+    rows, columns = np.nonzero((depth > 0) & (samples.geometric == 0))
+    pixels = np.stack([samples.columns[columns], samples.rows[rows], np.ones_like(rows)])
+    points = depth[rows, columns].astype(np.float64) * pixels
     rays = view.R.T @ np.linalg.inv(view.K) @ points
-    known = depth.ravel() > 0
-    seen = np.zeros(depth.size, bool)
-    apart = np.zeros(depth.size, bool)
-    met = np.zeros(depth.size, bool)
+    found = np.zeros((3, len(rows)), bool)
+    seen, apart, met = found
     for partner in partners:
         transfer = pixel_transfer(view, partner.view)
         moved = transfer[:, :3] @ points + transfer[:, 3:]
-        in_view, places = _in_view(partner, moved, known)
+        in_view, places = _in_view(partner, moved)
         seen[in_view] = True
         unsure = in_view[~apart[in_view]]
         angles = _angles(rays[:, unsure], partner.view.center - view.center)
         apart[unsure] = angles >= min_angle
         # What lies behind the surface that the partner sees is hidden from it.
-        most = _depths_around(partner.samples)[places]
+        most = partner.depths_around[places]
         met[in_view] |= (most > 0) & (moved[2, in_view] <= (1 + _SLACK) * most)
-    shape = depth.shape
-    return seen.reshape(shape), apart.reshape(shape), met.reshape(shape)
+    maps = np.zeros((3, *depth.shape), bool)
+    maps[:, rows, columns] = found
+    return maps[0], maps[1], maps[2]
 
 
 def _in_view(
-    partner: Partner, moved: NDArray[np.float64], known: NDArray[np.bool_]
+    partner: Partner, moved: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], tuple[NDArray[np.int64], NDArray[np.int64]]]:
     """(m,) homogeneous pixels, of (3, n), that lie in a partner's image; row and column of the sample there."""
     x, y, depth = moved
     view = partner.view
-    inside = known & (x >= 0) & (y >= 0) & (x <= (view.width - 1) * depth) & (y <= (view.height - 1) * depth)
+    inside = (x >= 0) & (y >= 0) & (x <= (view.width - 1) * depth) & (y <= (view.height - 1) * depth)
     which = np.flatnonzero(inside & (depth > 0))
     rows = nearest_in(partner.samples.rows, y[which] / depth[which])
     columns = nearest_in(partner.samples.columns, x[which] / depth[which])
     return which, (rows, columns)
-
-
-def _depths_around(samples: MapSamples) -> NDArray[np.float32]:
-    """(h, w): the largest depth at each sample and those around it; 0 where there is none."""
-    found = np.where(samples.photometric > 0, samples.photometric, samples.geometric)
-    return np.asarray(cv2.dilate(found, np.ones((3, 3), np.uint8)), np.float32)
 
 
 def _angles(rays: NDArray[np.float64], baseline: NDArray[np.float64]) -> NDArray[np.float64]:

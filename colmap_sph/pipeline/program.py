@@ -7,7 +7,6 @@ maker, and changes the digest, too.
 
 import platform
 import re
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -68,17 +67,17 @@ def reached_modules(module: str) -> list[str]:
         name = waiting.pop()
         if name not in reached:
             reached.add(name)
-            waiting += _imported_by(name)
+            waiting += _imported_by(_source_of(name))
             package, _, _ = name.rpartition(".")
             waiting += [package] if package else []
     return sorted(reached)
 
 
-def _imported_by(module: str) -> Iterator[str]:
-    return (name for name in _ours_imported(_source_of(module).read_bytes()) if _source_of(name).is_file())
-
-
 @cache
+def _imported_by(source: Path) -> tuple[str, ...]:
+    return tuple(name for name in _ours_imported(source.read_bytes()) if _source_of(name).is_file())
+
+
 def _ours_imported(source: bytes) -> tuple[str, ...]:
     """Full names of what a module's code imports of this package, of ``from a import b`` also ``a.b``."""
     names: list[str] = []

@@ -197,6 +197,9 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         self._voted = {name: result.facts.coverage for name, result in votes.items()}
         self._residuals = residuals_of(matched)
         self._all_partners = partners_of(matched)
+        # Each is asked for by all partners of a view.
+        self._files: dict[str, EstimateFile] = {}
+        self._chosen: dict[str, list[str]] = {}
 
     def input_key(self) -> str:
         """See `RememberingStage`."""
@@ -248,8 +251,10 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         return Job(key, self.found(task), self._cost(item), task)
 
     def _partners(self, name: str) -> list[str]:
-        facing = self.context.facing.views(name, self._matched(name))
-        return [other for views in facing for other in views if other in self._vote_keys]
+        if name not in self._chosen:
+            facing = self.context.facing.views(name, self._matched(name))
+            self._chosen[name] = [other for views in facing for other in views if other in self._vote_keys]
+        return self._chosen[name]
 
     def _residuals_with(self, name: str, partners: Sequence[str]) -> list[float]:
         """Row residuals of a view's pairs, radians."""
@@ -260,16 +265,17 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         return self._all_partners.get(self.context.lead(name), [])
 
     def _estimate_file(self, name: str) -> EstimateFile:
-        context = self.context
-        view = context.scene.view(name).without_points()
-        return EstimateFile(
-            view,
-            context.window(name),
-            context.workspace.image_path(name),
-            undistorted_place(context.workspace, name).record,
-            context.estimate_path(name),
-            self._vote_keys[name],
-        )
+        if name not in self._files:
+            context = self.context
+            self._files[name] = EstimateFile(
+                context.scene.view(name).without_points(),
+                context.window(name),
+                context.workspace.image_path(name),
+                undistorted_place(context.workspace, name).record,
+                context.estimate_path(name),
+                self._vote_keys[name],
+            )
+        return self._files[name]
 
     def _cost(self, name: str) -> Cost:
         pixels = self._pixels(name)

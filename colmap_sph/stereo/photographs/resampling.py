@@ -54,11 +54,12 @@ def resample_photograph(
     valid = np.zeros(shape, np.uint8)
     pixels = [image.astype(np.float32, copy=False) for image in images]
     tables = [ray_tables(view, pair, side) for view in views]
+    shown = [_shown_coarsely(*each) for each in zip(views, tables, strict=True)]
     for first in range(0, pair.height, _BAND_ROWS):
         band = slice(first, min(first + _BAND_ROWS, pair.height))
         nearness = np.zeros(rectified[band].shape, np.float32)
-        for image, view, table, mask in zip(pixels, views, tables, masks, strict=True):
-            columns = _columns_of(view, table, band)
+        for image, view, table, mask, is_shown in zip(pixels, views, tables, masks, shown, strict=True):
+            columns = _columns_of(is_shown, band)
             if columns.start < columns.stop:
                 target = (rectified[band, columns], valid[band, columns], nearness[:, columns])
                 cosine = table.depths(band, columns)
@@ -66,11 +67,18 @@ def resample_photograph(
     return rectified, valid
 
 
-def _columns_of(view: View, tables: RayTables, band: slice) -> slice:
+def _shown_coarsely(view: View, tables: RayTables) -> NDArray[np.bool_]:
+    """Whether a view has the ray of every so many-th rectified pixel in its image."""
+    every = slice(None, None, _COARSE)
+    *_, inside = tables.source_pixels(view, every, every)
+    return inside > 0
+
+
+def _columns_of(is_shown: NDArray[np.bool_], band: slice) -> slice:
     """The columns of a band in which a view may have rays; none where it has none."""
-    rows = slice(band.start, band.stop + _COARSE - 1, _COARSE)
-    *_, inside = tables.source_pixels(view, rows, slice(None, None, _COARSE))
-    found = np.flatnonzero(inside.any(axis=0))
+    # Bands begin at rows that were looked at, and the first one beyond counts, too.
+    rows = slice(band.start // _COARSE, -(-band.stop // _COARSE) + 1)
+    found = np.flatnonzero(is_shown[rows].any(axis=0))
     if not len(found):
         return slice(0, 0)
     return slice(max((int(found[0]) - 1) * _COARSE, 0), (int(found[-1]) + 1) * _COARSE + 1)
@@ -90,9 +98,9 @@ def _read(
     owned = (inside > 0) & (cosine > nearness)
     if not owned.any():
         return
-    nearness[owned] = cosine[owned]
+    np.copyto(nearness, cosine, where=owned)
     if mask is not None:
         inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
     values = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    rectified[owned] = values[owned]
-    valid[owned] = inside[owned]
+    np.copyto(rectified, values, where=owned)
+    np.copyto(valid, inside, where=owned)

@@ -1,12 +1,13 @@
 """Matched pair of photographs that were cut into views → ties, as `poses.ties` measures those of two views."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.scene import View
-from colmap_sph.stereo.poses.ties import MAX_TIES, Ties, find_ties
+from colmap_sph.stereo.poses.ties import MAX_TIES, Ties, measure_ties, read_windows, surfaces_at
 from colmap_sph.stereo.rectified_pair import (
     Float,
     RectifiedPair,
@@ -41,24 +42,47 @@ def find_ties_of_photographs(
     Ties
         At most `MAX_TIES`.
     """
-    found = []
-    for number, (view, image, corners) in enumerate(left):
-        corners = corners[: _MOST_CORNERS // len(left)]
-        places = rectified_coordinates(view, geometry, "left", corners)
-        is_own = _owners([photo[0] for photo in left], geometry, "left", places) == number
-        corners, places = corners[is_own], places[is_own]
-        middle = np.rint(places).astype(int)
-        inside = ((middle >= 0) & (middle < [geometry.left_width, geometry.height])).all(axis=1)
-        corners, places, middle = corners[inside], places[inside], middle[inside]
-        matched = places - np.column_stack([disparity[middle[:, 1], middle[:, 0]], np.zeros(len(middle))])
-        owners = _owners([photo[0] for photo in right], geometry, "right", matched)
-        for owner in np.unique(owners[owners >= 0]):
-            other = right[owner]
-            own = corners[owners == owner]
-            found.append(find_ties((view, image), (other[0], other[1]), geometry, disparity, own))
-    ties = [np.concatenate(parts) for parts in zip(*((t.left, t.right, t.sigma) for t in found), strict=True)]
-    step = -(-len(ties[0]) // MAX_TIES) or 1 if ties else 1
-    return Ties(*(part[::step] for part in ties)) if ties else Ties.none()
+    lefts, rights = ([view for view, _, _ in photos] for photos in (left, right))
+    tried = [corners[: _MOST_CORNERS // len(left)] for _, _, corners in left]
+    numbers = np.repeat(np.arange(len(left)), [len(corners) for corners in tried])
+    in_views = [
+        rectified_coordinates(view, geometry, "left", each) for view, each in zip(lefts, tried, strict=True)
+    ]
+    places = np.concatenate(in_views)
+    middle = np.rint(places).astype(int)
+    inside = ((middle >= 0) & (middle < [geometry.left_width, geometry.height])).all(axis=1)
+    own = np.flatnonzero(inside & (_owners(lefts, geometry, "left", places) == numbers))
+    numbers, places, middle = numbers[own], places[own], middle[own]
+    matched = places - np.column_stack([disparity[middle[:, 1], middle[:, 0]], np.zeros(len(own))])
+    owners = _owners(rights, geometry, "right", matched)
+    by_views = np.lexsort((owners, numbers))
+    by_views = by_views[owners[by_views] >= 0]
+    smooth, planes = surfaces_at(places[by_views], disparity)
+    which = by_views[smooth]
+    windows = _Windows(left, geometry, "left", numbers[which]), _Windows(right, geometry, "right", owners[which])
+    ties = measure_ties(places[which], planes, *windows)
+    step = -(-len(ties) // MAX_TIES) or 1
+    return Ties(ties.left[::step], ties.right[::step], ties.sigma[::step])
+
+
+@dataclass(frozen=True, eq=False)
+class _Windows:
+    """Reads the windows around places, each from the photo of its number."""
+
+    photos: Sequence[Photo]
+    geometry: RectifiedPair
+    side: Side
+    numbers: NDArray[np.int64]
+
+    def __call__(self, places: Float, slopes: Float, length: int) -> NDArray[np.float32]:
+        """See `read_windows`."""
+        windows = np.empty((len(places), length, length), np.float32)
+        for number in np.unique(self.numbers):
+            view, image, _ = self.photos[number]
+            which = self.numbers == number
+            photo = (view, image)
+            windows[which] = read_windows(photo, self.geometry, self.side, places[which], slopes[which], length)
+        return windows
 
 
 def _owners(views: Sequence[View], geometry: RectifiedPair, side: Side, places: Float) -> NDArray[np.int64]:

@@ -6,8 +6,9 @@ hundred small windows along and across the rows. Errors of poses and lens shift 
 unseen: the *row residual* of a pair tells how far its disparities can be trusted.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -22,6 +23,9 @@ from colmap_sph.stereo.rectified_pair import (
     pixel_from_rectified_ray,
     rectified_coordinates,
 )
+
+Windows = Callable[[Float, Float, int], NDArray[np.float32]]
+"""Reads windows around places: see `read_windows`, whose last three parameters it has."""
 
 MAX_TIES = 300
 """Of a pair."""
@@ -182,30 +186,15 @@ def find_ties(
         At most `MAX_TIES`, in pixels of `geometry`.
     """
     places = rectified_coordinates(left[0], geometry, "left", corners)
-    places, planes = _on_surfaces(places, disparity)
-    if not len(places):
-        return Ties.none()
+    smooth, planes = surfaces_at(places, disparity)
+    kept = slice(None, None, -(-len(smooth) // MAX_TIES) or 1)
     fine = geometry.resampled(finer)
-    places, planes = places * finer, planes * [finer, 1, 1]
-    upright = np.tile([1.0, 0.0], (len(places), 1))
-    template = _Template.of(_windows(left, fine, "left", places, upright, _SIDE + 2))
-    start = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
-    found = start.copy()
-    # The right column of the window's pixel (i, j) is that of its middle, plus slopes · (i, j).
-    slopes = np.column_stack([1 - planes[:, 1], -planes[:, 2]])
-    for _ in range(_STEPS):
-        window = _windows(right, fine, "right", found, slopes, _SIDE)
-        move, correlation, sigma = template.step(window)
-        found -= np.column_stack([(slopes * move[:, :2]).sum(axis=1), move[:, 1]])
-        slopes -= slopes[:, :1] * move[:, 2:]
-    good = (correlation > _LEAST_CORRELATION) & (sigma < _MAX_SIGMA).all(axis=1)
-    good &= (np.abs(move[:, :2]) < _CONVERGED).all(axis=1) & (np.abs(found - start) < MAX_MOVE).all(axis=1)
-    measured = ((part[good] / finer).astype(np.float32) for part in (places, found, sigma[:, 1]))
-    return Ties(*measured)
+    lefts, rights = partial(read_windows, left, fine, "left"), partial(read_windows, right, fine, "right")
+    return measure_ties(places[smooth[kept]], planes[kept], lefts, rights, finer)
 
 
-def _on_surfaces(places: Float, disparity: NDArray[np.float32]) -> tuple[Float, Float]:
-    """Those places, up to `MAX_TIES`, around which disparities lie on a plane, and (n, 3) the planes.
+def surfaces_at(places: Float, disparity: NDArray[np.float32]) -> tuple[NDArray[np.int64], Float]:
+    """Numbers (m,) of those places (n, 2) around which disparities lie on a plane, and (m, 3) the planes.
 
     A plane is the disparity at the place, and its change per column and row.
     """
@@ -213,8 +202,41 @@ def _on_surfaces(places: Float, disparity: NDArray[np.float32]) -> tuple[Float, 
     roughness = np.empty(len(places), dtype=np.float32)
     _native.fit_surfaces(disparity, np.ascontiguousarray(places), _LEAST_FOUND, planes, roughness)
     smooth = np.flatnonzero(roughness <= _MAX_ROUGHNESS)
-    smooth = smooth[:: -(-len(smooth) // MAX_TIES) or 1]
-    return places[smooth], planes[smooth]
+    return smooth, planes[smooth]
+
+
+def measure_ties(places: Float, planes: Float, lefts: Windows, rights: Windows, finer: float = 1.0) -> Ties:
+    """Match the windows around places of the left rectified image in the right one.
+
+    Parameters
+    ----------
+    places : (n, 2) float64 ndarray
+        Columns and rows.
+    planes : (n, 3) float64 ndarray
+        Of the disparities around them, see `surfaces_at`.
+    lefts, rights : callable
+        Read the windows of all places, in their order, which have `finer` pixels per pixel of these.
+    finer : float
+        See `find_ties`.
+    """
+    if not len(places):
+        return Ties.none()
+    places, planes = places * finer, planes * [finer, 1, 1]
+    upright = np.tile([1.0, 0.0], (len(places), 1))
+    template = _Template.of(lefts(places, upright, _SIDE + 2))
+    start = np.column_stack([places[:, 0] - planes[:, 0], places[:, 1]])
+    found = start.copy()
+    # The right column of the window's pixel (i, j) is that of its middle, plus slopes · (i, j).
+    slopes = np.column_stack([1 - planes[:, 1], -planes[:, 2]])
+    for _ in range(_STEPS):
+        window = rights(found, slopes, _SIDE)
+        move, correlation, sigma = template.step(window)
+        found -= np.column_stack([(slopes * move[:, :2]).sum(axis=1), move[:, 1]])
+        slopes -= slopes[:, :1] * move[:, 2:]
+    good = (correlation > _LEAST_CORRELATION) & (sigma < _MAX_SIGMA).all(axis=1)
+    good &= (np.abs(move[:, :2]) < _CONVERGED).all(axis=1) & (np.abs(found - start) < MAX_MOVE).all(axis=1)
+    measured = ((part[good] / finer).astype(np.float32) for part in (places, found, sigma[:, 1]))
+    return Ties(*measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -261,7 +283,7 @@ class _Template:
         return move, correlation, np.sqrt(_CORRELATED * variance[:, None] * spread)
 
 
-def _windows(
+def read_windows(
     photo: tuple[View, NDArray[np.uint8] | NDArray[np.float32]],
     geometry: RectifiedPair,
     side: Side,
