@@ -269,8 +269,11 @@ def test_largest_size() -> None:
 # ---- which cameras are wide ----------------------------------------------------------------------------------
 
 
-def model_of(camera: pycolmap.Camera, places: np.ndarray) -> pycolmap.Reconstruction:
-    """One image that observes points, one at each place."""
+def model_of(
+    camera: pycolmap.Camera, places: np.ndarray, points: np.ndarray | None = None
+) -> pycolmap.Reconstruction:
+    """Two images of one pose that observe points (n, 3), one at each place (n, 2)."""
+    points = np.tile([0.0, 0.0, 1.0], (len(places), 1)) if points is None else points
     model = pycolmap.Reconstruction()
     camera.camera_id = 1
     model.add_camera_with_trivial_rig(camera)
@@ -281,7 +284,7 @@ def model_of(camera: pycolmap.Camera, places: np.ndarray) -> pycolmap.Reconstruc
         track = pycolmap.Track()
         for number in (1, 2):
             track.add_element(number, row)
-        model.add_point3D(np.array([0.0, 0.0, 1.0]), track, np.zeros(3, np.uint8))
+        model.add_point3D(points[row], track, np.zeros(3, np.uint8))
     return model
 
 
@@ -328,6 +331,34 @@ def test_spheres_smaller_than_their_images_are_refused(params: tuple[float, ...]
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=240, height=120, params=params)
     with pytest.raises(InputError, match=r"Camera 1.* in here .*"):
         wide_lenses(model_of(camera, np.empty((0, 2))), "here")
+
+
+PARTS = {
+    "whole": ((240, 120), (240.0, 120.0), 0, None),
+    "left half": ((120, 120), (240.0, 120.0), 0, None),
+    "right half, counted from the left of the whole": ((120, 120), (240.0, 120.0), 0, "outside of its images"),
+    "right half as if it were the left": ((120, 120), (240.0, 120.0), 120, "degrees beside"),
+    "right half as if it were the whole": ((120, 120), (120.0, 120.0), 120, "degrees beside"),
+    "left half as if it were the whole": ((120, 120), (120.0, 120.0), 0, "degrees beside"),
+}
+
+
+@pytest.mark.parametrize("part", PARTS)
+def test_panoramas_are_whole_or_say_which_part_they_are(part: str) -> None:
+    size, params, cut, told = PARTS[part]
+    low = 120 if "right" in part else 0
+    high = 240 if part == "whole" else low + 120
+    x, y = np.meshgrid(np.arange(low, high, 10) + 5.0, np.arange(5.0, 120, 10))
+    east, down = (x.ravel() / 240 - 0.5) * 2 * np.pi, (y.ravel() / 120 - 0.5) * np.pi
+    points = 7 * np.stack([np.sin(east) * np.cos(down), np.sin(down), np.cos(east) * np.cos(down)], axis=1)
+    places = np.stack([x.ravel() - cut, y.ravel()], axis=1)
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=size[0], height=size[1], params=params)
+    model = model_of(camera, places, points)
+    if told is None:
+        assert set(wide_lenses(model, "here")) == {1}
+        return
+    with pytest.raises(InputError, match=rf"amera 1 \(EQUIRECTANGULAR\) in here .*{told}.*Fill other parts up"):
+        wide_lenses(model, "here")
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,16 @@ _MOST_BEYOND = 0.01
 # A sphere may have so much of the size of its images: sizes are rounded.
 _ROUNDED = 0.99
 _HALF = 0.5
+_TINY = 1e-12
+# Degrees by which half of what panoramas observe may lie beside where they show it. It is seldom one; where images
+# are another part of the sphere than their camera says, it is tens.
+_MOST_ASTRAY = 10.0
+# Images of a camera that are asked for what they observe, from all over the model.
+_ASKED = 50
+_WHOLE = (
+    "an image must be the whole sphere, or the left or upper part of one whose width and height are the "
+    "camera's parameters. Fill other parts up to the whole, in black, and mask that, before structure from motion."
+)
 
 
 def wide_lenses(model: pycolmap.Reconstruction, name: str) -> dict[int, Lens]:
@@ -41,7 +51,7 @@ def wide_lenses(model: pycolmap.Reconstruction, name: str) -> dict[int, Lens]:
     for camera_id in sorted(used_cameras(model)):
         camera = model.camera(camera_id)
         if camera.model_name == PANORAMA:
-            lenses[camera_id] = _panorama(camera, name)
+            lenses[camera_id] = _panorama(model, camera, name)
         elif camera.model_name in MODELS:
             lens = _fisheye(model, camera, name)
             if max(angles_shown(lens)) > WIDEST_PINHOLE:
@@ -58,7 +68,7 @@ def _lens(camera: pycolmap.Camera) -> Lens:
     return Lens(camera.model_name, tuple(map(float, camera.params)), camera.width, camera.height)
 
 
-def _panorama(camera: pycolmap.Camera, name: str) -> Lens:
+def _panorama(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str) -> Lens:
     width, height = camera.params
     if not (np.isfinite([width, height]).all() and min(width, height) >= 1):
         raise InputError(f"Camera {camera.camera_id} in {name} has impossible parameters; export the model again.")
@@ -68,7 +78,24 @@ def _panorama(camera: pycolmap.Camera, name: str) -> Lens:
             f"pixels, less than its images have ({camera.width} x {camera.height}); its parameters are the width "
             "and height of whole panoramas."
         )
-    return _lens(camera)
+    lens = _lens(camera)
+    places, towards = _sights(model, camera.camera_id)
+    if not len(places):
+        return lens
+    beyond = ((places < 0) | (places > (camera.width, camera.height))).any(axis=1).mean()
+    if beyond > _MOST_BEYOND:
+        raise InputError(
+            f"Camera {camera.camera_id} ({PANORAMA}) in {name} has {100 * beyond:.0f} % of its observations outside "
+            f"of its images of {camera.width} x {camera.height} pixels; {_WHOLE}"
+        )
+    cosines = (camera_rays(lens, places) * towards).sum(axis=1)
+    astray = float(np.degrees(np.arccos(np.clip(np.nanmedian(cosines), -1, 1))))
+    if astray > _MOST_ASTRAY:
+        raise InputError(
+            f"What camera {camera.camera_id} ({PANORAMA}) in {name} observes lies {astray:.0f} degrees beside where "
+            f"its images show it; {_WHOLE}"
+        )
+    return lens
 
 
 def _fisheye(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str) -> Lens:
@@ -114,6 +141,21 @@ def _outside(lens: Lens) -> str | None:
     if lens.model == "FOV" and not abs(lens.params[-1]) < np.pi:
         return f"omega = {lens.params[-1]:g}, which must be an angle below pi"
     return None
+
+
+def _sights(model: pycolmap.Reconstruction, camera_id: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(n, 2) image coordinates at which images of a camera observe points, and (n, 3) unit vectors to these."""
+    images = [model.image(image_id) for image_id in model.reg_image_ids()]
+    images = [image for image in images if image.camera_id == camera_id and image.num_points3D]
+    places, towards = [np.empty((0, 2))], [np.empty((0, 3))]
+    for image in images[:: -(-len(images) // _ASKED) or 1]:
+        seen = image.get_observation_points2D()
+        points = np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        pose = image.cam_from_world().matrix()
+        places.append(np.array([point.xy for point in seen]))
+        towards.append(points @ pose[:, :3].T + pose[:, 3])
+    vectors = np.concatenate(towards)
+    return np.concatenate(places), vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), _TINY)
 
 
 def _observed(model: pycolmap.Reconstruction, camera_id: int) -> NDArray[np.float64]:
