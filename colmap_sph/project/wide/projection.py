@@ -242,19 +242,23 @@ def _undistorted(lens: Lens, points: Float) -> Float:
     distance = np.hypot(place[:, 0], place[:, 1])
     start = np.interp(distance, radius, angle)
     found = place * (start / np.maximum(distance, _TINY))[:, None]
+    left = np.arange(len(points))
     with np.errstate(all="ignore"):
         for _ in range(_STEPS):
-            miss = _distorted(lens, found) - points
-            if not (np.abs(miss) > _CLOSE).any():
+            miss = _distorted(lens, found[left]) - points[left]
+            is_off = (np.abs(miss) > _CLOSE).any(axis=1)
+            left, miss = left[is_off], miss[is_off]
+            if not len(left):
                 break
+            here = found[left]
             columns = [
-                (_distorted(lens, found + step) - _distorted(lens, found - step)) / (2 * _DELTA)
+                (_distorted(lens, here + step) - _distorted(lens, here - step)) / (2 * _DELTA)
                 for step in np.eye(2) * _DELTA
             ]
             (a, c), (b, d) = (column.T for column in columns)
             determinant = a * d - b * c
             change = np.column_stack([d * miss[:, 0] - b * miss[:, 1], a * miss[:, 1] - c * miss[:, 0]])
-            found = found - np.clip(change / determinant[:, None], -0.2, 0.2)
+            found[left] -= np.clip(change / determinant[:, None], -0.2, 0.2)
     return np.nan_to_num(found, nan=np.inf)
 
 
