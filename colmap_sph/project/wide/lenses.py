@@ -85,15 +85,15 @@ def _panorama(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str
     beyond = ((places < 0) | (places > (camera.width, camera.height))).any(axis=1).mean()
     if beyond > _MOST_BEYOND:
         raise InputError(
-            f"Camera {camera.camera_id} ({PANORAMA}) in {name} has {100 * beyond:.0f} % of its observations outside "
-            f"of its images of {camera.width} x {camera.height} pixels; {_WHOLE}"
+            f"Camera {camera.camera_id} ({PANORAMA}) in {name} has {100 * beyond:.0f} % of its observations "
+            f"outside of its images of {camera.width} x {camera.height} pixels; {_WHOLE}"
         )
     cosines = (camera_rays(lens, places) * towards).sum(axis=1)
     astray = float(np.degrees(np.arccos(np.clip(np.nanmedian(cosines), -1, 1))))
     if astray > _MOST_ASTRAY:
         raise InputError(
-            f"What camera {camera.camera_id} ({PANORAMA}) in {name} observes lies {astray:.0f} degrees beside where "
-            f"its images show it; {_WHOLE}"
+            f"What camera {camera.camera_id} ({PANORAMA}) in {name} observes lies {astray:.0f} degrees beside "
+            f"where its images show it; {_WHOLE}"
         )
     return lens
 
