@@ -579,6 +579,18 @@ def test_an_image_with_hardly_any_depth_does_not_confirm():
     np.testing.assert_array_equal(confirmed.depth[second] > 0, (first & with_depth)[second])
 
 
+def test_a_view_of_the_sky_may_have_hardly_any_depth():
+    """Where other views of its photograph have some: these say that it is of this place."""
+    views, maps = wall_views(3)
+    first = in_view(views[0], views[1], 10.0)
+    maps[2][:, maps[2].shape[1] // 16 :] = 0
+    sky = replace(views[2], original="photograph")
+    back = replace(sky, name="back", R=np.diag([-1.0, 1.0, -1.0]) @ sky.R, t=np.diag([-1.0, 1.0, -1.0]) @ sky.t)
+    partners = [(views[1], estimate(maps[1])), (sky, estimate(maps[2])), (back, estimate(maps[1]))]
+    confirmed = confirm_depth(views[0], estimate(maps[0]), partners, UNSURE, [1, 2, 2], [0.0] * 3)
+    np.testing.assert_array_equal(confirmed.depth > 0, first)
+
+
 def test_what_too_few_views_confirm_is_dropped():
     views, maps = wall_views(4)
     for k in (2, 3):

@@ -112,10 +112,12 @@ def confirm_depth(
     for number, members in groupby(numbered, key=lambda member: member[0]):
         has_others = sizes[number] > 1
         station = _Sums.empty(estimate.depth.shape) if has_others else sums
-        for _, (partner, partner_estimate), residual in members:
-            silence_counts = _fits_none(partner_estimate)
+        for _, of_one in groupby(members, key=lambda member: member[1][0].photograph):
+            views = [(*partner, residual) for _, partner, residual in of_one]
+            silence_counts = _fits_none([partner_estimate for _, partner_estimate, _ in views])
             any_silence_counts |= silence_counts
-            _compare(view, estimate, partner, partner_estimate, options, residual, silence_counts, station)
+            for partner, partner_estimate, residual in views:
+                _compare(view, estimate, partner, partner_estimate, options, residual, silence_counts, station)
         if has_others:
             _add_as_one(station, sums)
     _native.confirm_depth(
@@ -147,8 +149,10 @@ class _Sums(NamedTuple):
         return cls(observing, agreeing, contradicting, weighted, weight)
 
 
-def _fits_none(estimate: DepthEstimate) -> bool:
-    return bool(np.count_nonzero(estimate.depth) < _LEAST_COVERED * estimate.depth.size)
+def _fits_none(estimates: Sequence[DepthEstimate]) -> bool:
+    """Whether the views of one photograph have next to no depth: of those cut from it, one may show the sky."""
+    found = sum(np.count_nonzero(estimate.depth) for estimate in estimates)
+    return bool(found < _LEAST_COVERED * sum(estimate.depth.size for estimate in estimates))
 
 
 def _compare(
