@@ -185,6 +185,7 @@ LENSES = {
     "190 degrees": Lens("OPENCV_FISHEYE", PARAMETERS["OPENCV_FISHEYE"], 480, 480, math.radians(97)),
     "230 degrees": Lens("FISHEYE", (114.0, 114.0, 240.0, 240.0), 480, 480, math.radians(115)),
     "137 degrees": Lens("FISHEYE", (200.0, 200.0, 240.0, 240.0), 480, 480),
+    "low": Lens("FISHEYE", (150.0, 150.0, 240.0, 100.0), 480, 200, math.radians(98)),
     "full frame": Lens("FISHEYE", (600.0, 600.0, 900.0, 600.0), 1800, 1200),
     "panorama": Lens(PANORAMA, (880.0, 440.0), 880, 440),
     "half a panorama": Lens(PANORAMA, (880.0, 440.0), 440, 440),
@@ -237,7 +238,10 @@ def test_views_end_where_the_lens_does(name: str) -> None:
 
 
 def test_number_of_views() -> None:
-    assert [face.name for face in faces_of(LENSES["190 degrees"])] == ["left", "right", "up", "down"]
+    quarters = {"upper_left", "upper_right", "lower_left", "lower_right"}
+    assert {face.name for face in faces_of(LENSES["190 degrees"])} == quarters
+    # Of an image that is low two views to the sides show all.
+    assert [face.name for face in faces_of(LENSES["low"])] == ["left", "right"]
     assert {face.name for face in faces_of(LENSES["230 degrees"])} == {"front", "left", "right", "up", "down"}
     assert {face.name for face in faces_of(LENSES["panorama"])} == {"front", "right", "back", "left", "up", "down"}
     assert "right" not in {face.name for face in faces_of(LENSES["half a panorama"])}
@@ -254,6 +258,10 @@ def test_left_is_left_and_up_is_up() -> None:
                 "down": y > 0,
                 "front": z > 0.9,
                 "back": z < -0.9,
+                "upper_left": x < -0.4 and y < -0.4,
+                "upper_right": x > 0.4 and y < -0.4,
+                "lower_left": x < -0.4 and y > 0.4,
+                "lower_right": x > 0.4 and y > 0.4,
             }
             assert expected[face.name]
             if face.name in ("left", "right"):

@@ -33,7 +33,7 @@ FISHEYE = CourtyardOptions(width=180, images=4, points=1500, supersample=2)
 PANORAMA = CourtyardOptions(width=320, images=4, points=1500, supersample=2, panoramas=True)
 OPTIONS = {"fisheye": FISHEYE, "panorama": PANORAMA}
 FACES = {
-    "fisheye": {"left", "right", "up", "down"},
+    "fisheye": {"upper_left", "upper_right", "lower_left", "lower_right"},
     "panorama": {"front", "right", "back", "left", "up", "down"},
 }
 
@@ -83,17 +83,25 @@ def test_names_of_views(project: Path) -> None:
     names = {
         view.name: view for view in read_scene(prepare(model_in(project), project / "dense").sparse_dir).views
     }
-    assert "cam/x/left/a.png" in names
-    assert names["up/b.c.png"].original == names["up/b.c.png"].photograph == "b.c.png"
+    assert "cam/x/upper_left/a.png" in names
+    assert names["lower_right/b.c.png"].original == names["lower_right/b.c.png"].photograph == "b.c.png"
     assert len(names) == 16
 
 
 def test_no_two_views_have_one_name(project: Path) -> None:
     # Two that differ by their ending alone, and one that is called like the view of another.
-    rename(project, {"C_0_00.png": "a.png", "C_0_01.png": "a.jpg", "C_1_00.png": "left/a.png", "C_1_01.png": "up"})
+    rename(
+        project,
+        {
+            "C_0_00.png": "a.png",
+            "C_0_01.png": "a.jpg",
+            "C_1_00.png": "upper_left/a.png",
+            "C_1_01.png": "lower_left",
+        },
+    )
     cuts = cuts_of(pycolmap.Reconstruction(model_in(project)), "here", scale=0.7, max_size=-1)
     assert len(cuts.views) == 16
-    assert set(cuts.of) == {"a.png", "a.jpg", "left/a.png", "up"}
+    assert set(cuts.of) == {"a.png", "a.jpg", "upper_left/a.png", "lower_left"}
     folders = {str(folder) for name in cuts.views for folder in Path(name).parents}
     assert not folders & set(cuts.views)
 
@@ -238,11 +246,11 @@ def test_masks_are_the_users_and_the_lenss(project: Path) -> None:
         assert set(np.unique(found)) <= {0, 255}
         return found == 255
 
-    # Of the left view only what it shows beyond the axis is left, of the right one nothing but that is lost.
-    assert 0 < white("left/C_0_00.png").mean() < 0.2 < 0.6 < white("right/C_0_00.png").mean()
-    whole = white("left/C_0_01.png")
+    # Of a left view only what it shows beyond the axis is left, of a right one nothing but that is lost.
+    assert 0 < white("upper_left/C_0_00.png").mean() < 0.35 < 0.6 < white("upper_right/C_0_00.png").mean()
+    whole = white("upper_left/C_0_01.png")
     assert 0.6 < whole.mean() < 1
-    view = cv2.imread(str(workspace.image_path("left/C_0_01.png")))
+    view = cv2.imread(str(workspace.image_path("upper_left/C_0_01.png")))
     assert view is not None
     assert not view[~whole].any()
 
@@ -253,7 +261,7 @@ def test_16_bits_stay(project: Path) -> None:
         assert picture is not None
         cv2.imwrite(str(path), picture.astype(np.uint16) * 257)
     workspace = prepare(model_in(project), project / "dense")
-    view = cv2.imread(str(workspace.image_path("left/C_0_01.png")), cv2.IMREAD_UNCHANGED)
+    view = cv2.imread(str(workspace.image_path("upper_left/C_0_01.png")), cv2.IMREAD_UNCHANGED)
     assert view is not None
     assert view.dtype == np.uint16
     assert view.max() > 30000
@@ -327,7 +335,7 @@ def test_an_image_without_any_depth_is_told_by_its_own_name(
     cli.main(["run", "--model", str(model_in(project)), "--threads", "1"])
     report = json.loads((project / "dense" / "colmap_sph" / "report.json").read_text())
     views = report["views"]["C_0_00.png"]
-    assert sorted(views) == [f"{face}/C_0_00.png" for face in ("down", "left", "right", "up")]
+    assert sorted(views) == [f"{face}/C_0_00.png" for face in sorted(FACES["fisheye"])]
     assert set(views) <= set(report["skipped_images"])
     assert report["originals"]["C_0_00.png"] == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "image skipped" in line]

@@ -1,9 +1,9 @@
 """Which pinhole views are cut from the image of a wide lens.
 
 Views overlap, since matching loses a margin of each. Of a fisheye up to about 200 degrees these are four, tilted
-to the left, right, up and down, of which each reaches from a little beyond the axis to the rim; of what sees more,
-six views as of the faces of a cube, but wider. All are cropped to what the lens shows, and one that shows nothing
-but what others show as well is left out.
+into the quarters of its image, or to the left, right, up and down where these have fewer pixels; each reaches from
+a little beyond the axis to the rim. Of what sees more they are six, as of the faces of a cube, but wider. All are
+cropped to what the lens shows, and one that shows nothing but what others show as well is left out.
 """
 
 from collections.abc import Sequence
@@ -32,11 +32,17 @@ _FOUR_VIEWS = 103.0
 _OVERLAP = 9.0
 _RIM = 1.5
 _HALF_FACE = 55.0
+# Four views tilted into the quarters have what lies level with the axis, often a horizon with most there is to
+# see, off their own axes, where pinholes have more pixels per degree. They may have so many times the pixels.
+_MOST_PIXELS = 1.1
 # A view is left out where others show all that it does, so far within their borders.
 _MARGIN = 5.0
 _GRID = 96
 _CROP_GRID = 160
 _HALF = 0.5
+# What views are called: to the sides, and as these come to lie when they are turned by 45 degrees.
+_SIDES = ("left", "right", "up", "down")
+_QUARTERS = ("lower_left", "upper_right", "upper_left", "lower_right")
 
 
 @dataclass(frozen=True)
@@ -148,9 +154,12 @@ def faces_of(lens: Lens, scale: float = 1.0, max_size: int = -1) -> tuple[Face, 
         return ()
     reach = float(np.arccos(np.clip(rays[:, 2].min(), -1, 1)))
     focal = scale * focal_length(lens)
-    is_four = lens.model != PANORAMA and np.degrees(reach) <= _FOUR_VIEWS
-    drawn = _without_idle(_four(reach, focal) if is_four else _cube(focal), rays)
-    faces = [_cropped(lens, face, rays) for face in drawn]
+    if lens.model != PANORAMA and np.degrees(reach) <= _FOUR_VIEWS:
+        quarters = _needed(lens, _four(reach, focal, _QUARTERS, np.pi / 4), rays)
+        sides = _needed(lens, _four(reach, focal, _SIDES, 0.0), rays)
+        faces = quarters if _pixels(quarters) <= _MOST_PIXELS * _pixels(sides) else sides
+    else:
+        faces = _needed(lens, _cube(focal), rays)
     longest = max(max(face.width, face.height) for face in faces)
     if max_size > 0 and longest > max_size:
         return faces_of(lens, scale * (max_size - 1) / longest)
@@ -165,8 +174,11 @@ def _rays_shown(lens: Lens) -> Float:
     return rays[~np.isnan(rays).any(axis=1)]
 
 
-def _four(reach: float, focal: float) -> list[Face]:
-    """Views tilted off the axis, of a lens that shows so much to all sides, radians."""
+def _four(reach: float, focal: float, names: Sequence[str], turn: float) -> list[Face]:
+    """Views tilted off the axis, of a lens that shows so much to all sides, radians.
+
+    To the left, right, up and down, or to where these are once turned about the axis, radians.
+    """
     tilt = reach / 2 + np.radians(1.0)
     rim = reach + np.radians(_RIM)
     # Between two views, at 45 degrees, each must reach the rim to its side.
@@ -176,11 +188,17 @@ def _four(reach: float, focal: float) -> list[Face]:
     outer = np.tan(rim - tilt)
     # How far to the rim the corner of a view reaches beyond the middle of its side, cropping will say.
     outer = max(outer, side)
+    tilts = (_about(1, -tilt), _about(1, tilt), _about(0, tilt), _about(0, -tilt))
+    borders = (
+        (outer, side, inner, side),
+        (inner, side, outer, side),
+        (side, outer, side, inner),
+        (side, inner, side, outer),
+    )
+    turned = _about(2, turn)
     return [
-        _drawn("left", _about(1, -tilt), (outer, side, inner, side), focal),
-        _drawn("right", _about(1, tilt), (inner, side, outer, side), focal),
-        _drawn("up", _about(0, tilt), (side, outer, side, inner), focal),
-        _drawn("down", _about(0, -tilt), (side, inner, side, outer), focal),
+        _drawn(name, rotation @ turned, reaches, focal)
+        for name, rotation, reaches in zip(names, tilts, borders, strict=True)
     ]
 
 
@@ -206,11 +224,22 @@ def _drawn(name: str, rotation: Float, borders: Sequence[float], focal: float) -
 
 
 def _about(axis: int, angle: float) -> Float:
-    """From the camera's frame to one turned about its x (0: upward) or y axis (1: to the right)."""
+    """From the camera's frame to one turned about its x (0: upward), y (1: to the right) or z axis (2)."""
     cosine, sine = np.cos(angle), np.sin(angle)
+    if axis == 2:
+        return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
     if axis == 0:
         return np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])
     return np.array([[cosine, 0.0, -sine], [0.0, 1.0, 0.0], [sine, 0.0, cosine]])
+
+
+def _needed(lens: Lens, drawn: list[Face], rays: Float) -> list[Face]:
+    """Those views that show `rays` which no other shows, cropped to what the lens shows."""
+    return [_cropped(lens, face, rays) for face in _without_idle(drawn, rays)]
+
+
+def _pixels(faces: Sequence[Face]) -> int:
+    return sum(face.width * face.height for face in faces)
 
 
 def _cropped(lens: Lens, face: Face, rays: Float) -> Face:
