@@ -89,7 +89,8 @@ def _panorama(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str
             f"outside of its images of {camera.width} x {camera.height} pixels; {_WHOLE}"
         )
     cosines = (camera_rays(lens, places) * towards).sum(axis=1)
-    astray = float(np.degrees(np.arccos(np.clip(np.nanmedian(cosines), -1, 1))))
+    cosines = cosines[np.isfinite(cosines)]
+    astray = float(np.degrees(np.arccos(np.clip(np.median(cosines), -1, 1)))) if len(cosines) else 0.0
     if astray > _MOST_ASTRAY:
         raise InputError(
             f"What camera {camera.camera_id} ({PANORAMA}) in {name} observes lies {astray:.0f} degrees beside "
@@ -149,10 +150,10 @@ def _sights(model: pycolmap.Reconstruction, camera_id: int) -> tuple[NDArray[np.
     images = [image for image in images if image.camera_id == camera_id and image.num_points3D]
     places, towards = [np.empty((0, 2))], [np.empty((0, 3))]
     for image in images[:: -(-len(images) // _ASKED) or 1]:
-        seen = image.get_observation_points2D()
-        points = np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        seen = [point for point in image.get_observation_points2D() if model.exists_point3D(point.point3D_id)]
+        points = np.array([model.point3D(point.point3D_id).xyz for point in seen]).reshape(-1, 3)
         pose = image.cam_from_world().matrix()
-        places.append(np.array([point.xy for point in seen]))
+        places.append(np.array([point.xy for point in seen]).reshape(-1, 2))
         towards.append(points @ pose[:, :3].T + pose[:, 3])
     vectors = np.concatenate(towards)
     return np.concatenate(places), vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), _TINY)
