@@ -14,6 +14,7 @@ from colmap_sph.app import cli
 from colmap_sph.errors import InputError
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.wide import layout
 from colmap_sph.project.wide.cuts import cuts_of
 from colmap_sph.project.wide.range_maps import CHANNELS, ViewMaps, range_and_normals, read_range_map
 from colmap_sph.project.wide.table import TABLE_NAME, read_cuts
@@ -300,6 +301,24 @@ def test_another_scale_is_another_workspace(project: Path) -> None:
     prepare(model_in(project), project / "dense", UndistortionOptions(wide_scale=1.0), overwrite=True)
     large = max(view.width for view in read_scene(workspace.sparse_dir).views)
     assert large == pytest.approx(small / 0.7, abs=2)
+
+
+def test_views_that_another_version_cut_give_way(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    layout.faces_of.cache_clear()
+    monkeypatch.setattr(layout, "_MOST_PIXELS", 0.0)  # to the left, right, up and down
+    workspace = Workspace(project / "dense")
+    arguments = ["run", "--model", str(model_in(project)), "--threads", "1", "--rectification.sampling", "0.5"]
+    assert cli.main(arguments) == 0
+    of_the_user = project / "dense" / "images" / "up" / "C_0_00.png"
+    cv2.imwrite(str(of_the_user), 255 - cv2.imread(str(of_the_user)))
+    former = [path for path in workspace.root.rglob("*.*") if path.parent.name in {"left", "right", "up", "down"}]
+    assert len(former) > 16 * 4
+    monkeypatch.undo()
+    layout.faces_of.cache_clear()
+    assert cli.main(arguments) == 0
+    assert {Path(view.name).parent.name for view in read_scene(workspace.sparse_dir).views} == FACES["fisheye"]
+    assert {path.name for path in former if path.exists()} == {"C_0_00.png", "C_0_00.png.undistorted.json"}
+    assert of_the_user.exists()
 
 
 def test_the_scale_has_no_part_in_other_workspaces(project: Path) -> None:

@@ -7,6 +7,7 @@ says of itself that it is not finished, and that the next run goes on with.
 import logging
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -28,6 +29,7 @@ from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import cameras_of_images, has_model, image_names
 from colmap_sph.project.state.ownership import (
     remove_empty_folders,
+    remove_image,
     remove_recorded,
     remove_undistorted,
     undistorted_place,
@@ -54,6 +56,7 @@ from colmap_sph.project.undistortion.model import (
 )
 from colmap_sph.project.undistortion.originals import read_originals
 from colmap_sph.project.undistortion.process import ChildProcess
+from colmap_sph.project.wide.table import read_cuts
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import NO_SCENE, Scene
 from colmap_sph.stereo.anchor import anchored
@@ -212,6 +215,7 @@ class Preparation:
         if self._is_model_there(names):
             logger.info("The undistorted images in %s are up to date", self.workspace.root)
             return
+        self._remove_former_views()
         self.workspace.create_stereo_dirs(names)
         scratch = self.workspace.undistortion_scratch_dir
         with scratch_folder(scratch):
@@ -223,6 +227,16 @@ class Preparation:
                 set_model_aside(self.workspace, self._found)  # one that is damaged, see `_is_model_there`
             publish_model(self.workspace, self._marker, made, names)
         logger.info("Undistorted %d of %d images into %s", len(names), len(self.names), self.workspace.root)
+
+    def _remove_former_views(self) -> None:
+        """Remove views that are no longer cut: another version of the program cut wide images otherwise."""
+        former: Collection[str] = ()
+        with suppress(InputError):  # a damaged table is replaced
+            former = read_cuts(self.workspace.sparse_dir).keys() - self._originals.cuts.views.keys()
+        for name in former:
+            remove_image(self.workspace, name)
+        if former:
+            remove_empty_folders(self.workspace.images_dir, self.workspace.masks_dir, self.workspace.stereo_dir)
 
     def given_model(self) -> GivenModel:
         """What polishing has to know of the model as it was given."""

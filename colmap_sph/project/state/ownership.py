@@ -233,6 +233,16 @@ def remove_undistorted(workspace: Workspace) -> None:
     _remove(undistorted_places(workspace))
 
 
+def remove_image(workspace: Workspace, name: str) -> None:
+    """Remove an undistorted image, its mask, maps and estimate of ours; `OutputError` where that is impossible."""
+    _remove(
+        [undistorted_place(workspace, name), *(map_place(workspace, name, kind) for kind in get_args(MapKind))]
+    )
+    estimate = workspace.photometric_dir / f"{name}{SUFFIX}"
+    if is_array_file(estimate):
+        remove(estimate)
+
+
 def _remove(places: Iterable[Place]) -> list[Path]:
     """Remove files that are as we left them; return the others."""
     return [path for place in places for path in remove_place(place)]
