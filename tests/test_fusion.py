@@ -403,6 +403,52 @@ def test_gates_are_the_oracles(seed):
     assert seen == {0, 1, 2, 3}
 
 
+def random_maps(rng, count):
+    """Views in the midst of pixels: each has some in view, and others behind or beside it."""
+    maps = []
+    for index in range(count):
+        width, height = int(rng.integers(60, 300)), int(rng.integers(4, 30))
+        R, _ = cv2.Rodrigues(rng.normal(0, 0.7, 3))
+        K = syn.pinhole(float(rng.uniform(30, 120)), width, height)
+        view = View(index + 1, f"{index}.png", width, height, K, R, rng.normal(0, 1, 3), np.empty(0, np.int64))
+        # Steps as at the edges of things, noise, and holes; some rows are empty.
+        steps = rng.uniform(0.5, 6, (height, width // 20 + 1)).repeat(20, axis=1)[:, :width]
+        depth = (steps * rng.uniform(0.99, 1.01, steps.shape)).astype(np.float32)
+        depth[rng.random(depth.shape) < 0.2] = 0
+        depth[rng.random(height) < 0.1] = rng.choice([0, -1, np.nan])
+        normals = np.broadcast_to(R[:, 2].astype(np.float32)[:, None, None], (3, *depth.shape)).copy()
+        maps.append(ViewMaps(view, index, depth, normals, np.zeros((*depth.shape, 3), np.uint8)))
+    return maps
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_no_pixel_is_passed_over_that_a_partner_has_in_view(seed):
+    """Blocks of pixels are passed over that are out of view as a whole: pixel by pixel the same agree."""
+    gates = (0.3, -1.0)
+    agree = out_of_view = 0
+    for one, other in itertools.permutations(random_maps(np.random.default_rng(seed), 10), 2):
+        transfer, turn = pixel_transfer(one.view, other.view), one.view.R @ other.view.R.T
+        covered, colour = np.zeros(one.depth.shape, np.uint8), np.zeros((*one.depth.shape, 3), np.uint16)
+        agreeing = np.zeros(one.depth.shape, np.uint64)
+        rays = [np.linalg.inv(maps.view.K) for maps in (one, other)]
+        _native.fuse_partner(
+            one.depth, one.normals, rays[0], other.depth, other.normals, rays[1], other.image, transfer, turn,
+            0.0, *gates, False, 0, covered, agreeing, colour,
+        )  # fmt: skip
+        rows, columns = np.nonzero(one.depth > 0)
+        gate, distance = np.empty(len(rows), np.uint8), np.empty(len(rows), np.float32)
+        places = (rows.astype(np.int32), columns.astype(np.int32))
+        _native.find_gates(
+            one.depth, one.normals, other.depth, other.normals, transfer, turn, *gates, *places, gate, distance
+        )
+        np.testing.assert_array_equal(agreeing[rows, columns], gate == 3)
+        assert agreeing.sum() == agreeing[rows, columns].sum()
+        agree += int(np.count_nonzero(gate == 3))
+        out_of_view += int(np.count_nonzero(gate == 0))
+    assert agree > 1000
+    assert out_of_view > 1000
+
+
 def test_bands_are_joined_in_order(yard, monkeypatch):
     whole = list(fuse_view(yard[0], yard[1:], FusionOptions()))
     assert len(whole) == 1

@@ -34,24 +34,28 @@ static inline sighting sight(const fusion_transfer *transfer, double column, dou
     return (sighting){seen.x / seen.z + 0.5, seen.y / seen.z + 0.5, seen.z};
 }
 
+static inline int is_in_view(const view_maps *partner, sighting seen) {
+    return seen.depth > 0 && seen.u >= 0 && seen.v >= 0 && seen.u < (double)partner->width &&
+           seen.v < (double)partner->height;
+}
+
 /* Of pixel p of the reference, which the partner sights. */
 static inline meeting meet(const view_maps *reference, const view_maps *partner, const fusion_transfer *transfer,
                            fusion_gates gates, ptrdiff_t p, sighting seen) {
     meeting met = {.gate = GATE_UNSEEN};
-    const double u = seen.u, v = seen.v;
-    if (!(seen.depth > 0 && u >= 0 && v >= 0 && u < (double)partner->width && v < (double)partner->height)) {
+    if (!is_in_view(partner, seen)) {
         return met;
     }
-    met.x = (ptrdiff_t)u;
-    met.y = (ptrdiff_t)v;
+    met.x = (ptrdiff_t)seen.u;
+    met.y = (ptrdiff_t)seen.v;
     const ptrdiff_t q = met.y * partner->width + met.x;
     met.depth = partner->depth[q];
     if (!(met.depth > 0 && isfinite(met.depth))) {
         return met;
     }
     met.gate = GATE_DEPTH;
-    met.du = u - 0.5 - (double)met.x;
-    met.dv = v - 0.5 - (double)met.y;
+    met.du = seen.u - 0.5 - (double)met.x;
+    met.dv = seen.v - 0.5 - (double)met.y;
     if (!(fabsf(met.depth - (float)seen.depth) <= gates.max_depth_error * met.depth)) {
         return met;
     }

@@ -37,7 +37,7 @@ CLOUD_BYTES = 22.0
 
 # Processor seconds per megapixel of the image, and per image that overlaps it.
 _SECONDS = 0.05
-_PARTNER_SECONDS = 0.011
+_PARTNER_SECONDS = 0.009
 # Bytes per pixel: of the maps of a view with its image; largest in use while a view is fused.
 _MAPS_BYTES = 19.0
 _FUSE_BYTES = 60.0
