@@ -253,9 +253,11 @@ def test_patch_match_cfg_is_obeyed(line: Scene, caplog: pytest.LogCaptureFixture
     assert "gone.jpg" in caplog.text and "lost.jpg" in caplog.text
 
 
-def test_patch_match_cfg_of_colmap_is_no_choice(line: Scene) -> None:
-    automatic = {view.name: 20 for view in line.views}
+def test_patch_match_cfg_of_colmap_is_no_choice(line: Scene, caplog: pytest.LogCaptureFixture) -> None:
+    """It names all images of the model, those that were left out among them: nobody asked for these."""
+    automatic = {view.name: 20 for view in line.views} | {"left_out.jpg": 20}
     assert select_pairs(line, FEW, explicit=automatic) == select_pairs(line, FEW)
+    assert "left_out.jpg" not in caplog.text
 
 
 def write_database(path: Path, names: Sequence[str], inliers: dict[tuple[int, int], int]) -> None:

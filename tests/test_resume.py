@@ -198,6 +198,22 @@ def test_photometric_maps_are_made_only_where_they_are_fused(finished: Finished)
     assert maps() == []
 
 
+def test_photometric_maps_do_not_outlive_other_normals(finished: Finished) -> None:
+    """The votes stay; maps that do not fit the options any more are removed where none are asked for."""
+    finished.rerun(fusion=FusionOptions(input="photometric"))
+    before = results_of_votes(finished.dense)
+    assert len(list(finished.dense.glob("stereo/*/*.photometric.bin"))) == 2 * 4
+    others: dict[str, Any] = {"normals": NormalOptions(radius=2)}
+    assert finished.rerun(**others).made["vote on depth"] == 4
+    assert list(finished.dense.glob("stereo/*/*.photometric.bin")) == []
+    assert results_of_votes(finished.dense) == before
+    assert finished.rerun(**others).made == NOTHING
+
+
+def results_of_votes(dense: Path) -> dict[str, int]:
+    return {path.name: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/photometric/*")}
+
+
 def test_fewer_pairs_keep_their_disparity_maps(finished: Finished) -> None:
     fewer = PairOptions(num_pairs=1)
     left = select_pairs(read_scene(finished.dense / "sparse"), fewer).unique_pairs()

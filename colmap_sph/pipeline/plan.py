@@ -108,7 +108,7 @@ def make_plan(
         within = Within(limit.begun(survey.seconds), context, selection, goes_on=not overwrite)
         context, pairs_to_match, chosen = within.planned()
         choice = f"{choice} {chosen.words}".lstrip()
-    go_through_stages(context, pairs_to_match, survey)
+    go_through_stages(context, pairs_to_match, survey, is_plan=True)
     stages = survey.stages
     pairs, _, maps, cloud = [stage for stage in stages if stage.name != RangeStage.name][-4:]
     return Plan(

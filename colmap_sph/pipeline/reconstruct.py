@@ -21,6 +21,7 @@ from colmap_sph.pipeline.input.prepared import prepare
 from colmap_sph.pipeline.input.start import start
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.pose_check import check_poses
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.report_files import command_of, keep_or_make_page, write_report
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
@@ -254,7 +255,12 @@ def reconstruct(
 
 
 def go_through_stages(
-    context: Context, pairs: Sequence[Pair], executor: Executor, *, until: Until = "cloud"
+    context: Context,
+    pairs: Sequence[Pair],
+    executor: Executor,
+    *,
+    until: Until = "cloud",
+    is_plan: bool = False,
 ) -> None:
     """Go through the stages in their order: each begins where all results of the one before are known.
 
@@ -267,10 +273,13 @@ def go_through_stages(
         What is done with each stage, see `Executor`.
     until : {"photometric", "geometric", "cloud"}
         The last results to make.
+    is_plan : bool
+        Whether the executor makes nothing, so that there is nothing to judge.
     """
     check_numbers(context, pairs)
     matched = by_name(executor(MatchStage(context, context.order.sorted_pairs(pairs))))
-    _judge_rows(context, matched)
+    if not is_plan:
+        _judge_pairs(context, matched)
     votes = by_name(executor(VoteStage(context, matched)))
     if until == "photometric":
         report_photometric(context, votes)
@@ -284,7 +293,7 @@ def go_through_stages(
 def go_through_stages_within(within: Within, executor: Executor) -> Context:
     """Go through all stages in the time that there is; return the context with the options that were chosen."""
     context, matched, votes = within.match_and_vote(executor)
-    _judge_rows(context, matched)
+    _judge_pairs(context, matched)
     context = within.refined(context, matched, votes)
     maps = by_name(executor(ConfirmStage(context, matched, by_name(votes))))
     _join_views(context, maps, executor)
@@ -299,9 +308,10 @@ def _join_views(context: Context, maps: Mapping[str, Result], executor: Executor
         executor(stage)
 
 
-def _judge_rows(context: Context, matched: Mapping[Pair, Result]) -> None:
+def _judge_pairs(context: Context, matched: Mapping[Pair, Result]) -> None:
     measured = {pair: result.facts.row_residual for pair, result in matched.items()}
     judge_rows(context.report, context.scene, measured)
+    check_poses(context, matched)
 
 
 def by_name(results: Mapping[Item, Result]) -> dict[Item, Result]:

@@ -9,6 +9,7 @@ same.
 import logging
 from collections.abc import Mapping
 from dataclasses import replace
+from statistics import median
 from typing import TYPE_CHECKING, Any
 
 from colmap_sph.pipeline.context import Context
@@ -24,8 +25,11 @@ from colmap_sph.pipeline.stages.confirm import ConfirmStage, confirm_seconds
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.stages.vote import VoteStage, normals_seconds, vote_seconds
+from colmap_sph.scene import View
 from colmap_sph.stereo.partners.pairing import Pair, partners_of
 from colmap_sph.stereo.partners.pairs import PairSelection
+from colmap_sph.stereo.poses.ties import filled_residuals
+from colmap_sph.stereo.refinement import suits_half_size
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.execute import Executor
@@ -106,6 +110,8 @@ class Within:
         self._has_pairs = any(context.workspace.pairs_dir.glob("*"))
         self._rank_works: dict[tuple[float, int], float] = {}
         self._later_works: dict[tuple[int, int, int], float] = {}
+        self._residuals: dict[Pair, float | None] = {}
+        self._residual: float | None = None
 
     # ---- what settings take --------------------------------------------------------------------------------
 
@@ -143,15 +149,34 @@ class Within:
         if known is None:
             partners = partners_of(self._pairs(count))
             options = settings.applied(self._context.options)
-            normals, refinement = (options.normals, options.refinement)
             known = estimated_fusion(self._context).seconds
             for name, others in partners.items():
-                seconds = vote_seconds(len(others)) + confirm_seconds(len(others), normals, refinement)
-                seconds += normals_seconds(normals) if self._context.wants_photometric else 0.0
-                views = self._context.scene.photograph(name).views
-                known += seconds * sum(self._context.window(view.name).num_pixels for view in views) / 1e6
+                seconds = vote_seconds(len(others))
+                seconds += normals_seconds(options.normals) if self._context.wants_photometric else 0.0
+                for view in self._context.scene.photograph(name).views:
+                    pixels = self._context.window(view.name).num_pixels
+                    known += (seconds + self._confirm_seconds(view, len(others), options)) * pixels / 1e6
             self._later_works[case] = known
         return known
+
+    def _confirm_seconds(self, view: View, partners: int, options: RunOptions) -> float:
+        """Processor seconds per megapixel to confirm a view and to refine it, by what is known of its pairs."""
+        if self._residual is None:
+            return confirm_seconds(partners, options.normals, options.refinement)
+        residual = self._residual * float(view.K[0, 0])
+        return confirm_seconds(
+            partners,
+            options.normals,
+            options.refinement.for_residual(residual),
+            half_size=suits_half_size(self._context.details.get(view.name, 1.0), residual),
+        )
+
+    def _note_residuals(self, results: Mapping[Pair, Result]) -> None:
+        """Views with precise poses take less refinement, and so do soft ones with imprecise poses."""
+        self._residuals |= {pair: result.facts.row_residual for pair, result in results.items()}
+        if self._residuals:
+            self._residual = median(filled_residuals([*self._residuals.values()]))
+            self._later_works.clear()
 
     def _matching_work(self, settings: Settings, first: int, end: int) -> float:
         return sum(self._rank_work(settings.sampling, rank) for rank in range(first, end))
@@ -237,6 +262,7 @@ class Within:
         seen: set[str] = set()
         for first in range(_MOST_PROBES):
             results = executor(ProbeStage(context, probes[first::_MOST_PROBES]))
+            self._note_residuals(results)
             made = {pair: result for pair, result in results.items() if result.made}
             worked = sum(result.seconds for result in made.values())
             for name in {name for pair in made for name in pair} - seen:
@@ -256,6 +282,7 @@ class Within:
         """Match ranks as long as there is time."""
         stage = self._stage(kind, end)
         results = self._timed(executor, stage, self._pace)
+        self._note_residuals(results)
         self._done = stage.done
         if "pairs.num_pairs" not in self._kept:
             self._settings = replace(self._settings, partners=self._done)

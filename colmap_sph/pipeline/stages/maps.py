@@ -15,6 +15,7 @@ from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.state.ownership import Place, remove_place
 from colmap_sph.project.state.records import (
     begin,
+    read_record,
     recorded_facts,
     vouch_when_on_disk,
     vouched_facts,
@@ -101,6 +102,11 @@ class MapFiles:
         """What is known of the maps, or None where they must be made."""
         known = vouched_facts(self.record, key, [self.depth, self.normals], MapFacts)
         return None if known is None else known.as_facts()
+
+    def are_outdated(self, key: str) -> bool:
+        """Whether there are maps of ours that were made under another key."""
+        record = read_record(self.record)
+        return record is not None and record.state == "done" and record.key != key
 
     def remove(self) -> None:
         """Remove maps that this program made, where there are any."""

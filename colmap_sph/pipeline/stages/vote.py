@@ -85,10 +85,8 @@ def make_photometric_maps(task: VoteTask) -> Facts:
     # A worker that was lost may have come so far.
     facts = facts_of_estimate(task.estimate, task.vote_key, view)
     if not task.wants_maps:
-        if facts is not None:
-            return facts
-        task.maps.remove()  # of an earlier vote
-        return _vote(task, view)[1]
+        task.maps.remove()  # of an earlier vote, or with other normals
+        return _vote(task, view)[1] if facts is None else facts
     estimate = _vote(task, view)[0] if facts is None else read_estimate(task.estimate, view, task.vote_key)
     normals, depth = fit_normals(view, estimate, task.normal_options)
     drop_other_depths(depth, task.depths)
@@ -161,7 +159,11 @@ class VoteStage(RememberingStage[str, VoteTask]):
     def found(task: VoteTask) -> Facts | None:
         """See `Stage.found`."""
         voted = facts_of_estimate(task.estimate, task.vote_key, task.window.view(task.view))
-        return voted if voted is None or not task.wants_maps else task.maps.facts(task.maps_key)
+        if voted is None:
+            return None
+        if task.wants_maps:
+            return task.maps.facts(task.maps_key)
+        return None if task.maps.are_outdated(task.maps_key) else voted
 
     def __init__(self, context: "Context", matched: Mapping[Pair, Result]) -> None:
         super().__init__(context, context.order.sorted(context.scene.index_of))
@@ -239,12 +241,12 @@ class VoteStage(RememberingStage[str, VoteTask]):
 
     def _cost(self, view: View, pixels: int, files: tuple[Path, ...], is_voted: bool) -> Cost:
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
-        seconds = vote_seconds(len(files))
-        disk = _ESTIMATE_BYTES * pixels
+        seconds = 0.0 if is_voted else vote_seconds(len(files))
+        disk = 0.0 if is_voted else _ESTIMATE_BYTES * pixels
         maps = 0.0
         if self.context.wants_photometric:
-            seconds = normals_seconds(self.context.options.normals) + (0.0 if is_voted else seconds)
-            disk = MAP_BYTES * view.num_pixels + (0.0 if is_voted else disk)
+            seconds += normals_seconds(self.context.options.normals)
+            disk += MAP_BYTES * view.num_pixels
             maps = MAP_BYTES * (view.num_pixels - pixels)
         return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities + maps, disk)
 

@@ -251,7 +251,6 @@ def _explicit_selection(
 ) -> PairSelection:
     index_of = scene.index_of
     place_of = {photograph.name: place for place, photograph in enumerate(graph.photographs)}
-    _warn_unknown(explicit, index_of)
     partners: dict[str, tuple[Partner, ...]] = {}
     obeyed = set(index_of) - set(explicit) != set()
     for name in sorted(explicit.keys() & index_of.keys(), key=index_of.__getitem__):
@@ -274,6 +273,8 @@ def _explicit_selection(
         before = partners.get(photograph.lead.name, ())
         others = {partner.name for partner in before}
         partners[photograph.lead.name] = before + tuple(each for each in found if each.name not in others)
+    if obeyed:  # else it is as COLMAP writes it, with all images
+        _warn_unknown(explicit, index_of)
     return PairSelection(partners, "patch-match.cfg" if obeyed else graph.source)
 
 

@@ -1,0 +1,155 @@
+"""A model without points, whose poses are right or wrong: what features of its images say of them."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from rendered import SIDES, grey
+
+from colmap_sph import synthetic as syn
+from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.plan import make_plan
+from colmap_sph.pipeline.reconstruct import run
+from colmap_sph.project.project import Project
+from colmap_sph.scene import View
+from colmap_sph.stereo.poses.features import Features, epipolar_share, find_features, match_features
+
+OPTIONS = RunOptions(threads=2)
+
+
+# ---- one pair ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def features() -> tuple[View, View, Features, Features]:
+    """Both views of a rendered pair, and their features."""
+    pair = syn.convergent_pair(15.0)
+    views = [
+        View(k, name, camera.width, camera.height, camera.K, camera.R, camera.t, np.empty(0, np.int64))
+        for k, (name, camera) in enumerate([("a", pair.left), ("b", pair.right)])
+    ]
+    images = [grey(pair.render(side)) for side in SIDES]
+    found = [find_features([(view, image, None)]) for view, image in zip(views, images, strict=True)]
+    return views[0], views[1], found[0], found[1]
+
+
+def test_features_match_in_their_epipolar_planes(features: tuple[View, View, Features, Features]) -> None:
+    left, right, first, second = features
+    matches = match_features(first, second)
+    assert len(matches) > 50
+    assert epipolar_share(first, second, matches, right.center - left.center) > 0.9
+
+
+def test_features_of_a_turned_camera_do_not(features: tuple[View, View, Features, Features]) -> None:
+    left, right, first, second = features
+    matches = match_features(first, second)
+    turn, _ = cv2.Rodrigues(np.radians([3.0, 2.0, -2.0]))
+    turned = replace(second, rays=second.rays @ turn.T)
+    assert epipolar_share(first, turned, matches, right.center - left.center) < 0.3
+
+
+def test_views_of_one_photograph_have_their_features_together() -> None:
+    pair = syn.convergent_pair(15.0)
+    view = View(1, "a", 160, 120, pair.left.K, pair.left.R, pair.left.t, np.empty(0, np.int64))
+    right = replace(view, name="b", R=pair.right.R, t=pair.right.t)
+    image = np.ascontiguousarray(grey(pair.render("left"))[:120, :160])
+    alone, both = find_features([(view, image, None)]), find_features([(view, image, None), (right, image, None)])
+    assert 10 < len(alone) < 750  # half of what a photograph may have
+    assert len(both) == 2 * len(alone)
+    assert np.allclose(both.rays[len(alone) :] @ right.R.T, alone.rays @ view.R.T)
+
+
+def test_nothing_is_wanted_of_what_is_masked() -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (200, 300), dtype=np.uint8)
+    image = cv2.GaussianBlur(noise, (0, 0), 2).astype(np.uint8)
+    view = View(1, "a", 300, 200, np.diag([300.0, 300.0, 1.0]), np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    mask = np.zeros_like(image)
+    mask[:, :150] = 255
+    found = find_features([(view, image, mask)])
+    assert 0 < len(found) < len(find_features([(view, image, None)]))
+    assert (found.rays[:, 0] / found.rays[:, 2] <= 0.5).all()
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1)])
+def test_images_without_features_match_nothing(shape: tuple[int, int]) -> None:
+    view = View(1, "a", shape[1], shape[0], np.eye(3), np.eye(3), np.zeros(3), np.empty(0, np.int64))
+    none = find_features([(view, np.zeros(shape, np.uint8), None)])
+    assert not len(none)
+    matches = match_features(none, none)
+    assert matches.shape == (0, 2)
+    assert np.isnan(epipolar_share(none, none, matches, np.ones(3)))
+
+
+# ---- whole runs --------------------------------------------------------------------------------------------
+
+
+def exchange_images(project: Path) -> None:
+    """Every image gets the place of one three places on, in the order of names."""
+    paths = sorted(path for path in (project / "images").rglob("*") if path.is_file())
+    contents = [path.read_bytes() for path in paths]
+    for path, content in zip(paths, contents[3:] + contents[:3], strict=True):
+        path.write_bytes(content)
+
+
+def turn_cameras(project: Path) -> None:
+    """Every camera looks four degrees past."""
+    rng = np.random.default_rng(5)
+
+    def turned(pose: pycolmap.Rigid3d) -> pycolmap.Rigid3d:
+        axis = rng.normal(size=3)
+        turn = cv2.Rodrigues(np.radians(4) * axis / np.linalg.norm(axis))[0]
+        matrix = turn @ pose.matrix()
+        return pycolmap.Rigid3d(pycolmap.Rotation3d(matrix[:, :3]), matrix[:, 3])
+
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for image in model.images.values():
+        image.frame.rig_from_world = turned(image.cam_from_world())
+    model.write(project / "sparse/0")
+
+
+def lengthen_focus(project: Path) -> None:
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for camera in model.cameras.values():
+        camera.focal_length_x *= 1.4
+        camera.focal_length_y *= 1.4
+    model.write(project / "sparse/0")
+
+
+def without_points(project: Path) -> None:
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for point_id in list(model.points3D):
+        model.delete_point3D(point_id)
+    model.write(project / "sparse/0")
+
+
+@pytest.mark.parametrize("spoil", [exchange_images, turn_cameras, lengthen_focus])
+def test_wrong_poses_without_points_are_refused(project: Path, spoil: Callable[[Path], None]) -> None:
+    without_points(project)
+    spoil(project)
+    with pytest.raises(NoResultError, match="no points to compare with, and features of its images lie"):
+        run(project / "sparse/0", options=OPTIONS)
+    assert not (project / "dense/fused.ply").exists()
+
+
+def test_right_poses_without_points_are_not(project: Path) -> None:
+    without_points(project)
+    plan = make_plan(Project(project / "sparse/0"), OPTIONS)
+    assert plan.pairs > plan.pairs_done == 0
+    report = run(project / "sparse/0", options=OPTIONS)
+    assert report.points > 10_000
+
+
+def test_images_of_something_else_are_refused(project: Path) -> None:
+    """Each of something else: they have many features, of which none match."""
+    without_points(project)
+    rng = np.random.default_rng(2)
+    for path in (project / "images").rglob("*.*"):
+        picture = cv2.GaussianBlur(rng.integers(0, 256, (240, 320, 3), dtype=np.uint8), (0, 0), 1.2)
+        path.write_bytes(cv2.imencode(path.suffix, picture)[1].tobytes())
+    with pytest.raises(NoResultError, match="match in none of"):
+        run(project / "sparse/0", options=OPTIONS)
