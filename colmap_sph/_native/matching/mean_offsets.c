@@ -28,7 +28,8 @@ static inline void mean_of_lanes(const int32_t *own, ptrdiff_t width, row_range 
                                  int32_t *mean) {
     const lanes middle = load_lanes(own);
     /* From the middle's offset less max_step to that plus max_step, as far as 32 bits go. */
-    const lanes below = middle<INT32_MIN + max_step, above = middle> INT32_MAX - max_step;
+    const lanes below = (middle < INT32_MIN + max_step);
+    const lanes above = (middle > INT32_MAX - max_step);
     const lanes least = (below & INT32_MIN) | (~below & (middle - (max_step & ~below)));
     const lanes most = (above & INT32_MAX) | (~above & (middle + (max_step & ~above)));
     const unsigned_lanes range = (unsigned_lanes)most - (unsigned_lanes)least;
