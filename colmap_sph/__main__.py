@@ -62,11 +62,14 @@ def _command() -> int:
     _load_colmap()
     from colmap_sph.app import cli
 
+    gc.freeze()  # nor while the command runs
     gc.enable()
     try:
         code = cli.main()
     except SystemExit as stop:  # the parser, after help or a mistake
         code = 0 if stop.code is None else stop.code if isinstance(stop.code, int) else 2
+    finally:
+        gc.unfreeze()  # or libraries would say on leaving that objects of theirs are left
     try:
         sys.stdout.flush()
     except BrokenPipeError:

@@ -249,7 +249,7 @@ def test_surfaces_are_not_mixed_across_a_step():
 @property_test
 @given(
     height=st.integers(1, 3),
-    widths=st.tuples(st.integers(1, 40), st.integers(1, 40)),
+    widths=st.tuples(st.integers(1, 150), st.integers(1, 150)),
     spread=st.sampled_from([0, 100, 700, 5000]),
     quantum=st.sampled_from([1, 128, 256]),
     holes=st.sampled_from([0.0, 0.2, 1.0]),

@@ -2,6 +2,8 @@
 
 #include "depth/depth.h"
 
+enum { BLOCK = 64, MANY = 2 };
+
 /* Where surfaces overlap in the right image, the nearer one (larger disparity) is what it sees. */
 static void put(float *row, ptrdiff_t width, ptrdiff_t column, float disparity) {
     if (column >= 0 && column < width && !(row[column] >= disparity)) {
@@ -24,6 +26,61 @@ static void put_segment(float *row, ptrdiff_t width, ptrdiff_t x, float d0, floa
     }
 }
 
+/* What pixels of a row leave in the right image, as most of them do in one column or none. */
+typedef struct {
+    int32_t column[BLOCK];  /* the first of a segment to the next pixel */
+    float disparity[BLOCK]; /* there */
+    int32_t columns[BLOCK]; /* how many: 0, 1 or MANY; MANY also of a pixel that is joined to no other */
+} block;
+
+/* Straight loops, so that the compiler vectorises them. */
+static inline int has_any(const float *d) {
+    int any = 0;
+    for (int i = 0; i < BLOCK; i++) {
+        any |= d[i] == d[i];
+    }
+    return any;
+}
+
+static inline void find_columns(const float *d, ptrdiff_t first, ptrdiff_t width, float max_step, block *k) {
+    const float end = (float)width;
+    for (int i = 0; i < BLOCK; i++) {
+        const float d0 = d[i], d1 = d[i + 1], r0 = (float)(int32_t)(first + i) - d0,
+                    r1 = (float)(int32_t)(first + i + 1) - d1;
+        const float from = r0 > 0 ? r0 : 0, bounded = from < end ? from : end;
+        const int32_t before = (int32_t)bounded, column = before + (r0 > (float)before);
+        const float at = (float)column;
+        /* False for NaN. */
+        const int joined = fabsf(d1 - d0) <= max_step;
+        const int some = (r1 > r0) & (r1 >= at) & (at < end), more = (r1 >= at + 1) & (at + 1 < end);
+        k->column[i] = column;
+        k->disparity[i] = d0 + (at - r0) * ((d1 - d0) / (r1 - r0));
+        k->columns[i] = joined ? (some ? (more ? MANY : 1) : 0) : d0 == d0 ? MANY : 0;
+    }
+}
+
+/* What the pixels from `first` on leave in a row of the right image; `d` holds one more, NaN behind the last. */
+static void put_block(const float *d, ptrdiff_t first, ptrdiff_t pixels, ptrdiff_t width, float max_step,
+                      float *row) {
+    if (!has_any(d)) {
+        return;
+    }
+    block k;
+    find_columns(d, first, width, max_step, &k);
+    float nowhere;
+    for (ptrdiff_t i = 0; i < pixels; i++) {
+        if (k.columns[i] < MANY) { /* without a branch: which of them have a column is hard to predict */
+            float *at = k.columns[i] ? row + k.column[i] : &nowhere;
+            nowhere = 0;
+            *at = *at >= k.disparity[i] ? *at : k.disparity[i];
+        } else if (fabsf(d[i + 1] - d[i]) <= max_step) {
+            put_segment(row, width, first + i, d[i], d[i + 1]);
+        } else {
+            put(row, width, (ptrdiff_t)llrintf((float)(first + i) - d[i]), d[i]);
+        }
+    }
+}
+
 void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_width, ptrdiff_t right_width,
                         float max_step, float *right) {
     for (ptrdiff_t y = 0; y < height; y++) {
@@ -32,16 +89,14 @@ void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_widt
         for (ptrdiff_t r = 0; r < right_width; r++) {
             row[r] = NAN;
         }
-        for (ptrdiff_t x = 0; x < left_width; x++) {
-            if (isnan(d[x])) {
-                continue;
-            }
-            const int joined = x + 1 < left_width && fabsf(d[x + 1] - d[x]) <= max_step;
-            if (joined) {
-                put_segment(row, right_width, x, d[x], d[x + 1]);
-            } else {
-                put(row, right_width, (ptrdiff_t)llrintf((float)x - d[x]), d[x]);
-            }
+        ptrdiff_t first = 0;
+        for (; first + BLOCK < left_width; first += BLOCK) {
+            put_block(d + first, first, BLOCK, right_width, max_step, row);
         }
+        float last[BLOCK + 1];
+        for (ptrdiff_t i = 0; i <= BLOCK; i++) {
+            last[i] = first + i < left_width ? d[first + i] : NAN;
+        }
+        put_block(last, first, left_width - first, right_width, max_step, row);
     }
 }

@@ -25,6 +25,29 @@ ALWAYS_INLINE __m256i gather_bytes(const uint8_t *bytes, __m256i place, __m256i 
     return _mm256_and_si256(_mm256_srlv_epi32(four, bits), _mm256_set1_epi32(UINT8_MAX));
 }
 
+/* Where bit mask `there` is set: the target pixels whose sums those of r are checked against, and these sums. */
+ALWAYS_INLINE __m256i rivals_of(__m256i r, __m256i there, match_size size, const selection_buffers *buffers,
+                                __m256i *sum) {
+    const __m256i minus_one = _mm256_set1_epi32(-1), own = _mm256_add_epi32(r, _mm256_set1_epi32((int)size.depth));
+    if (!buffers->columns) {
+        *sum = gather_bytes(buffers->best_sum, own, there);
+        return r;
+    }
+    const __m256i width = _mm256_set1_epi32((int)size.source_width), none = _mm256_set1_epi32(UINT8_MAX);
+    const __m256i column = _mm256_mask_i32gather_epi32(minus_one, buffers->columns, r, there, 4);
+    const __m256i inside =
+        _mm256_and_si256(_mm256_cmpgt_epi32(column, minus_one), _mm256_cmpgt_epi32(width, column));
+    const int *words = (const int *)(const void *)buffers->best;
+    const __m256i best = _mm256_mask_i32gather_epi32(minus_one, words, column, inside, 4);
+    const __m256i column_sum = _mm256_srli_epi32(best, 24), lacks = _mm256_cmpeq_epi32(column_sum, none);
+    *sum = column_sum;
+    const __m256i asked = _mm256_and_si256(there, lacks);
+    if (!_mm256_testz_si256(asked, asked)) {
+        *sum = _mm256_blendv_epi8(column_sum, gather_bytes(buffers->best_sum, own, asked), lacks);
+    }
+    return _mm256_blendv_epi8(_mm256_and_si256(best, _mm256_set1_epi32(0xffffff)), r, lacks);
+}
+
 /* Row entries from `first` on, which may lie before or behind the row where bit mask `there` is not set. */
 ALWAYS_INLINE __m256i load_there(const int32_t *row, ptrdiff_t first, __m256i there) {
     return _mm256_maskload_epi32((const int *)((uintptr_t)row + (uintptr_t)first * sizeof *row), there);
@@ -82,8 +105,8 @@ static inline void check_eight(const uint8_t *sums, const int32_t *base, const u
     const __m256i sum = _mm256_and_si256(_mm256_srli_epi32(three, 8), byte);
     const __m256i after = _mm256_and_si256(_mm256_srli_epi32(three, 16), byte);
 
-    const __m256i best_sum = gather_bytes(buffers->best_sum, _mm256_add_epi32(r, depth), found);
-    const __m256i rival = _mm256_mask_i32gather_epi32(minus_one, buffers->rival, r, found, 4);
+    __m256i best_sum;
+    const __m256i rival = rivals_of(r, found, size, buffers, &best_sum);
     const __m256i excess = _mm256_sub_epi32(sum, best_sum);
     __m256i mutual = _mm256_andnot_si256(_mm256_cmpgt_epi32(excess, _mm256_set1_epi32(check.max_excess)), found);
     for (int32_t step = 1; step <= check.max_difference && step < (int32_t)size.width; step++) {

@@ -21,9 +21,10 @@ enum {
 };
 
 /* Offsets of a row, RADIUS before the first and beyond the last block, NONE where a pixel cannot be used;
- * and for each the costs of 2 REACH + 1 target pixels around it, COST_BITS each, the leftmost lowest. */
+ * the least whole pixels of offset for which costs are kept; and the costs of 2 REACH + 1 target pixels around
+ * each, COST_BITS each, the leftmost lowest. */
 typedef struct {
-    int32_t *offset;
+    int32_t *offset, *least;
     uint32_t *costs;
 } window_row;
 
@@ -47,14 +48,18 @@ static inline lanes load_lanes(const void *p) {
 
 static inline lanes absolute(lanes v) { return (v ^ (v >> 31)) - (v >> 31); }
 
+/* Where |v| <= most, in one comparison. */
+static inline lanes is_within(lanes v, int most) { return (unsigned_lanes)(v + most) <= (unsigned)(2 * most); }
+
 static inline lanes choose(lanes condition, lanes yes, lanes no) { return (condition & yes) | (~condition & no); }
 
-static inline int any(lanes condition) {
-    int32_t found = 0;
-    for (int l = 0; l < LANES; l++) {
-        found |= condition[l];
+/* Whether none of a block's pixels can be used; most often the first one tells. */
+static inline int is_empty(const int32_t *offset) {
+    int l = 0;
+    while (l < LANES && offset[l] == NONE) {
+        l++;
     }
-    return found != 0;
+    return l == LANES;
 }
 
 /* Whole quotients of numbers below 2^24 with few digits before the point: rounding lifts none to the next. */
@@ -75,6 +80,7 @@ static inline void read_row(const int32_t *offset, const uint64_t *reference, co
                             match_size size, ptrdiff_t y, window_row row) {
     for (ptrdiff_t x = -RADIUS; x < size.width + RADIUS + LANES; x++) {
         row.offset[x] = NONE;
+        row.least[x] = 0;
         row.costs[x] = 0;
     }
     if (y < 0 || y >= size.height) {
@@ -95,6 +101,7 @@ static inline void read_row(const int32_t *offset, const uint64_t *reference, co
         }
         if (!invalid) {
             row.offset[x] = o;
+            row.least[x] = nearest_256(o) - (REACH - 1);
             row.costs[x] = costs;
         }
     }
@@ -108,7 +115,7 @@ static inline offset_planes fit_offsets(lanes difference[SIDE][SIDE]) {
         lanes count = {0}, count_x = {0}, sum = {0};
         for (int i = 0; i < SIDE; i++) {
             const int dx = i - RADIUS, ring = abs(dx) > abs(dy) ? abs(dx) : abs(dy);
-            const lanes kept = absolute(difference[j][i]) <= MAX_OFFSET_STEP * ring;
+            const lanes kept = is_within(difference[j][i], MAX_OFFSET_STEP * ring);
             const lanes o = difference[j][i] & kept;
             count -= kept;
             count_x -= kept * dx;
@@ -157,24 +164,27 @@ static inline lanes fit_pixels(const window_row rows[SIDE], ptrdiff_t x, lanes c
     lanes count = {0}, rounded = {0};
     unsigned_lanes beside = {0},
                    on = {0}; /* costs before (from bit 0) and behind (from bit 12) the plane, on it */
-    lanes row_value = plane.value - RADIUS * plane.dy;
+    /* By adding a half beforehand, cutting off rounds to the nearest: parts of 256, and whole pixels. */
+    const lanes centre_and_half = centre + 128;
+    lanes row_value = plane.value + 128 - RADIUS * plane.dy;
     for (int j = 0; j < SIDE; j++, row_value += plane.dy) {
         lanes value = row_value - RADIUS * plane.dx;
         for (int i = 0; i < SIDE; i++, value += plane.dx) {
-            const lanes predicted = nearest_256_lanes(value);
-            const lanes whole = nearest_256_lanes(predicted + centre);
-            /* Whole pixels from the neighbour's own offset to what the plane says. */
-            const lanes step = whole - nearest_256_lanes(difference[j][i] + centre);
-            const lanes kept =
-                (absolute(difference[j][i] - predicted) <= MAX_OFFSET_STEP) & (absolute(step) < REACH);
-            const unsigned_lanes costs = (unsigned_lanes)(load_lanes(rows[j].costs + x + i - RADIUS) & kept) >>
-                                         (unsigned_lanes)(COST_BITS * (step + REACH - 1) & kept);
+            const ptrdiff_t at = x + i - RADIUS;
+            const lanes predicted = (value >> 8) + centre_and_half, whole = predicted >> 8;
+            /* Whole pixels from the first of the costs. */
+            const lanes step = whole - load_lanes(rows[j].least + at);
+            const lanes kept = is_within(load_lanes(rows[j].offset + at) + 128 - predicted, MAX_OFFSET_STEP) &
+                               ((unsigned_lanes)step <= 2 * (REACH - 1));
+            const unsigned_lanes costs = (unsigned_lanes)(load_lanes(rows[j].costs + at) & kept) >>
+                                         (unsigned_lanes)(COST_BITS * step & kept);
             beside += costs & (63 | 63 << 2 * COST_BITS);
             on += costs >> COST_BITS & 63;
             count -= kept;
-            rounded += (predicted + centre - whole * 256) & kept;
+            rounded += predicted & 255 & kept;
         }
     }
+    rounded -= 128 * count;
     const lanes before = (lanes)(beside & 4095), after = (lanes)(beside >> 2 * COST_BITS), at = (lanes)on;
     const lanes rise = choose(before > after, before, after) - at;
     const lanes good = plane.found & (count >= MIN_COUNT) & (rise > 0) & (at <= before) & (at <= after);
@@ -189,22 +199,29 @@ int VERSION_OF(fit_offsets)(const int32_t *offset, const uint64_t *reference, co
                             match_size size, int32_t *fitted) {
     const ptrdiff_t stride = size.width + 2 * RADIUS + LANES;
     int32_t *offsets = malloc((size_t)(SIDE * stride) * sizeof *offsets);
+    int32_t *least = malloc((size_t)(SIDE * stride) * sizeof *least);
     uint32_t *costs = malloc((size_t)(SIDE * stride) * sizeof *costs);
-    const int failed = !offsets || !costs;
+    const int failed = !offsets || !least || !costs;
     window_row rows[SIDE];
     for (int j = 0; j < SIDE && !failed; j++) {
-        rows[j] = (window_row){offsets + j * stride + RADIUS, costs + j * stride + RADIUS};
+        rows[j] =
+            (window_row){offsets + j * stride + RADIUS, least + j * stride + RADIUS, costs + j * stride + RADIUS};
         read_row(offset, reference, target, size, j - RADIUS, rows[j]);
     }
     for (ptrdiff_t y = 0; y < size.height && !failed; y++) {
         for (ptrdiff_t x = 0; x < size.width; x += LANES) {
             const lanes centre = load_lanes(rows[RADIUS].offset + x), none = centre == NONE;
             const ptrdiff_t p = y * size.width + x, left = size.width - x, count = left < LANES ? left : LANES;
-            if (!any(~none)) {
+            if (is_empty(rows[RADIUS].offset + x)) {
                 memcpy(fitted + p, offset + p, (size_t)count * sizeof *fitted);
                 continue;
             }
             const lanes result = fit_pixels(rows, x, centre & ~none);
+            if (count == LANES) { /* which most blocks are: whole vectors */
+                const lanes stored = choose(none, load_lanes(offset + p), result);
+                memcpy(fitted + p, &stored, sizeof stored);
+                continue;
+            }
             for (ptrdiff_t l = 0; l < count; l++) {
                 fitted[p + l] = none[l] ? offset[p + l] : result[l];
             }
@@ -217,6 +234,7 @@ int VERSION_OF(fit_offsets)(const int32_t *offset, const uint64_t *reference, co
         read_row(offset, reference, target, size, y + RADIUS + 1, oldest);
     }
     free(offsets);
+    free(least);
     free(costs);
     return failed ? -1 : 0;
 }

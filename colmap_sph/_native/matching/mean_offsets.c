@@ -4,8 +4,9 @@
 #include "matching/matching.h"
 #include "version.h"
 
-/* Sums of differences fit in 32 bits. */
-_Static_assert((2 * MAX_MEAN_RADIUS + 1) * (2 * MAX_MEAN_RADIUS + 1) * (int64_t)MAX_MEAN_STEP < INT32_MAX, "sums");
+/* Sums of differences fit in 32 bits, also of those from the least that are kept. */
+_Static_assert((2 * MAX_MEAN_RADIUS + 1) * (2 * MAX_MEAN_RADIUS + 1) * (int64_t)(2 * MAX_MEAN_STEP) < INT32_MAX,
+               "sums");
 
 typedef int32_t lanes __attribute__((vector_size(4 * LANES)));
 typedef uint32_t unsigned_lanes __attribute__((vector_size(4 * LANES)));
@@ -26,18 +27,25 @@ typedef struct {
 static inline void mean_of_lanes(const int32_t *own, ptrdiff_t width, row_range rows, int radius, int32_t max_step,
                                  int32_t *mean) {
     const lanes middle = load_lanes(own);
-    lanes sum = {0}, count = {0};
+    /* From the middle's offset less max_step to that plus max_step, as far as 32 bits go. */
+    const lanes below = (middle < INT32_MIN + max_step);
+    const lanes above = (middle > INT32_MAX - max_step);
+    const lanes least = (below & INT32_MIN) | (~below & (middle - (max_step & ~below)));
+    const lanes most = (above & INT32_MAX) | (~above & (middle + (max_step & ~above)));
+    const unsigned_lanes range = (unsigned_lanes)most - (unsigned_lanes)least;
+    unsigned_lanes sum_from_least = {0};
+    lanes count = {0};
     for (ptrdiff_t dy = rows.first; dy <= rows.last; dy++) {
         for (ptrdiff_t dx = -radius; dx <= radius; dx++) {
-            const lanes other = load_lanes(own + dy * width + dx);
-            /* Wraps round for extremes, to one of the other sign. */
-            const lanes difference = (lanes)((unsigned_lanes)other - (unsigned_lanes)middle);
-            const lanes kept =
-                (difference <= max_step) & (difference >= -max_step) & ((difference < 0) == (other < middle));
-            sum += difference & kept;
+            const unsigned_lanes other = (unsigned_lanes)load_lanes(own + dy * width + dx);
+            /* Wraps round for what is less, to more than any range. */
+            const unsigned_lanes from_least = other - (unsigned_lanes)least;
+            const lanes kept = from_least <= range;
+            sum_from_least += from_least & (unsigned_lanes)kept;
             count -= kept;
         }
     }
+    const lanes sum = (lanes)sum_from_least - count * (middle - least);
     /* Whole quotients of 32-bit numbers: doubles are fine enough that rounding lifts none to the next. */
     const double_lanes quotient =
         __builtin_convertvector(sum, double_lanes) / __builtin_convertvector(count, double_lanes);

@@ -14,36 +14,50 @@ uint64_t *cost_row_buffer(match_size size) {
 int selection_begin(selection_buffers *buffers, match_size size) {
     /* Three more, as vectorised versions read four at once. */
     const ptrdiff_t best_sums = size.target_width + 2 * size.depth + 3;
-    const size_t words = (size_t)(size.width + size.target_width + size.source_width);
+    const size_t words = (size_t)(size.width + size.source_width);
     buffers->winner = malloc(words * sizeof(int32_t) + (size_t)best_sums);
     if (!buffers->winner) {
         return -1;
     }
-    buffers->rival = buffers->winner + size.width;
-    buffers->best = (uint32_t *)(buffers->rival + size.target_width);
+    buffers->best = (uint32_t *)(buffers->winner + size.width);
     buffers->best_sum = (uint8_t *)(buffers->best + size.source_width);
     return 0;
 }
 
 /* Whether target pixels are those of the source, which was not warped. Each then stands for itself. */
-static int are_the_source(const int32_t *columns, match_size size, int32_t *rival) {
+static int are_the_source(const int32_t *columns, match_size size) {
     int32_t w = 0;
-    for (; w < (int32_t)size.target_width && columns[w] == w; w++) {
-        rival[w] = w;
+    while (w < (int32_t)size.target_width && columns[w] == w) {
+        w++;
     }
     return w == (int32_t)size.target_width && size.target_width <= size.source_width;
 }
 
-void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, const selection_buffers *buffers) {
+/* Whether nothing points at eight target pixels. */
+static int are_passed_over(const uint8_t *best_sum) {
+    uint64_t eight;
+    memcpy(&eight, best_sum, sizeof eight);
+    return eight == UINT64_MAX;
+}
+
+void merge_columns(const int32_t *columns, match_size size, selection_buffers *buffers) {
     /* Where a surface is stretched, its target pixels skip columns of the source: they stand for these, too. */
     enum { MAX_STRETCH = 4 };
     const int32_t source_width = (int32_t)size.source_width, target_width = (int32_t)size.target_width;
-    if (are_the_source(columns, size, buffers->rival)) {
+    buffers->columns = are_the_source(columns, size) ? NULL : columns;
+    if (!buffers->columns) {
         return;
     }
+    const uint8_t *best_sum = buffers->best_sum + size.depth;
     uint32_t *best = buffers->best;
     memset(best, UINT8_MAX, (size_t)source_width * sizeof *best);
     for (int32_t w = 0; w < target_width; w++) {
+        while (w + 8 <= target_width && are_passed_over(best_sum + w)) {
+            w += 8;
+        }
+        if (w == target_width) {
+            break;
+        }
         const int32_t first = columns[w];
         /* Those that nothing points at have no say. */
         if (best_sum[w] == UINT8_MAX || first < 0 || first >= source_width) {
@@ -56,13 +70,6 @@ void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, c
             uint32_t *skipped = best + first + i;
             *skipped = own < *skipped ? own : *skipped;
         }
-    }
-    for (int32_t w = 0; w < target_width; w++) {
-        const int32_t c = columns[w];
-        const uint32_t there = c >= 0 && c < source_width ? best[c] : UINT32_MAX;
-        const int shown = there >> 24 < UINT8_MAX;
-        buffers->rival[w] = shown ? (int32_t)(there & 0xffffff) : w;
-        best_sum[w] = shown ? (uint8_t)(there >> 24) : best_sum[w];
     }
 }
 

@@ -55,16 +55,16 @@ typedef void sweep_rows_fn(sweep_state *state, ptrdiff_t y, ptrdiff_t rows, cons
 /* ---- selection --------------------------------------------------------------------------------------------- */
 
 typedef struct {
-    int32_t *winner;   /* of every pixel its best slot; -1 without content */
-    int32_t *rival;    /* of every target pixel the one whose sum it is checked against, */
-    uint8_t *best_sum; /* and that sum; at first the least of its own, with `depth` more on both sides */
-    uint32_t *best;    /* of every source column the least sum, and in 24 bits the target pixel that has it */
+    int32_t *winner;        /* of every pixel its best slot; -1 without content */
+    uint8_t *best_sum;      /* of every target pixel the least of its own, with `depth` more on both sides */
+    uint32_t *best;         /* of every source column the least sum, and in 24 bits the target pixel that has it */
+    const int32_t *columns; /* of the source, by target pixel; NULL where each pixel stands for itself */
 } selection_buffers;
 
 /* 0, or -1 without memory; ended by free(buffers->winner). */
 int selection_begin(selection_buffers *buffers, match_size size);
-/* Least sums of target pixels become those of the source columns that they show. */
-void merge_columns(const int32_t *columns, match_size size, uint8_t *best_sum, const selection_buffers *buffers);
+/* Sets the least sums of source columns, from those of the target pixels that show them. */
+void merge_columns(const int32_t *columns, match_size size, selection_buffers *buffers);
 typedef void selection_row_fn(const uint8_t *sums, const int32_t *base, const uint64_t *reference,
                               const uint64_t *target, const int32_t *columns, match_size size,
                               left_right_check check, selection_buffers *buffers, int32_t *offset);

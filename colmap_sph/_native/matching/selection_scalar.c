@@ -55,6 +55,16 @@ static int32_t first_minimum(const uint8_t *sums, ptrdiff_t depth) {
     return best;
 }
 
+/* The target pixel whose sum that of r is checked against, and that sum. */
+static ptrdiff_t rival_of(ptrdiff_t r, const uint8_t *best_sum, match_size size, const selection_buffers *buffers,
+                          uint8_t *sum) {
+    const ptrdiff_t c = buffers->columns ? buffers->columns[r] : -1;
+    const uint32_t there = c >= 0 && c < size.source_width ? buffers->best[c] : UINT32_MAX;
+    const int shown = there >> 24 < UINT8_MAX;
+    *sum = shown ? (uint8_t)(there >> 24) : best_sum[r];
+    return shown ? (ptrdiff_t)(there & 0xffffff) : r;
+}
+
 void check_winners_scalar(const uint8_t *sums, const int32_t *base, const uint64_t *target, match_size size,
                           left_right_check check, const selection_buffers *buffers, int32_t *offset) {
     const uint8_t *best_sum = buffers->best_sum + size.depth;
@@ -62,11 +72,14 @@ void check_winners_scalar(const uint8_t *sums, const int32_t *base, const uint64
         const uint8_t *own = sums + x * size.depth;
         const ptrdiff_t best = buffers->winner[x], r = x + base[x] + best;
         /* At the end of the range the true minimum may lie beyond it. */
-        const int found = best > 0 && best < size.depth - 1 && r >= 0 && r < size.target_width &&
-                          !(target[r] & CENSUS_INVALID) &&
-                          (own[best] - best_sum[r] <= check.max_excess ||
-                           is_mutual(sums, base, buffers->winner, size, best_sum[r], x, buffers->rival[r],
-                                     check.max_difference));
+        int found =
+            best > 0 && best < size.depth - 1 && r >= 0 && r < size.target_width && !(target[r] & CENSUS_INVALID);
+        if (found) {
+            uint8_t sum;
+            const ptrdiff_t rival = rival_of(r, best_sum, size, buffers, &sum);
+            found = own[best] - sum <= check.max_excess ||
+                    is_mutual(sums, base, buffers->winner, size, sum, x, rival, check.max_difference);
+        }
         offset[x] =
             found ? (int32_t)(base[x] + best) * 256 + subpixel_offset(own[best - 1], own[best], own[best + 1])
                   : OFFSET_INVALID;
@@ -81,6 +94,6 @@ void selection_row_scalar(const uint8_t *sums, const int32_t *base, const uint64
     }
     uint8_t *best_sum = buffers->best_sum + size.depth;
     match_target_row(sums, base, reference, size, best_sum);
-    merge_columns(columns, size, best_sum, buffers);
+    merge_columns(columns, size, buffers);
     check_winners_scalar(sums, base, target, size, check, buffers, offset);
 }

@@ -142,6 +142,6 @@ void VERSION_OF(selection_row)(const uint8_t *sums, const int32_t *base, const u
     default:
         first_pass(sums, base, reference, size, buffers, size.depth);
     }
-    merge_columns(columns, size, buffers->best_sum + size.depth, buffers);
+    merge_columns(columns, size, buffers);
     check_winners(sums, base, target, size, check, buffers, offset);
 }
