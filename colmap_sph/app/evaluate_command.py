@@ -69,7 +69,9 @@ class EvaluateCommand:
     """Which of the workspace's maps: those confirmed by other views, or the unchecked ones."""
     json: Path | None = None
     """File to write all results to, as JSON."""
-    options: Annotated[EvaluationOptions, tyro.conf.arg(name="")] = field(default_factory=EvaluationOptions)
+    options: Annotated[EvaluationOptions, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = field(
+        default_factory=EvaluationOptions
+    )
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds or options that contradict each other, and

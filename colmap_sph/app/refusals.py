@@ -12,11 +12,10 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
+from colmap_sph.app.option_list import TAKEN_APART, without_marks
 from colmap_sph.app.spelling import SHORT, full_flag
 from colmap_sph.errors import InputError
 
-# Records whose options have no prefix.
-_TAKEN_APART = ("project", "options", "georeference")
 _OPTION = re.compile(r"--?[^\W\d]")
 # Lines, corners and colours of the parser's box, with or without Unicode.
 _DRAWN = re.compile(r"[╭╮╰╯│─]|^[|+]|[|+]$|-{3,}|\x1b\[[\d;]*m")
@@ -70,13 +69,13 @@ def _reason(arguments: Sequence[str], commands: Mapping[str, Any]) -> str | None
 
 
 def _known(annotated: Any, prefix: str = "", *, has_switches: bool = True) -> Iterator[_Known]:
-    record, marks = _taken_apart(annotated)
+    record, marks = without_marks(annotated)
     has_switches = has_switches and tyro.conf.FlagConversionOff not in marks
     kinds = get_type_hints(record, include_extras=True)
     for each in fields(record):
-        kind, marks = _taken_apart(kinds[each.name])
+        kind, marks = without_marks(kinds[each.name])
         if is_dataclass(kind):
-            inner = prefix if each.name in _TAKEN_APART else f"{prefix}{each.name}."
+            inner = prefix if each.name in TAKEN_APART else f"{prefix}{each.name}."
             yield from _known(kinds[each.name], inner, has_switches=has_switches)
         else:
             is_positional = tyro.conf.Positional in marks
@@ -84,12 +83,6 @@ def _known(annotated: Any, prefix: str = "", *, has_switches: bool = True) -> It
             is_required = each.default is MISSING and each.default_factory is MISSING
             is_switch = kind is bool and has_switches
             yield _Known(flag, flag or f"a {each.name}", None if is_switch else kind, is_required)
-
-
-def _taken_apart(annotated: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A kind, and how it is marked."""
-    marks = getattr(annotated, "__metadata__", ())
-    return (get_args(annotated)[0] if marks else annotated), marks
 
 
 def _problem(typed: Sequence[str], options: Mapping[str, _Known], known: Sequence[_Known]) -> str | None:
