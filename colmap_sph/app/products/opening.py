@@ -6,12 +6,14 @@ from colmap_sph.app.report_command import opened
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.georeferencing import GeoreferenceOptions, georeferenced, report_lines
+from colmap_sph.products.maps.reading import check_maps
 from colmap_sph.project.workspace import Workspace
 
 
 def opened_on_map(path: Path, options: GeoreferenceOptions, terminal: Terminal) -> tuple[Workspace, Georeference]:
     """The workspace and its place on the map; tells what an alignment has left over."""
     workspace = opened(path)
+    check_maps(workspace)
     georeference = georeferenced(workspace, options)
     if options.align is not None:
         terminal.say_lines("\n".join(report_lines(georeference)))
