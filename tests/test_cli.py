@@ -176,6 +176,34 @@ def test_values_may_begin_with_a_dash(typed: list[str], parsed: list[str]) -> No
     assert with_dashed_values(typed) == parsed
 
 
+@pytest.mark.parametrize(
+    ("typed", "what"),
+    [
+        (["run", ""], "--model"),
+        (["run", "--model", "sparse/0", "--output", ""], "--output"),
+        (["run", "sparse/0", "--images=", "--dry-run"], "--images"),
+        (["run", "--workspace", "", "--fusion.mask-path", "m"], "--workspace"),
+        (["run", "--workspace", "dense", "--fusion.mask-path="], "--fusion.mask-path"),
+        (["demo", "--output", ""], "--output"),
+        (["export", ""], "A path"),
+        (["evaluate", "--reference", "a.ply", ""], "A path"),
+        (["evaluate", "b.ply", "--reference", ""], "--reference"),
+    ],
+)
+def test_empty_paths_are_not_the_current_folder(
+    typed: list[str], what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As from ``--output "$OUT"`` in a script that sets no OUT."""
+    assert error_sentence(*command(capsys, *typed)).startswith(f"{what} is empty; give a path, ")
+
+
+def test_other_values_may_be_empty() -> None:
+    """They are as if they were not given."""
+    assert _parsed(["run", "--workspace", "dense", "--memory", "", "--region="]) == _parsed(
+        ["run", "--workspace", "dense"]
+    )
+
+
 def test_up_is_along_a_negative_axis() -> None:
     command = _parsed(["surface", "dense", "--up", "-z"])
     assert isinstance(command, SurfaceCommand) and command.options.up == "-z"

@@ -25,7 +25,7 @@ from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.option_list import help_of
 from colmap_sph.app.part_command import part_command
 from colmap_sph.app.products.commands import PRODUCTS
-from colmap_sph.app.refusals import refusals_in_words
+from colmap_sph.app.refusals import refusals_in_words, refuse_empty_paths
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, with_dashed_values
@@ -158,6 +158,8 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal, started: flo
 def _parsed(arguments: Sequence[str]) -> Command:
     typed = with_dashed_values(arguments)
     arguments = ["run", *all_arguments(typed[1:], RunCommand)] if typed[:1] == ["run"] else typed
+    if arguments and arguments[0] in _COMMANDS:
+        refuse_empty_paths(arguments[1:], _COMMANDS[arguments[0]])
     with standard_output(), refusals_in_words(typed, _COMMANDS), short_completion(arguments):
         command: Command = tyro.extras.subcommand_cli_from_dict(
             _COMMANDS,

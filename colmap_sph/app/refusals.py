@@ -7,6 +7,7 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from itertools import dropwhile, takewhile
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -50,6 +51,36 @@ def refusals_in_words(arguments: Sequence[str], commands: Mapping[str, Any]) -> 
         if not stop.code:
             raise
         raise InputError(_reason(arguments, commands) or _without_box(said.getvalue())) from None
+
+
+def refuse_empty_paths(arguments: Sequence[str], command: Any) -> None:
+    """Raise `InputError` for a path that is empty: the parser takes it for the current folder.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        Of the command, in full.
+    command : type
+        The record of its options.
+    """
+    paths = {each.flag for each in _known(command) if each.flag and _is_path(each.kind)}
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        flag, equals, value = word.partition("=")
+        if flag in paths and equals and not value:
+            raise _empty(flag)
+        if not word and (before in paths or not _OPTION.match(before)):
+            raise _empty(before if before in paths else "A path")
+
+
+def _empty(what: str) -> InputError:
+    return InputError(
+        f"{what} is empty; give a path, . for the current folder, or leave it out. Is a variable of the "
+        "shell unset?"
+    )
+
+
+def _is_path(kind: Any) -> bool:
+    return kind is Path or any(map(_is_path, get_args(kind)))
 
 
 def _reason(arguments: Sequence[str], commands: Mapping[str, Any]) -> str | None:
