@@ -23,7 +23,8 @@ What the stages do is told in [algorithm.md](algorithm.md).
 
 _PRESETS_TEXT = """All other options are as always, and what is given beside `--quality` wins. In Python:
 `colmap_sph.preset("preview")`. What each is worth is measured in [usage.md](usage.md#quality). With
-`--fusion.method colmap` the nearness of fusion is as always."""
+`--fusion.method colmap` the nearness of fusion is as always; in Python:
+`colmap_sph.preset("best", fusion_method="colmap")`."""
 
 
 def page() -> str:

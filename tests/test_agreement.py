@@ -13,6 +13,7 @@ from exact_maps import HEIGHT, NAMES, WIDTH, make_workspace
 from projects import FOUR_NAMES, read_picture, render_four_images
 
 import colmap_sph
+from colmap_sph.app import cli
 from colmap_sph.app.run_command import print_summary
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
@@ -24,7 +25,8 @@ from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, refuse_disagreement
 from colmap_sph.pipeline.stages.facts import Agreement
-from colmap_sph.project.map_files import read_depth_map
+from colmap_sph.products.maps.reading import check_maps
+from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -43,6 +45,48 @@ def exact(tmp_path_factory):
     workspace = make_workspace(tmp_path_factory.mktemp("exact") / "dense")
     maps = {name: read_depth_map(workspace.depth_map_path(name, "geometric")) for name in NAMES}
     return read_scene(workspace.sparse_dir), maps
+
+
+@pytest.fixture
+def aligned(tmp_path):
+    """A workspace whose model was scaled, moved and turned after its maps were made, by so much."""
+
+    def workspace(scale):
+        made = make_workspace(tmp_path / "dense")
+        model = pycolmap.Reconstruction(made.sparse_dir)
+        turned = pycolmap.Rotation3d(np.array([0.5, 0.5, 0.5, 0.5]))
+        model.transform(pycolmap.Sim3d(scale, turned, np.array([5e5, 5e6, 0.0])))
+        model.write(made.sparse_dir)
+        return made
+
+    return workspace
+
+
+@pytest.mark.parametrize("scale", [0.01, 1.2, 37.0])
+@pytest.mark.parametrize("what", ["surface", "mesh", "export", "stereo_fusion"])
+def test_maps_of_a_model_of_another_scale_are_refused(what, scale, aligned, capsys):
+    """As where a model is aligned after dense reconstruction: depth counts in its old unit."""
+    workspace = aligned(scale)
+    before = sorted(workspace.root.iterdir())
+    paths = ["--workspace_path", str(workspace.root), "--output_path", str(workspace.root / "cloud.ply")]
+    assert cli.main([what, *(paths if what == "stereo_fusion" else [str(workspace.root)])]) == 2
+    assert re.fullmatch(
+        r"error: The depth maps in \S+stereo are not of the model in \S+sparse: only \d\.\d% of its sparse points "
+        r"that have a depth there agree with it\. Was the model scaled, .*\n",
+        capsys.readouterr().err,
+    )
+    made = {*workspace.root.iterdir()} - {*before}
+    assert made <= {workspace.state_dir}  # the log
+
+
+def test_maps_of_a_model_that_was_moved_and_turned_are_its_own(aligned):
+    """Depth is along the cameras' axes. So are maps with half as many pixels."""
+    workspace = aligned(1.0)
+    check_maps(workspace)
+    for name in NAMES:
+        path = workspace.depth_map_path(name, "geometric")
+        write_depth_map(path, np.ascontiguousarray(read_depth_map(path)[::2, ::2]))
+    check_maps(workspace)
 
 
 def agreement_of(scene, name, depth, mask=None):
@@ -120,6 +164,7 @@ def reported(agreements, misplaced=0.0):
     """What the confirmation and the end of a run put into the report."""
     report = RunReport(
         agreement={name: found.share for name, found in agreements.items()},
+        agreement_of_found={name: found.share_of_found for name, found in agreements.items()},
         sparse_points=sum(agreements.values(), Agreement()),
     )
     report.overall_agreement = report.sparse_points.share
@@ -135,6 +180,15 @@ def test_an_image_that_hardly_agrees_is_named():
     assert report.overall_agreement == pytest.approx(453 / 605)
     refuse_disagreement(report)
     assert reported(sound).doubts == ""
+
+
+def test_an_image_that_agrees_less_than_the_others_is_named():
+    """Two neighbours in a strip that were exchanged fit some of their points; a scene may be hard for all."""
+    others = {f"{k}.jpg": Agreement(440, 320, 310) for k in range(5)}
+    report = reported({**others, "a.jpg": Agreement(438, 250, 136), "few.jpg": Agreement(60, 29, 14)})
+    assert "a.jpg (31%)" in report.doubts and "few.jpg" not in report.doubts and "0.jpg" not in report.doubts
+    hard = {f"{k}.jpg": Agreement(400, 300, 160) for k in range(5)}
+    assert reported({**hard, "a.jpg": Agreement(438, 250, 136)}).doubts == ""
 
 
 def test_hardly_any_agreement_is_no_result():

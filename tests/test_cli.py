@@ -126,8 +126,9 @@ STAGES = {
 }
 
 
-def test_every_text_of_the_help_is_a_sentence() -> None:
-    for group in option_groups(RunCommand):
+@pytest.mark.parametrize("name", cli._COMMANDS)
+def test_every_text_of_the_help_is_a_sentence(name: str) -> None:
+    for group in option_groups(cli._COMMANDS[name]):
         for text in (group.text, *(option.text for option in group.options)):
             assert text[0].isupper() and text[-1] in ".)", text
 
@@ -175,6 +176,34 @@ def test_values_may_begin_with_a_dash(typed: list[str], parsed: list[str]) -> No
     assert with_dashed_values(typed) == parsed
 
 
+@pytest.mark.parametrize(
+    ("typed", "what"),
+    [
+        (["run", ""], "--model"),
+        (["run", "--model", "sparse/0", "--output", ""], "--output"),
+        (["run", "sparse/0", "--images=", "--dry-run"], "--images"),
+        (["run", "--workspace", "", "--fusion.mask-path", "m"], "--workspace"),
+        (["run", "--workspace", "dense", "--fusion.mask-path="], "--fusion.mask-path"),
+        (["demo", "--output", ""], "--output"),
+        (["export", ""], "A path"),
+        (["evaluate", "--reference", "a.ply", ""], "A path"),
+        (["evaluate", "b.ply", "--reference", ""], "--reference"),
+    ],
+)
+def test_empty_paths_are_not_the_current_folder(
+    typed: list[str], what: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As from ``--output "$OUT"`` in a script that sets no OUT."""
+    assert error_sentence(*command(capsys, *typed)).startswith(f"{what} is empty; give a path, ")
+
+
+def test_other_values_may_be_empty() -> None:
+    """They are as if they were not given."""
+    assert _parsed(["run", "--workspace", "dense", "--memory", "", "--region="]) == _parsed(
+        ["run", "--workspace", "dense"]
+    )
+
+
 def test_up_is_along_a_negative_axis() -> None:
     command = _parsed(["surface", "dense", "--up", "-z"])
     assert isinstance(command, SurfaceCommand) and command.options.up == "-z"
@@ -187,11 +216,30 @@ def test_every_earlier_spelling_leads_to_an_option() -> None:
     assert not spelling._RENAMED.keys() & flags
 
 
-def test_help_of_demo(capsys: pytest.CaptureFixture[str]) -> None:
-    code, output = command(capsys, "demo", "--help")
+@pytest.mark.parametrize(
+    ("name", "usage", "options"),
+    [
+        ("demo", "demo [OPTIONS]", ["--output PATH", "--threads N"]),
+        ("evaluate", "evaluate --reference PATH [OPTIONS] [CLOUDS ...]", ["--register {True,False}", "--gsd X"]),
+        ("export", "export [OPTIONS] WORKSPACE", ["--overwrite", "--crs TEXT"]),
+        ("surface", "surface [OPTIONS] WORKSPACE", ["--[no-]orthophoto", "--plane TEXT TEXT TEXT"]),
+        ("mesh", "mesh [OPTIONS] WORKSPACE", ["--texture", "--formats {ply,glb,obj} ..."]),
+        ("view", "view [OPTIONS] WORKSPACE", ["--full", "--port N"]),
+        ("report", "report [OPTIONS] WORKSPACE", []),
+    ],
+)
+def test_help_of_other_commands(
+    name: str, usage: str, options: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In words: an option that is not given has what its text says, and not a value of the program's language."""
+    code, output = command(capsys, name, "--nonsense", "--help")
     assert code == 0
-    assert "--output PATH" in output
-    assert "exact depth" in output
+    assert output.startswith(f"usage: colmap_sph {usage}\n")
+    for option in options:
+        assert re.search(rf"^  {re.escape(option)}  +[A-Z0-9]", output, re.MULTILINE), option
+    told = [option.flag for group in option_groups(cli._COMMANDS[name]) for option in group.options]
+    assert all(flag.replace("--", "", 1) in output for flag in told)
+    assert not re.search(r"None|MISSING|default: ", output)
 
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:

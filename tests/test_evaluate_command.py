@@ -252,6 +252,23 @@ def test_refuses_clouds_that_cannot_be_measured(folder, capsys, role):
     assert "map coordinates (projected (WGS 84 / UTM zone 33N))" in message and "subtract the offset" in message
 
 
+def test_refuses_a_cloud_that_is_its_own_reference(folder, capsys):
+    (folder / "link.ply").symlink_to("deep.ply")
+    assert evaluate(folder / "link.ply", "--reference", folder / "deep.ply") == 2
+    assert "link.ply is the reference itself" in sentence(capsys)
+
+
+@pytest.mark.parametrize("fused", [["reference"], ["cloud"], ["reference", "cloud"], []])
+def test_a_cloud_and_its_reference_that_may_be_exchanged(folder, capsys, fused):
+    """What fusion made is measured, and seldom is it what is true."""
+    for name in ("reference", "cloud"):
+        write_ply(folder / f"{name}.ply", ground(CAMERAS[1]))
+    for name in fused:
+        (folder / f"{name}.ply.vis").write_bytes(b"")
+    assert evaluate(folder / "cloud.ply", "--reference", folder / "reference.ply", "--register", "False") == 0
+    assert ("are the two exchanged?" in capsys.readouterr().err) == (fused == ["reference"])
+
+
 def test_a_projected_reference_is_shifted_to_the_local_model(folder, capsys):
     reference = write_las(folder / "utm.laz", ground(CAMERAS[1]) + UTM)
     shift = ["--reference-shift", 455_000, 5_400_000, 100]
@@ -292,10 +309,11 @@ def test_only_results_are_replaced_by_results(folder, capsys):
     assert evaluate(cloud, "--reference", cloud, "--json", cloud) == 3
     assert "deep.ply is there already, and no evaluation wrote it; name another for --json" in sentence(capsys)
     assert cloud.read_bytes() == before
+    reference = write_ply(folder / "reference.ply", ground(CAMERAS[1]))
     (folder / "scores.json").touch()
     for _ in range(2):
-        assert evaluate(cloud, "--reference", cloud, "--json", folder / "scores.json") == 0
-        assert json.loads((folder / "scores.json").read_text())["reference"] == str(cloud)
+        assert evaluate(cloud, "--reference", reference, "--json", folder / "scores.json") == 0
+        assert json.loads((folder / "scores.json").read_text())["reference"] == str(reference)
 
 
 def test_refuses_what_is_not_exact_depth(folder, capsys):
@@ -326,6 +344,25 @@ def test_refuses_what_is_not_exact_depth(folder, capsys):
     (folder / "other").mkdir()
     assert evaluate(folder / "deep.ply", "--reference", folder / "other", *options) == 2
     assert "has no depth map for any of the 3 images" in sentence(capsys)
+
+
+@pytest.mark.parametrize(("scale", "remedy"), [(0.5, "0.0005"), (5e-7, "0.0005"), (0.0005, ""), (0.0006, "")])
+def test_refuses_depth_in_another_unit_than_the_model(folder, capsys, scale, remedy):
+    """Millimetres taken for metres, or the other way round: all shares would be 0, or all 1."""
+    points = ground(CAMERAS[1])[::50]
+    nothing = (np.empty((0, 2)),) * 3
+    sparse = syn.SparsePoints(points, nothing, (np.empty(0, np.int64),) * 3)
+    model = syn.build_reconstruction(NAMES, CAMERAS, sparse)
+    for camera in model.cameras.values():
+        camera.model, camera.params = "PINHOLE", [FOCAL, FOCAL, 60, 45]
+    syn.write_reconstruction(model, folder / "sparse")
+    arguments = ("--reference", folder / "depth", "--model", folder / "sparse", "--depth-scale", scale)
+    code = evaluate(folder / "deep.ply", *arguments, "--tau", 1)
+    if remedy:
+        assert code == 2
+        assert f"times as deep; give --depth-scale {remedy}, or another --model." in sentence(capsys)
+    else:
+        assert code == 0
 
 
 def test_refuses_models_and_workspaces_that_do_not_fit(folder, capsys):

@@ -40,6 +40,15 @@ def test_a_known_motion_is_recovered(offset):
     assert np.linalg.norm(np.array(result.shift) + shift) < 0.02
 
 
+@pytest.mark.parametrize(("degrees", "is_told"), [(3, False), (9, True)])
+def test_a_large_turn_is_told(degrees, is_told, caplog):
+    reference = hills(40_000, 1)
+    cloud = moved(hills(40_000, 2), Rotation.from_rotvec([0, 0, np.radians(degrees)]), np.zeros(3))
+    result = register(cloud, reference, max_distance=4.0)
+    assert result.rotation_degrees == pytest.approx(degrees, abs=0.1)
+    assert (f"turned the cloud by {degrees}" in caplog.text or not is_told) and bool(caplog.text) == is_told
+
+
 def test_what_is_in_place_stays_in_place():
     reference, cloud = hills(40_000, 1), hills(40_000, 2)
     result = register(cloud, reference, max_distance=1.0)

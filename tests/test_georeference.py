@@ -239,6 +239,9 @@ def test_what_cannot_be_is_refused(workspace: Workspace, tmp_path: Path) -> None
         (GeoreferenceOptions(crs="EPSG:99999"), OptionError, "EPSG:99999"),
         (GeoreferenceOptions(crs="EPSG:4326"), OptionError, "degrees"),
         (GeoreferenceOptions(crs="EPSG:25832"), InputError, "--align"),
+        # At whose origin, on the equator, is no zone of theirs.
+        (GeoreferenceOptions(crs="EPSG:32633"), InputError, "--align"),
+        (GeoreferenceOptions(crs="EPSG:32733"), InputError, "--align"),
         (GeoreferenceOptions(crs="EPSG:4978"), InputError, "--align"),
     ]
     for options, kind, words in refused:
@@ -272,6 +275,8 @@ def test_what_was_said_is_kept_until_something_else_is_said(workspace: Workspace
     model = pycolmap.Reconstruction(workspace.sparse_dir)
     model.transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(ROTATION), SHIFT))
     model.write_binary(workspace.sparse_dir)
+    # The next zone goes on to the west, where many a map of two zones is drawn in one.
+    assert georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25833")).crs == "EPSG:25833"
     own = georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25832"))
     assert own.is_identity and own.crs == "EPSG:25832" and not own.aligned_by
 

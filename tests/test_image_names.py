@@ -22,7 +22,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.project.given import image_places
 from colmap_sph.project.given.image_places import find_images, tell_problems
-from colmap_sph.project.images.reading import WrongSize
+from colmap_sph.project.images.reading import Damaged, Missing, Problem, Unreadable, WrongSize
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -260,14 +260,13 @@ def test_sizes_without_a_rule_are_told_one_by_one(tmp_path: Path, caplog: pytest
     ("problems", "remedy"),
     [
         ([WrongSize((96, 55), (96, 64))] * 3, "give the images that the model was made from as --images"),
-        (["is damaged or no image (cut off)", "is damaged or no image (?)", "is missing"], "copy them again from"),
-        (["is empty"] * 3, "copy them again from where they came from"),
-        (["cannot be read (Permission denied)"] * 3, "check their permissions"),
-        (["is missing"] * 3, "check --images"),
-        (["is not a regular file"] * 3, "check --images"),
+        ([Damaged("is cut off"), Damaged("is no image"), Missing("is missing")], "copy them again from where"),
+        ([Unreadable("cannot be read (Permission denied)")] * 3, "check their permissions"),
+        ([Missing("is missing")] * 3, "check --images"),
+        ([Problem("needs 2 GiB")] * 3, "check --images"),
     ],
 )
-def test_what_to_do_when_no_image_is_usable(tmp_path: Path, problems: list[str], remedy: str) -> None:
+def test_what_to_do_when_no_image_is_usable(tmp_path: Path, problems: list[Problem], remedy: str) -> None:
     named = {f"{number}.png": problem for number, problem in enumerate(problems)}
     with pytest.raises(InputError, match=rf"None of the model's 3 images in .* is usable; {remedy}"):
         tell_problems(tmp_path / "sparse", tmp_path, named, 3, undistorted=False)
@@ -280,7 +279,7 @@ def test_many_of_one_wrong_size_are_told_together(
     """And those that have another problem by name."""
     sparse = make_project(tmp_path)
     names = [f"{number:02d}.png" for number in range(9)]
-    problems = dict.fromkeys(names[num_whole:], WrongSize((96, 55), (96, 64))) | {names[8]: "is damaged"}
+    problems = dict.fromkeys(names[num_whole:], WrongSize((96, 55), (96, 64))) | {names[8]: Damaged("is damaged")}
     if num_whole:
         tell_problems(sparse, tmp_path, problems, len(names), undistorted=False)
     else:

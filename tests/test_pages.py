@@ -29,10 +29,12 @@ from colmap_sph.pipeline import report_files
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report_files import command_of
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.maps import MapFiles
 from colmap_sph.pipeline.stages.pair_files import write_estimate
 from colmap_sph.project.map_files import read_depth_map, write_depth_map, write_normal_map
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.ownership import map_place
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.fusion import FusionOptions
@@ -443,6 +445,27 @@ def test_samples_of_what_was_voted_where_there_is_no_map_of_it(tmp_path: Path, c
     assert not samples.has_photometric
     write_estimate(path, estimate, "key", Facts(), corner=(left + 1, top))  # it reaches beyond the image
     assert not read_samples(workspace, view, 50).photometric.any()
+
+
+def test_what_was_voted_is_shown_and_not_maps_of_others(tmp_path: Path) -> None:
+    """COLMAP's own, say, of a run on another machine; ours, which is fitted to what was voted, is."""
+    workspace = ground_workspace(tmp_path / "dense", NAMES[:1])
+    (view,) = read_scene(workspace.sparse_dir).views
+    voted = np.full((view.height, view.width), 3, np.float32)
+    path = workspace.photometric_dir / "a.png.sph"
+    path.parent.mkdir(parents=True)
+    write_estimate(path, DepthEstimate(voted, voted, np.ones(voted.shape, np.uint8)), "key", Facts())
+    place = map_place(workspace, "a.png", "photometric")
+    write_depth_map(place.files[0], np.full_like(voted, 5))
+    assert (read_samples(workspace, view, 50).photometric == 3).all()
+    MapFiles(place.files[0], place.files[1], place.record).write(
+        np.zeros((*voted.shape, 3), np.float32), voted + 4, "key"
+    )
+    assert (read_samples(workspace, view, 50).photometric == 7).all()
+    write_depth_map(place.files[0], np.full_like(voted, 5))  # over ours
+    assert (read_samples(workspace, view, 50).photometric == 3).all()
+    path.unlink()
+    assert (read_samples(workspace, view, 50).photometric == 5).all()
 
 
 def test_reduced_maps_are_shown(tmp_path: Path) -> None:

@@ -13,8 +13,9 @@ import colmap_sph
 from colmap_sph.app import cli
 from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.run_command import RunCommand
+from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.presets import PRESETS, Quality, preset
+from colmap_sph.pipeline.presets import PRESETS, FusionMethod, Quality, preset
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_0.jpg", "N_1_1.jpg", "N_1_2.jpg"]
 
@@ -44,13 +45,21 @@ def test_what_is_given_beside_it_wins(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("method", "most"), [("best-pixel", 0.25), ("colmap", 0.5)])
-def test_the_best_quality_is_of_both_methods_of_fusion(method: str, most: float) -> None:
+def test_the_best_quality_is_of_both_methods_of_fusion(method: FusionMethod, most: float) -> None:
     """What makes our own clouds denser keeps COLMAP's fusion from merging, and its points are less exact then."""
     chosen = parsed("--quality", "best", "--fusion.method", method)
     assert chosen.fusion.reprojection_error == most
+    assert chosen == preset("best", fusion_method=method)
     assert chosen.pairs == preset("best").pairs
     given = parsed("--fusion.max-reproj-error", "1", "--quality", "best", f"--fusion.method={method}")
     assert given.fusion.reprojection_error == 1
+
+
+def test_what_there_is_not_is_refused() -> None:
+    with pytest.raises(OptionError, match=r"quality must be one of preview, normal, best, not 'fine'"):
+        preset("fine")  # type: ignore[arg-type]
+    with pytest.raises(OptionError, match=r"method must be 'best-pixel' or 'colmap', not 'colmpa'"):
+        preset("best", fusion_method="colmpa")  # type: ignore[arg-type]
 
 
 def test_a_report_leaves_nothing_to_a_quality(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

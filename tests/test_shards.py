@@ -18,6 +18,7 @@ from colmap_sph.app import cli
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.start import Request
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.shards import run_part as shards
 from colmap_sph.pipeline.shards.part import Part, StageName
@@ -337,9 +338,7 @@ def opened(project: Project, options: RunOptions) -> Iterator[tuple[Context, lis
     """What stages work with, as the jobs find it."""
     workspace = Workspace(project.root)
     with shared(workspace):
-        context, selection = shards.start(
-            workspace, options, execute, progress=shards.Silent(), report=shards.RunReport()
-        )
+        context, selection = shards.start(workspace, options, execute, Request())
         yield context, selection.unique_pairs()
 
 

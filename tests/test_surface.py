@@ -18,10 +18,12 @@ from colmap_sph import synthetic as syn
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.surface.drawing import margin_of
 from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
+from colmap_sph.project.claim import claimed
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.surface.coarser import coarser_colours, coarser_surface
@@ -466,6 +468,36 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
         made(workspace, tmp_path, overwrite=False)
     assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
     assert (tmp_path / "dsm.tif").read_text() == "earlier"
+
+
+def test_space_is_asked_for_without_what_a_killed_process_left(workspace, tmp_path, monkeypatch):
+    left = tmp_path / ".surface.tmp" / "dsm.tif"
+    left.parent.mkdir()
+    left.write_text("half")
+    monkeypatch.setattr(
+        "colmap_sph.products.surface.make.free_space", lambda _: 1000 if left.exists() else 1 << 50
+    )
+    made(workspace, tmp_path)
+    assert (tmp_path / "dsm.tif").exists() and not left.exists()
+
+
+@pytest.mark.parametrize("what", ["surface", "mesh --method poisson", "export"])
+def test_two_commands_in_one_folder(what, workspace, tmp_path, capsys):
+    """The second would take temporary files of the first for leftovers, and its own be published unfinished."""
+    typed = [*what.split(), str(workspace.root), "--output", str(tmp_path / "out")]
+    with alone_in(tmp_path / "out"):
+        assert cli.main(typed) == 3
+        assert f"Another command is at work in {tmp_path / 'out'}; wait for its end" in capsys.readouterr().err
+        assert not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("what", ["surface", "mesh --method poisson", "export"])
+def test_nothing_is_made_of_a_workspace_where_a_run_is_at_work(what, workspace, tmp_path, capsys):
+    typed = [*what.split(), str(workspace.root), "--output", str(tmp_path / "out")]
+    with claimed(workspace):
+        assert cli.main(typed) == 3
+    assert f"Another run is at work in {workspace.root}; wait for its end" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_small_pictures_show_the_surface(products, workspace, tmp_path):

@@ -324,6 +324,22 @@ def test_input_inside_the_output_is_refused(tmp_path: Path, what: str, overwrite
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_workspace_among_the_originals_is_refused(tmp_path: Path) -> None:
+    """COLMAP, asked for the features of all images, would find its images there."""
+    sparse = make_project(tmp_path)
+    among = tmp_path / "images/dense"
+    with pytest.raises(InputError, match=r"would lie in .*images, where COLMAP would take .* another --output"):
+        prepare(sparse, among)
+    assert not among.exists()
+    # Of an earlier version.
+    prepare(sparse, tmp_path / "dense").root.rename(among)
+    prepare(sparse, among)
+    # Of who has all of a project in one folder.
+    shutil.copytree(tmp_path / "sparse", tmp_path / "images/sparse")
+    project = Project(tmp_path / "images/sparse/0", tmp_path / "images", output=tmp_path / "images/dense2")
+    Preparation(project, RunOptions())
+
+
 @pytest.mark.parametrize("what", ["model", "images", "masks"])
 def test_input_that_is_linked_to_the_output_is_refused(tmp_path: Path, what: str) -> None:
     """Files may lie inside though their folder does not: --overwrite would remove them."""

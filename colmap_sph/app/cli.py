@@ -22,9 +22,10 @@ from colmap_sph.app.events import Events
 from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.option_list import help_of
 from colmap_sph.app.part_command import part_command
 from colmap_sph.app.products.commands import PRODUCTS
-from colmap_sph.app.refusals import refusals_in_words
+from colmap_sph.app.refusals import refusals_in_words, refuse_empty_paths
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, with_dashed_values
@@ -49,6 +50,14 @@ class DemoCommand:
     """Worker threads; 0: as many as the process may use cores."""
 
 
+_COMMANDS: dict[str, Any] = {
+    "run": RunCommand,
+    "demo": DemoCommand,
+    "evaluate": EvaluateCommand,
+    "report": ReportCommand,
+    "view": ViewCommand,
+    **{name: options for name, (options, _) in PRODUCTS.items()},
+}
 # Or of one of PRODUCTS.
 Command = RunCommand | DemoCommand | EvaluateCommand | ReportCommand | ViewCommand | Any
 
@@ -92,9 +101,8 @@ def _answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int
         return 0
     if arguments and is_colmap_command(arguments[0]):
         return _answer_as_colmap(arguments, terminal, started)
-    asks_for_all = not {"--help-all", "--help_all"}.isdisjoint(arguments)
-    if arguments[:1] == ["run"] and (asks_for_all or not {"-h", "--help"}.isdisjoint(arguments)):
-        print_result(help_text(everything=asks_for_all))
+    if (asked := _help_asked_for(arguments)) is not None:
+        print_result(asked)
         return 0
     command = _parsed(arguments)
     events = _events_of(command)
@@ -119,6 +127,15 @@ def _answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int
     return code
 
 
+def _help_asked_for(arguments: Sequence[str]) -> str | None:
+    """The help of a command, where that is asked for; None: the parser has that of all."""
+    command, *typed = arguments or ("",)
+    everything = not {"--help-all", "--help_all"}.isdisjoint(typed)
+    if command not in _COMMANDS or not (everything or not {"-h", "--help"}.isdisjoint(typed)):
+        return None
+    return help_text(everything=everything) if command == "run" else help_of(command, _COMMANDS[command])
+
+
 def _events_of(command: Command) -> Events:
     is_wanted = isinstance(command, RunCommand) and command.progress == "json"
     return Events(sys.stdout if is_wanted else None)
@@ -141,18 +158,11 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal, started: flo
 def _parsed(arguments: Sequence[str]) -> Command:
     typed = with_dashed_values(arguments)
     arguments = ["run", *all_arguments(typed[1:], RunCommand)] if typed[:1] == ["run"] else typed
-    # `run` alone has flags without a value, among its own options.
-    commands: dict[str, Any] = {
-        "run": RunCommand,
-        "demo": DemoCommand,
-        "evaluate": tyro.conf.FlagConversionOff[EvaluateCommand],
-        "report": ReportCommand,
-        "view": ViewCommand,
-        **{name: options for name, (options, _) in PRODUCTS.items()},
-    }
-    with standard_output(), refusals_in_words(typed, commands), short_completion(arguments):
+    if arguments and arguments[0] in _COMMANDS:
+        refuse_empty_paths(arguments[1:], _COMMANDS[arguments[0]])
+    with standard_output(), refusals_in_words(typed, _COMMANDS), short_completion(arguments):
         command: Command = tyro.extras.subcommand_cli_from_dict(
-            commands,
+            _COMMANDS,
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU. COLMAP's own commands are taken, too: "
             "patch_match_stereo and stereo_fusion are done here, all others by COLMAP.",

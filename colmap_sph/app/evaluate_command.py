@@ -11,6 +11,7 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
 from colmap_sph.app.terminal import Terminal, output_width, print_result
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
@@ -41,6 +42,10 @@ logger = logging.getLogger(__name__)
 
 _BEGIN = b'{\n  "reference": '
 """What every file of results begins with."""
+_OTHER_UNIT = 3.0
+"""Exact depth is so many times that of sparse points, of which the median may be hidden, in another unit alone."""
+_SOME_VIEWS = 4
+_FEWEST_POINTS = 30
 _SAME_CAMERA = 1e-6
 """Largest relative difference of the calibrations of one camera in two files."""
 
@@ -69,7 +74,9 @@ class EvaluateCommand:
     """Which of the workspace's maps: those confirmed by other views, or the unchecked ones."""
     json: Path | None = None
     """File to write all results to, as JSON."""
-    options: Annotated[EvaluationOptions, tyro.conf.arg(name="")] = field(default_factory=EvaluationOptions)
+    options: Annotated[EvaluationOptions, tyro.conf.arg(name=""), tyro.conf.FlagConversionOff] = field(
+        default_factory=EvaluationOptions
+    )
 
     def check(self) -> None:
         """Raise `OptionError` for a value out of bounds or options that contradict each other, and
@@ -93,6 +100,9 @@ class EvaluateCommand:
                 raise InputError(f"The cloud {cloud} {lack}; check its path.")
         if self.json is not None:
             _check_target(self.json)
+        for cloud in self.clouds:
+            if self.reference.is_file() and cloud.samefile(self.reference):
+                raise InputError(f"The cloud {cloud} is the reference itself; give another as --reference.")
 
 
 def _check_target(path: Path) -> None:
@@ -108,9 +118,22 @@ def _check_target(path: Path) -> None:
             raise OutputError(f"{path} is there already, and no evaluation wrote it; name another for --json.")
 
 
+def _tell_exchanged(command: EvaluateCommand) -> None:
+    """Warn where a fused cloud is the reference of what is none: accuracy and completeness change their places."""
+    fused = [path for path in (command.reference, *command.clouds) if path.with_name(f"{path.name}.vis").is_file()]
+    if fused == [command.reference]:
+        logger.warning(
+            "The reference %s is a fused cloud (%s.vis is beside it), and what is measured by it is none; are the "
+            "two exchanged?",
+            command.reference,
+            command.reference.name,
+        )
+
+
 def evaluate_command(command: EvaluateCommand, terminal: Terminal) -> int:
     """`colmap_sph evaluate`: tables on the standard output, JSON where asked for."""
     command.check()
+    _tell_exchanged(command)
     views: list[DepthView] = []
     if command.reference.is_dir():
         model = command.model or Workspace(command.workspace or Path()).sparse_dir
@@ -233,7 +256,32 @@ def exact_depth_views(folder: Path, model_dir: Path, depth_scale: float | None =
         logger.warning(
             "%d of %d images have no exact depth, such as %s; left out", len(missing), total, missing[0]
         )
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    _check_unit(folder, model_dir, points, views, depth_scale or 1.0)
     return views
+
+
+def _check_unit(
+    folder: Path, model_dir: Path, points: NDArray[np.float64], views: list[DepthView], depth_scale: float
+) -> None:
+    """Raise `InputError` where exact depth counts in another unit than the sparse points of its model, if any."""
+    ratios = []
+    for view in views[:: -(-len(views) // _SOME_VIEWS)]:
+        exact = view.read_depth()
+        homogeneous = (points @ view.R.T + view.t) @ view.K.T
+        sparse = homogeneous[:, 2]
+        in_front = sparse > 0
+        columns, rows = np.floor(homogeneous[in_front, :2] / sparse[in_front, None]).T
+        inside = (columns >= 0) & (columns < exact.shape[1]) & (rows >= 0) & (rows < exact.shape[0])
+        seen = exact[rows[inside].astype(int), columns[inside].astype(int)]
+        ratios.append((seen / sparse[in_front][inside])[seen > 0])
+    found = np.concatenate(ratios)
+    ratio = float(np.median(found)) if len(found) >= _FEWEST_POINTS else 1.0
+    if not 1 / _OTHER_UNIT < ratio < _OTHER_UNIT:
+        raise InputError(
+            f"The exact depth maps in {folder} count in another unit than {model_dir}: at its sparse points they "
+            f"are {ratio:.3g} times as deep; give --depth-scale {depth_scale / ratio:.2g}, or another --model."
+        )
 
 
 def _depth_file(folder: Path, name: str) -> Path | None:

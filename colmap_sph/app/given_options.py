@@ -7,7 +7,8 @@ from colmap_sph.app.config_file import arguments_of_file
 from colmap_sph.app.option_list import Option, option_groups
 from colmap_sph.app.spelling import in_full
 from colmap_sph.errors import OptionError
-from colmap_sph.pipeline.presets import PRESETS
+from colmap_sph.pipeline.presets import PRESETS, values_of
+from colmap_sph.stereo.fusion import FusionOptions
 
 
 def all_arguments(typed: Sequence[str], command: type) -> list[str]:
@@ -57,10 +58,8 @@ def given_places(typed: Sequence[str], command: type) -> set[str]:
 
 def _of_quality(quality: str | None, fusion: str | None) -> list[str]:
     """What a quality sets for a method of fusion; nothing for one that there is not, which the parser refuses."""
-    chosen = dict(next((values for name, values in PRESETS.items() if name == quality), {}))
-    if fusion == "colmap":
-        # COLMAP's fusion merges what is as near as this: with less it finds less that agrees.
-        chosen.pop("fusion.max_reproj_error", None)
+    known = next((name for name in PRESETS if name == quality), None)
+    chosen = {} if known is None else values_of(known, fusion or FusionOptions().method)
     return [f"--{place.replace('_', '-')}={value}" for place, value in chosen.items()]
 
 

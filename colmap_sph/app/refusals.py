@@ -7,16 +7,16 @@ from contextlib import contextmanager, redirect_stderr
 from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from itertools import dropwhile, takewhile
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
 
+from colmap_sph.app.option_list import TAKEN_APART, without_marks
 from colmap_sph.app.spelling import SHORT, full_flag
 from colmap_sph.errors import InputError
 
-# Records whose options have no prefix.
-_TAKEN_APART = ("project", "options", "georeference")
 _OPTION = re.compile(r"--?[^\W\d]")
 # Lines, corners and colours of the parser's box, with or without Unicode.
 _DRAWN = re.compile(r"[╭╮╰╯│─]|^[|+]|[|+]$|-{3,}|\x1b\[[\d;]*m")
@@ -53,6 +53,36 @@ def refusals_in_words(arguments: Sequence[str], commands: Mapping[str, Any]) -> 
         raise InputError(_reason(arguments, commands) or _without_box(said.getvalue())) from None
 
 
+def refuse_empty_paths(arguments: Sequence[str], command: Any) -> None:
+    """Raise `InputError` for a path that is empty: the parser takes it for the current folder.
+
+    Parameters
+    ----------
+    arguments : sequence of str
+        Of the command, in full.
+    command : type
+        The record of its options.
+    """
+    paths = {each.flag for each in _known(command) if each.flag and _is_path(each.kind)}
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        flag, equals, value = word.partition("=")
+        if flag in paths and equals and not value:
+            raise _empty(flag)
+        if not word and (before in paths or not _OPTION.match(before)):
+            raise _empty(before if before in paths else "A path")
+
+
+def _empty(what: str) -> InputError:
+    return InputError(
+        f"{what} is empty; give a path, . for the current folder, or leave it out. Is a variable of the "
+        "shell unset?"
+    )
+
+
+def _is_path(kind: Any) -> bool:
+    return kind is Path or any(map(_is_path, get_args(kind)))
+
+
 def _reason(arguments: Sequence[str], commands: Mapping[str, Any]) -> str | None:
     names = ", ".join(commands)
     if not arguments:
@@ -70,13 +100,13 @@ def _reason(arguments: Sequence[str], commands: Mapping[str, Any]) -> str | None
 
 
 def _known(annotated: Any, prefix: str = "", *, has_switches: bool = True) -> Iterator[_Known]:
-    record, marks = _taken_apart(annotated)
+    record, marks = without_marks(annotated)
     has_switches = has_switches and tyro.conf.FlagConversionOff not in marks
     kinds = get_type_hints(record, include_extras=True)
     for each in fields(record):
-        kind, marks = _taken_apart(kinds[each.name])
+        kind, marks = without_marks(kinds[each.name])
         if is_dataclass(kind):
-            inner = prefix if each.name in _TAKEN_APART else f"{prefix}{each.name}."
+            inner = prefix if each.name in TAKEN_APART else f"{prefix}{each.name}."
             yield from _known(kinds[each.name], inner, has_switches=has_switches)
         else:
             is_positional = tyro.conf.Positional in marks
@@ -84,12 +114,6 @@ def _known(annotated: Any, prefix: str = "", *, has_switches: bool = True) -> It
             is_required = each.default is MISSING and each.default_factory is MISSING
             is_switch = kind is bool and has_switches
             yield _Known(flag, flag or f"a {each.name}", None if is_switch else kind, is_required)
-
-
-def _taken_apart(annotated: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A kind, and how it is marked."""
-    marks = getattr(annotated, "__metadata__", ())
-    return (get_args(annotated)[0] if marks else annotated), marks
 
 
 def _problem(typed: Sequence[str], options: Mapping[str, _Known], known: Sequence[_Known]) -> str | None:

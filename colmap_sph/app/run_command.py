@@ -13,15 +13,13 @@ from typing import Annotated, Literal
 import tyro
 from rich.console import Console
 from rich.filesize import decimal
-from rich.table import Table
-from rich.text import Text
 
 import colmap_sph
 from colmap_sph.app.display import Display, duration
 from colmap_sph.app.events import Events
 from colmap_sph.app.given_options import given_places
 from colmap_sph.app.log_file import workspace_log
-from colmap_sph.app.option_list import Option, option_groups
+from colmap_sph.app.option_list import option_groups, print_options
 from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.spelling import EVERYDAY
 from colmap_sph.app.terminal import Terminal
@@ -178,7 +176,7 @@ def _print_help(console: Console, *, everything: bool) -> None:
     console.print(plain.text, highlight=False, markup=False)
     known = {option.flag: option for group in (plain, *stages) for option in group.options}
     others = [option for option in plain.options if option.flag not in EVERYDAY] if everything else []
-    _print_options([*(known[flag] for flag in EVERYDAY), *others], console)
+    print_options([*(known[flag] for flag in EVERYDAY), *others], console)
     if not everything:
         console.print(
             "\nAll other options, stage by stage: colmap_sph run --help-all", highlight=False, markup=False
@@ -188,16 +186,7 @@ def _print_help(console: Console, *, everything: bool) -> None:
         rest = [option for option in group.options if option.flag not in EVERYDAY]
         if rest:
             console.print(f"\n{group.name}: {group.text}", highlight=False, markup=False)
-            _print_options(rest, console)
-
-
-def _print_options(options: Sequence[Option], console: Console) -> None:
-    table = Table.grid(padding=(0, 2))
-    table.add_column(no_wrap=True)
-    table.add_column()
-    for option in options:
-        table.add_row(Text(f"  {option.flag} {option.values}".rstrip()), Text(option.text_with_default))
-    console.print(table)
+            print_options(rest, console)
 
 
 # ---- plan and summary --------------------------------------------------------------------------------------

@@ -19,23 +19,23 @@ class EvaluationOptions:
 
     tau: tuple[float, ...] = ()
     """Distances up to which a point counts as right: in GSD where `gsd` is given, else in metres.
-    Empty: 1 2 4 GSD, or 0.05 0.1 0.2 0.5 m."""
+    Default: 1 2 4 GSD, or 0.05 0.1 0.2 0.5 m."""
     gsd: float | None = None
     """Ground sampling distance in metres; makes `tau` count in GSD."""
     definition: Literal["points", "tanks-and-temples", "eth3d"] = "points"
     """How shares are counted. points: every point counts alike. tanks-and-temples: both clouds are first
     thinned to the centroids of voxels of τ/2. eth3d: mean of the shares per voxel of `voxel_size`."""
     voxel_size: float | None = None
-    """Voxel edge of the eth3d definition, in metres. None: the smallest τ."""
+    """Voxel edge of the eth3d definition, in metres. Default: the smallest τ."""
     distance_cap: float | None = None
     """Distances above this count as this in the mean and standard deviation (CloudCompare's -MAX_DIST), in
-    metres. None: no cap."""
+    metres. Default: no cap."""
     register: bool = True
     """Move the cloud onto the reference by ICP before measuring; the motion is reported. Against exact depth
     maps nothing is ever moved: the cameras already tie the two."""
     registration_distance: float | None = None
     """ICP pairs points up to this distance, in metres; larger misalignments must be removed beforehand.
-    None: five times the largest τ."""
+    Default: five times the largest τ."""
     crop: Literal["auto", "box", "horizontal", "none"] = "auto"
     """Which points are judged: those inside the reference's bounding box, enlarged by the largest τ (box),
     those inside its extent in x and y (horizontal), or all (none). auto: horizontal for LAS/LAZ, whose z
@@ -43,7 +43,7 @@ class EvaluationOptions:
     reference_shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Subtracted from the reference's coordinates: the offset of a local model from map coordinates."""
     truth_spacing: float | None = None
-    """Spacing of the surface samples taken from meshes and exact depth maps, in metres. None: a quarter of
+    """Spacing of the surface samples taken from meshes and exact depth maps, in metres. Default: a quarter of
     the smallest τ."""
     min_view_count: int = 3
     """With exact depth maps: only surface that so many of them see counts for completeness."""

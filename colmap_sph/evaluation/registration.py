@@ -18,6 +18,8 @@ logger = logging.getLogger(__name__)
 _MAX_POINTS = 300_000
 """Points of either cloud that ICP sees: plenty for six unknowns."""
 _MIN_POINTS = 100
+_MOST_DEGREES = 5.0
+"""What is nearly in place already is turned by less."""
 _FINE_SHARE = 0.25
 """The second pass pairs points up to this share of the first pass's distance."""
 
@@ -100,13 +102,20 @@ def register(cloud: Points, reference: Points, *, max_distance: float, threads: 
     applied = bool(np.isfinite(motion).all() and after <= before)
     if not applied:
         logger.warning("registration made the residual larger (%.4g to %.4g m): it is not applied", before, after)
+    rotation = float(np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude()))
+    if applied and rotation > _MOST_DEGREES:
+        logger.warning(
+            "registration turned the cloud by %.1f degrees, which is no small misalignment: are cloud and "
+            "reference of one place, and in one frame? Align them first, or give --register False",
+            rotation,
+        )
     matrix = motion.copy()
     matrix[:3, 3] += centre - motion[:3, :3] @ centre
     shift = moved.mean(axis=0) - source.mean(axis=0)
     return Registration(
         matrix=matrix,
         applied=applied,
-        rotation_degrees=float(np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude())),
+        rotation_degrees=rotation,
         shift=(float(shift[0]), float(shift[1]), float(shift[2])),
         inlier_share=inlier_share,
         rms_before=before,

@@ -14,6 +14,8 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.map_files import map_size, read_some_pixels
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.state.array_file import SUFFIX, first_array
+from colmap_sph.project.state.ownership import map_place
+from colmap_sph.project.state.records import altered_files, read_record
 from colmap_sph.project.wide.projection import Lens
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import View
@@ -43,7 +45,8 @@ class MapSamples:
     photometric, geometric : (h, w) float32 ndarray
         Depths, 0 = none.
     has_photometric, has_geometric : bool
-        Whether there are such maps. Where there is no photometric map, the depths are those that were voted.
+        Whether there are such maps. Where there is no photometric map, the depths are those that were voted, and
+        so where another program's is beside a vote of ours.
     ignored : (h, w) bool ndarray
         Under the mask.
     """
@@ -94,7 +97,11 @@ def read_samples(
         _depth(workspace, view, kind, rows, columns) if kind in kinds else None for kind in get_args(MapKind)
     )
     none = np.zeros((len(rows), len(columns)), np.float32)
-    voted = _voted(workspace, view, rows, columns) if photometric is None and "photometric" in kinds else None
+    voted = None
+    if "photometric" in kinds and (photometric is None or _is_foreign(workspace, view)):
+        voted = _voted(workspace, view, rows, columns)
+    if voted is not None:
+        photometric = None
     return MapSamples(
         rows,
         columns,
@@ -104,6 +111,12 @@ def read_samples(
         geometric is not None,
         _ignored(workspace, view)[np.ix_(rows, columns)] if workspace.masks_dir.is_dir() else none > 0,
     )
+
+
+def _is_foreign(workspace: Workspace, view: View) -> bool:
+    """Whether a view's photometric map is not as this program left it."""
+    place = map_place(workspace, view.name, "photometric")
+    return bool(altered_files(read_record(place.record), place.files))
 
 
 def read_normals(workspace: Workspace, view: View, samples: MapSamples) -> NDArray[np.float32] | None:

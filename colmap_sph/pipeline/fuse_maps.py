@@ -21,13 +21,14 @@ from colmap_sph.pipeline.stages.view_maps import MapSources, views_beside
 from colmap_sph.pipeline.workers import room_for_workers
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.cloud_output import CloudOutput
-from colmap_sph.project.map_files import has_depth, map_size
+from colmap_sph.project.map_files import depth_if_readable, has_depth, map_size
 from colmap_sph.project.pair_lists import read_lines
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import map_place, named
 from colmap_sph.project.state.records import altered_files, read_record, whole_digests
 from colmap_sph.project.workspace import MapKind, Workspace, mask_path
 from colmap_sph.scene import Region, Scene, View
+from colmap_sph.stereo.agreement import check_some_maps
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair, as_pair
 
@@ -73,6 +74,13 @@ def fuse_maps(
     report = RunReport()
     given = read_scene(workspace.sparse_dir)
     mapped = _with_maps(workspace, given, _listed(workspace, given), options.fusion.input)
+    check_some_maps(
+        given,
+        sorted(mapped),
+        lambda name: depth_if_readable(workspace.depth_map_path(name, options.fusion.input)),
+        maps=str(workspace.stereo_dir),
+        model=str(workspace.sparse_dir),
+    )
     with claimed(workspace), room_for_workers():
         scene = _at_map_sizes(given, mapped, options.undistortion.max_image_size)
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)

@@ -5,7 +5,7 @@ deviations, geometric maps, the cloud. What an earlier run finished with the sam
 """
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -18,7 +18,7 @@ from colmap_sph.pipeline.forecast.sizes import with_affordable_size
 from colmap_sph.pipeline.forecast.time_limit import TimeLimit, time_limit
 from colmap_sph.pipeline.forecast.within import Within, widest
 from colmap_sph.pipeline.input.prepared import prepare
-from colmap_sph.pipeline.input.start import start
+from colmap_sph.pipeline.input.start import Request, start
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.pose_check import check_poses
@@ -28,7 +28,6 @@ from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, 
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
-from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage, report_photometric
 from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
@@ -134,19 +133,16 @@ def run_project(
         prepared = prepare(
             project, options, dense, executor, overwrite=overwrite, verify=verify, progress=progress, report=report
         )
-        return reconstruct(
-            dense,
-            prepared.options,
-            executor=executor,
-            expected=prepared.names,
+        request = Request(
             progress=progress,
             report=report,
             database=project.database(),
+            expected=prepared.names,
             given=prepared.given,
             overwrite=overwrite,
             verify=verify,
-            limit=limit,
         )
+        return reconstruct(dense, prepared.options, request, executor=executor, limit=limit)
 
 
 def check_input(project: Project, options: RunOptions, limit: TimeLimit | None = None) -> None:
@@ -171,18 +167,10 @@ def check_input(project: Project, options: RunOptions, limit: TimeLimit | None =
 def reconstruct(
     workspace: Workspace,
     options: RunOptions,
+    request: Request,
     *,
     executor: Executor = execute,
-    progress: Progress | None = None,
-    report: RunReport | None = None,
-    database: Path | None = None,
-    expected: Collection[str] = (),
-    given: GivenModel | None = None,
-    overwrite: bool = False,
-    verify: bool = False,
     until: Until = "cloud",
-    pair_list: Path | None = None,
-    needs_all: bool = False,
     limit: TimeLimit | None = None,
 ) -> RunReport:
     """Match, vote, confirm and fuse everything in a dense workspace; see `run`.
@@ -191,60 +179,32 @@ def reconstruct(
     ----------
     workspace : Workspace
     options : RunOptions
+    request : Request
     executor : callable
         Makes the results of a stage, see `Executor`.
-    progress : Progress, optional
-    report : RunReport, optional
-        What is known of the run so far.
-    database : Path, optional
-        COLMAP's database, whose verified matches serve where the model has no tracks.
-    expected : collection of str
-        Names of images that are reported as skipped where the workspace's model does not have them.
-    given : GivenModel, optional
-        The model that the workspace's was undistorted from: its poses may be polished where the options say so.
-    overwrite : bool
-        Files that this program did not make, where maps and cloud go, get another name; without it they are
-        refused.
-    verify : bool
-        See `run`.
     until : {"photometric", "geometric", "cloud"}
         The last results to make: maps of a kind, or the cloud.
-    pair_list : Path, optional
-        Which pairs to match, in the format of ``patch-match.cfg`` and instead of the workspace's own.
-    needs_all : bool
-        Whether an image that is missing or damaged ends the run (`InputError`) before anything is made.
     limit : TimeLimit, optional
         The time to end within.
 
     Returns
     -------
     RunReport
+        That of the request.
     """
-    progress = Silent() if progress is None else progress
-    report = report or RunReport()
+    report = request.report
     report.until = until
     options = options if limit is None else widest(options, limit)
     with room_for_workers():
-        context, selection = start(
-            workspace,
-            options,
-            executor,
-            progress=progress,
-            report=report,
-            database=database,
-            expected=expected,
-            given=given,
-            overwrite=overwrite,
-            verify=verify,
-            pair_list=pair_list,
-            needs_all=needs_all,
-        )
+        context, selection = start(workspace, options, executor, request)
         misplaced = judge_reprojection(report, context.scene)
         if limit is None:
-            progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
+            request.progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
             go_through_stages(context, selection.unique_pairs(), executor, until=until)
         else:
-            context = go_through_stages_within(Within(limit, context, selection, goes_on=not overwrite), executor)
+            context = go_through_stages_within(
+                Within(limit, context, selection, goes_on=not request.overwrite), executor
+            )
         judge_agreement(report, misplaced=misplaced)
     write_report(context)
     keep_or_make_page(context)

@@ -135,6 +135,8 @@ class RunReport:
         fewer than ten tell.
     overall_agreement : float or None
         The same of all images together.
+    agreement_of_found : dict
+        Image name → share of those sparse points that have a depth; None where these are fewer than thirty.
     sparse_points : Agreement
         The numbers behind it.
     doubts : str
@@ -188,6 +190,7 @@ class RunReport:
     originals: dict[str, float] = field(default_factory=dict)
     views: dict[str, list[str]] = field(default_factory=dict)
     agreement: dict[str, float | None] = field(default_factory=dict)
+    agreement_of_found: dict[str, float | None] = field(default_factory=dict)
     overall_agreement: float | None = None
     sparse_points: Agreement = field(default_factory=Agreement)
     doubts: str = ""

@@ -17,6 +17,9 @@ logger = logging.getLogger(__name__)
 _DOUBTED_SHARE = 0.15
 # ... and all of them below this one.
 _REFUSED_SHARE = 0.1
+# An image is doubted, too, where its points with a depth agree so much less often than those of the median image:
+# of real scenes the worst has nine tenths of that, an image exchanged for its neighbour in the strip half.
+_DOUBTED_OF_USUAL = 0.7
 # Where points do not project to their observations in most images, sound depth would still agree with most points:
 # so it does where only the observations are of another size.
 _REFUSED_SHARE_OF_MISPLACED = 0.5
@@ -48,7 +51,13 @@ def judge_agreement(report: RunReport, *, misplaced: float) -> None:
     total = report.sparse_points
     is_enough = total.tested >= _FEWEST
     shares = {name: share for name, share in report.agreement.items() if share is not None}
-    doubted = {name: share for name, share in shares.items() if share < _DOUBTED_SHARE}
+    of_found = {name: share for name, share in report.agreement_of_found.items() if share is not None}
+    usual = median(of_found.values()) if of_found else 0.0
+    doubted = {
+        name: share
+        for name, share in shares.items()
+        if share < _DOUBTED_SHARE or of_found.get(name, usual) < _DOUBTED_OF_USUAL * usual
+    }
     if not total.tested:
         logger.info("There are no sparse points to check the depth maps against")
     elif is_enough and misplaced > 0.5 and total.agreeing < _REFUSED_SHARE_OF_MISPLACED * total.tested:

@@ -16,6 +16,8 @@ _MISSING = "needs PROJ, which is not installed; install this program with it: pi
 _GPS = "EPSG:4979"
 # Metres from the ellipsoid: what is farther, as a local model is, lies in no geocentric system.
 _HIGHEST = 1e5
+# Units of a projected system; UTM's zones begin farther from theirs, and models in frames of their own end nearer.
+_NEAR_ORIGIN = 1e5
 _FIRST_UTM_NORTH = 32601
 _FIRST_UTM_SOUTH = 32701
 
@@ -117,7 +119,9 @@ def is_in_area(crs: "pyproj.CRS", place: NDArray[np.float64]) -> bool:
     if not np.isfinite([longitude, latitude]).all() or (crs.is_geocentric and abs(height) > _HIGHEST):
         return False
     width = (area.east - area.west) % 360 or 360
-    beyond = max(width, area.north - area.south) / 2
+    # A model in a frame of its own lies at the origin, which in UTM is not far from a zone, and in none.
+    is_at_origin = np.abs(place[:2]).max() < _NEAR_ORIGIN
+    beyond = 0.0 if is_at_origin else max(width, area.north - area.south) / 2
     east_of_west = (longitude - area.west + beyond) % 360
     is_in_width = width + 2 * beyond >= 360 or east_of_west <= width + 2 * beyond
     return bool(is_in_width and area.south - beyond <= latitude <= area.north + beyond)

@@ -16,11 +16,11 @@ from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.maps.files import write_exr, write_npz, write_png
 from colmap_sph.products.maps.reading import MappedScene, mapped_scene
 from colmap_sph.products.places import check_no_input
+from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.scenes.mvsnet import write_mvsnet
 from colmap_sph.products.scenes.nerfstudio import write_nerfstudio
 from colmap_sph.products.scenes.splats import write_splats
 from colmap_sph.project.claim import check_ways_out
-from colmap_sph.project.files import make_dir
 from colmap_sph.project.workspace import Workspace
 
 if TYPE_CHECKING:
@@ -172,8 +172,8 @@ def export(exporter: Exporter, status: Status, *, overwrite: bool = False) -> Se
     for path in paths:
         if os.path.lexists(path) and not overwrite:
             raise OutputError(f"{path} is there already; give --overwrite, or another --output.")
-    make_dir(exporter.folder)
-    for each, path in zip(formats, paths, strict=True):
-        with status(path):
-            _MAKERS[each][1](exporter, path)
+    with alone_in(exporter.folder):
+        for each, path in zip(formats, paths, strict=True):
+            with status(path):
+                _MAKERS[each][1](exporter, path)
     return paths

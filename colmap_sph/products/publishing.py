@@ -3,7 +3,7 @@
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.platforms.files import move_into_place, sync_file, sync_folder, write_text
+from colmap_sph.platforms.locks import holding, remove_lock
 from colmap_sph.project.files import atomic_file, make_dir
 
 MARK = "made_by_colmap_sph.txt"
@@ -29,6 +30,29 @@ def _told(path: Path) -> Iterator[None]:
             f"{path} cannot be written ({reason_of(error)}); check space and permissions, or choose another "
             "--output."
         ) from error
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Make a folder for products, and hold it: another command would take our temporary files for leftovers.
+
+    Raises
+    ------
+    OutputError
+        Another command is at work there, or the folder cannot be made.
+    """
+    make_dir(folder)
+    with ExitStack() as held:
+        held.callback(remove_lock, folder)
+        try:
+            held.enter_context(holding(folder))
+        except BlockingIOError as error:
+            raise OutputError(
+                f"Another command is at work in {folder}; wait for its end, or choose another --output."
+            ) from error
+        except OSError as error:
+            raise OutputError(f"{folder} cannot be used ({reason_of(error)}); choose another --output.") from error
+        yield
 
 
 @contextmanager

@@ -6,6 +6,7 @@ ASCII ``width&height&channels&`` followed by little-endian float32, plane after 
 
 import re
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -66,6 +67,13 @@ def read_depth_map(path: Path, digest: str | None = None) -> NDArray[np.float32]
         It is missing, cannot be read, or is no depth map.
     """
     return np.asarray(_read_planes(path, 1, digest)[0])
+
+
+def depth_if_readable(path: Path) -> NDArray[np.float32] | None:
+    """Read a COLMAP depth map; None where it is missing or damaged, which whoever needs it will tell."""
+    with suppress(InputError):
+        return read_depth_map(path)
+    return None
 
 
 def write_normal_map(path: Path, normals: NDArray[np.float32]) -> str:

@@ -4,12 +4,14 @@ The sparse points come from the same poses as the depth maps, but from other mea
 belong to their poses, or are turned, next to no point agrees with the maps; where all fits, nearly all do.
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 
+from colmap_sph.errors import InputError
 from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.depth import Depths
 from colmap_sph.stereo.region.inside import is_inside
@@ -21,6 +23,11 @@ _MAX_POINTS = 500
 _MAX_DISTANCE = 4.0
 # ... A point tells something where it would not agree at this many times its distance.
 _TELLING = 1.25
+# Maps of so many views tell whether all are of this model; fewer points with a depth say nothing.
+_SOME_VIEWS = 8
+_FEWEST_FOUND = 30
+# Of the points that have a depth at all, nearly all agree with it as a rule, and next to none by chance.
+_LEAST_OF_FOUND = 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,6 +138,50 @@ def compare_with_sparse(
     ratio = np.divide(nearest, sights.depth, out=np.ones(len(asked)), where=found)
     agreeing = found & (_distances(sights, ratio) <= _MAX_DISTANCE)
     return int(asked.sum()), int(found.sum()), int(agreeing.sum())
+
+
+def check_some_maps(
+    scene: Scene,
+    names: Sequence[str],
+    read: Callable[[str], NDArray[np.float32] | None],
+    *,
+    maps: str,
+    model: str,
+) -> None:
+    """Make sure that depth maps that were made earlier are of this model, and not of one of another scale, say.
+
+    Parameters
+    ----------
+    scene : Scene
+    names : sequence of str
+        Views that have maps, of which some are looked at.
+    read : callable
+        Name of a view → (H, W) float32 depth map, maybe with fewer pixels than the view; None: there is none.
+    maps, model : str
+        Where they are, for the message.
+
+    Raises
+    ------
+    InputError
+        Hardly any sparse point agrees with the maps. Where few points have a depth, nothing is said.
+    """
+    tracks = SparseTracks(scene)
+    found = agreeing = 0
+    for name in names[:: -(-len(names) // _SOME_VIEWS) or 1]:
+        view, depth = scene.view(name), read(name)
+        if depth is not None:
+            rows = np.arange(view.height) * depth.shape[0] // view.height
+            columns = np.arange(view.width) * depth.shape[1] // view.width
+            whole = np.where(np.isfinite(depth), depth, np.float32(0))[np.ix_(rows, columns)]
+            _, of_view, right = compare_with_sparse(view, whole, tracks.sights(name))
+            found += of_view
+            agreeing += right
+    if found >= _FEWEST_FOUND and agreeing < _LEAST_OF_FOUND * found:
+        raise InputError(
+            f"The depth maps in {maps} are not of the model in {model}: only {agreeing / found:.1%} of its sparse "
+            "points that have a depth there agree with it. Was the model scaled, aligned or replaced after they "
+            "were made? Put back the one they were made with, or make them again."
+        )
 
 
 def _distances(sights: SparseSights, ratio: NDArray[np.float64]) -> NDArray[np.float64]:

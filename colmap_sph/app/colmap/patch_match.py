@@ -6,8 +6,10 @@ from pathlib import Path
 
 from colmap_sph.app.colmap.options import PATCH_MATCH_STEREO, Value
 from colmap_sph.app.colmap.settings import WrongOptionError, check_workspace, run_options, spelled_as_colmap
+from colmap_sph.pipeline.context import Until
+from colmap_sph.pipeline.input.start import Request
 from colmap_sph.pipeline.reconstruct import reconstruct
-from colmap_sph.pipeline.report import Progress, RunReport
+from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.project import Project, open_workspace
 
@@ -48,12 +50,11 @@ def make_maps(
     workspace = open_workspace(project)
     check_links(workspace, is_given=True)
     with claimed(workspace), spelled_as_colmap(PATCH_MATCH_STEREO, "PatchMatchStereo"):
-        return reconstruct(
-            workspace,
-            options,
-            progress=progress,
+        request = Request(
+            progress=progress or Silent(),
             report=RunReport(command=command, started=started or time.monotonic()),
-            until="geometric" if chosen.get("geom_consistency", True) else "photometric",
             pair_list=pair_list,
             needs_all=not chosen.get("allow_missing_files", False),
         )
+        until: Until = "geometric" if chosen.get("geom_consistency", True) else "photometric"
+        return reconstruct(workspace, options, request, until=until)

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Collection
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, get_args
 
@@ -13,7 +13,7 @@ from colmap_sph.pipeline.input.good_images import with_good_images, without_misp
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
-from colmap_sph.pipeline.report import Progress, RunReport
+from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.project.files import make_dir
@@ -31,29 +31,53 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Request:
+    """How a run is asked for, beside its workspace and its options.
+
+    Attributes
+    ----------
+    progress : Progress
+    report : RunReport
+        What is known of the run so far.
+    database : Path or None
+        COLMAP's database, whose verified matches serve where the model has no tracks.
+    expected : collection of str
+        Names of images that are reported as skipped where the workspace's model does not have them.
+    given : GivenModel or None
+        The model that the workspace's was undistorted from: its poses may be polished where the options say so.
+    overwrite : bool
+        Files that this program did not make, where maps and cloud go, get another name; without it they are
+        refused.
+    verify : bool
+        Look at every byte of earlier results first, and make again what is damaged.
+    pair_list : Path or None
+        Which pairs to match, in the format of ``patch-match.cfg`` and instead of the workspace's own.
+    needs_all : bool
+        Whether an image that is missing or damaged ends the run (`InputError`) before anything is made.
+    """
+
+    progress: Progress = field(default_factory=Silent)
+    report: RunReport = field(default_factory=RunReport)
+    database: Path | None = None
+    expected: Collection[str] = ()
+    given: GivenModel | None = None
+    overwrite: bool = False
+    verify: bool = False
+    pair_list: Path | None = None
+    needs_all: bool = False
+
+
 def start(
-    workspace: Workspace,
-    options: RunOptions,
-    executor: "Executor",
-    *,
-    progress: Progress,
-    report: RunReport,
-    database: Path | None = None,
-    expected: Collection[str] = (),
-    given: GivenModel | None = None,
-    overwrite: bool = False,
-    verify: bool = False,
-    pair_list: Path | None = None,
-    needs_all: bool = False,
+    workspace: Workspace, options: RunOptions, executor: "Executor", request: Request
 ) -> tuple[Context, PairSelection]:
     """Check the images, choose the pairs, and polish the poses where that is asked for.
 
     Parameters
     ----------
-    workspace, options, executor, progress, report, database, expected, given, overwrite, verify, pair_list
+    workspace, options, executor
         See `reconstruct`.
-    needs_all
-        See `reconstruct`.
+    request : Request
 
     Returns
     -------
@@ -61,29 +85,31 @@ def start(
         Of the images that are to be matched.
     selection : PairSelection
     """
+    report = request.report
     make_dir(workspace.state_dir)
-    is_polishing = given is not None and options.polish.is_wanted
+    is_polishing = request.given is not None and options.polish.is_wanted
     scene = read_scene(starting_model(workspace) if is_polishing else workspace.sparse_dir)
     # Images that this program undistorted are no larger.
     scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
     report.views = _views_of_photographs(scene)
-    context = Context(workspace, scene, options, Keys(workspace, options), progress, report).in_region()
-    _report_missing(context, expected)
-    context = with_good_images(context, executor, verify=verify)
-    if needs_all and report.skipped_images:
+    context = Context(workspace, scene, options, Keys(workspace, options), request.progress, report)
+    context = context.in_region()
+    _report_missing(context, request.expected)
+    context = with_good_images(context, executor, verify=request.verify)
+    if request.needs_all and report.skipped_images:
         reason = next(iter(sorted(report.skipped_images.items())))[1]
         raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
     context = _without_misplaced(context)
     workspace.create_stereo_dirs(context.scene.index_of)
-    selection = _selection(context, database, pair_list)
+    selection = _selection(context, request.database, request.pair_list)
     context = replace(context, scene=wanted_scene(context.scene, selection))
-    take_places(context.places, overwrite=overwrite)
-    if verify:
+    take_places(context.places, overwrite=request.overwrite)
+    if request.verify:
         _verify(context)
-    if given is not None and is_polishing:
+    if request.given is not None and is_polishing:
         pairs = selection.unique_pairs()
-        progress.foresee(foreseen_stages(context, pairs, (MatchToPolishStage(context, pairs),)))
-        context = with_polished_poses(context, pairs, executor, given)
+        request.progress.foresee(foreseen_stages(context, pairs, (MatchToPolishStage(context, pairs),)))
+        context = with_polished_poses(context, pairs, executor, request.given)
     return context, selection
 
 

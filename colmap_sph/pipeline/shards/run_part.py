@@ -18,7 +18,7 @@ from colmap_sph.pipeline.engine.lag import PATIENCE
 from colmap_sph.pipeline.execute import execute, made_by_threads, tell_counts
 from colmap_sph.pipeline.forecast.foresight import estimate
 from colmap_sph.pipeline.input.prepared import find_prepared, prepare
-from colmap_sph.pipeline.input.start import start
+from colmap_sph.pipeline.input.start import Request, start
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.options import RunOptions
@@ -119,15 +119,8 @@ def run_part(
         prepared = find_prepared(project, options, workspace, progress, report)
         if prepared is None:
             raise _unprepared(workspace)
-        context, selection = start(
-            workspace,
-            prepared.options,
-            _only_prepared,
-            progress=progress,
-            report=report,
-            database=project.database(),
-            given=prepared.given,
-        )
+        request = Request(progress=progress, report=report, database=project.database(), given=prepared.given)
+        context, selection = start(workspace, prepared.options, _only_prepared, request)
         return _make(_stage_of(stage, part, context, selection.unique_pairs()), part, _WHAT[stage])
 
 
@@ -170,10 +163,7 @@ def _prepare(
             progress=progress,
             report=report,
         )
-        context, selection = start(
-            workspace,
-            prepared.options,
-            execute,
+        request = Request(
             progress=progress,
             report=report,
             database=project.database(),
@@ -182,6 +172,7 @@ def _prepare(
             overwrite=overwrite,
             verify=verify,
         )
+        context, selection = start(workspace, prepared.options, execute, request)
     number = len(context.scene.views)
     made = sum(report.made.values())
     return PartReport(

@@ -20,7 +20,7 @@ from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.given.image_places import tell_problems
 from colmap_sph.project.images.decoding import is_jpeg
 from colmap_sph.project.images.depth import ValueSample, sample_values
-from colmap_sph.project.images.reading import image_problem, read_grey
+from colmap_sph.project.images.reading import Problem, image_problem, read_grey
 from colmap_sph.project.state.records import read_json
 from colmap_sph.project.state.typed import from_json
 from colmap_sph.project.workspace import checked_name
@@ -228,8 +228,8 @@ class CheckStage(Stage[str, ImageFile]):
         """Tell what is wrong with bad images; `InputError` where there is no other."""
         places = self._places
         problems = {
-            name: image_problem(places.path(name), *self._sizes[name]) or problem
-            for name, problem in sorted(self._bad.items())
+            name: image_problem(places.path(name), *self._sizes[name]) or Problem(reason)
+            for name, reason in sorted(self._bad.items())
         }
         tell_problems(
             places.model_dir, places.folder, problems, len(self.items), undistorted=places.what == "images"

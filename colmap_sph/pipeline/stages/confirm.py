@@ -318,6 +318,9 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         if self.context.focus is not None:
             report.in_region = {name: result.facts.in_region for name, result in results.items()}
         report.agreement = {name: result.facts.agreement.share for name, result in results.items()}
+        report.agreement_of_found = {
+            name: result.facts.agreement.share_of_found for name, result in results.items()
+        }
         report.sparse_points = sum((result.facts.agreement for result in results.values()), Agreement())
         report.overall_agreement = report.sparse_points.share
         report.images = sum(share > 0 for share in report.coverage.values())

@@ -3,8 +3,9 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-# Fewer sparse points say nothing of an image.
+# Fewer sparse points say nothing of an image, and fewer with a depth nothing of how right that is.
 _FEWEST = 10
+_FEWEST_FOUND = 30
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,11 @@ class Agreement:
     def share(self) -> float | None:
         """Agreeing points of those tested (without a depth none agrees); None where these are fewer than ten."""
         return self.agreeing / self.tested if self.tested >= _FEWEST else None
+
+    @property
+    def share_of_found(self) -> float | None:
+        """Agreeing points of those that have a depth; None where these are fewer than thirty."""
+        return self.agreeing / self.found if self.found >= _FEWEST_FOUND else None
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
-from colmap_sph.project.map_files import has_depth, map_size, read_depth_map, read_normal_planes
+from colmap_sph.project.map_files import depth_if_readable, has_depth, map_size, read_depth_map, read_normal_planes
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.agreement import check_some_maps
 from colmap_sph.stereo.map_sizes import at_pixel_centres
 
 logger = logging.getLogger(__name__)
@@ -92,3 +93,16 @@ def at_map_size(view: View, path: Path) -> View:
     if not view.may_be_reduced_to(width, height):
         raise InputError(f"{path} has another shape than its image; delete it and compute it again.")
     return view.resized(width, height)
+
+
+def check_maps(workspace: Workspace) -> None:
+    """Raise `InputError` where the geometric maps of a workspace are there, and of another model than its own."""
+    scene = read_scene(workspace.sparse_dir)
+    paths = {view.name: workspace.depth_map_path(view.name, "geometric") for view in scene.views}
+    check_some_maps(
+        scene,
+        [name for name, path in paths.items() if path.is_file()],
+        lambda name: depth_if_readable(paths[name]),
+        maps=str(workspace.stereo_dir),
+        model=str(workspace.sparse_dir),
+    )

@@ -20,8 +20,9 @@ from colmap_sph.products.mesh.texture.textured import Sheet, plain, textured
 from colmap_sph.products.mesh.triangles import Triangles, joined, read_ply, write_ply
 from colmap_sph.products.mesh.tsdf import Volume, open3d
 from colmap_sph.products.places import check_places
+from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.surface.seen import SeenView, seen_views
-from colmap_sph.project.files import make_dir, scratch_folder
+from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.meshing import poisson_mesh, simplify
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
@@ -82,9 +83,8 @@ def make_mesh(
     gsd = float(np.median(np.concatenate([each.footprint for each in seen])))
     if options.voxel:
         _check_voxel(options, _size(seen))
-    make_dir(request.folder)
     scratch = request.folder / ".mesh.tmp"
-    with scratch_folder(scratch):
+    with alone_in(request.folder), scratch_folder(scratch):
         if options.method == "tsdf":
             mesh = _of_maps(request, seen, options.voxel or gsd, start, advance)
         else:

@@ -14,7 +14,8 @@ class MeshOptions:
     """How a workspace becomes a mesh, and in which files."""
 
     method: Literal["tsdf", "poisson"] = "tsdf"
-    """tsdf: of the depth maps, averaged in voxels, by Open3D; poisson: of the cloud, smooth, by COLMAP."""
+    """What it is made of. tsdf: the depth maps, averaged in voxels, by Open3D; poisson: the cloud, smooth, by
+    COLMAP."""
     formats: tuple[MeshFormat, ...] = ("ply", "glb")
     """Files to write."""
     texture: bool = False

@@ -14,6 +14,7 @@ from colmap_sph.errors import NoResultError, OutputError, reason_of
 from colmap_sph.platforms.files import move_into_place, sync_file
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.places import check_places
+from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.surface.drawing import Drawing, Drawn, margin_of
 from colmap_sph.products.surface.geotiff import NO_HEIGHT, Layer, LayerFiles, gdal
 from colmap_sph.products.surface.options import SurfaceOptions
@@ -22,7 +23,7 @@ from colmap_sph.products.surface.placing import Placement, place
 from colmap_sph.products.surface.previews import PREVIEWS, write_previews
 from colmap_sph.products.surface.seen import SeenView, seen_views
 from colmap_sph.products.surface.tiles import Sightings, Tile, choose_side, tiles_of
-from colmap_sph.project.files import atomic_file, free_space, make_dir, scratch_folder
+from colmap_sph.project.files import atomic_file, free_space, scratch_folder
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 
@@ -123,10 +124,9 @@ def make_surface(request: SurfaceRequest, start: Start, advance: Advance) -> tup
     scene, seen = seen_views(request.workspace)
     placement = place(scene, seen, request.georeference, request.options)
     drawing, tiles = _prepared(request, scene, seen, placement)
-    make_dir(request.folder)
-    _check_space(request.folder, placement)
     scratch = request.folder / ".surface.tmp"
-    with scratch_folder(scratch):
+    with alone_in(request.folder), scratch_folder(scratch):
+        _check_space(request.folder, placement)  # without what a process that was killed has left
         counts = np.zeros(2, np.int64)
         with LayerFiles(scratch, layers, placement.raster, placement.crs, _tags(placement)) as files:
             start("surface", len(tiles))

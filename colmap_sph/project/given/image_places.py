@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.files import real_path
-from colmap_sph.project.images.reading import WrongSize
+from colmap_sph.project.images.reading import Damaged, Problem, Unreadable, WrongSize
 
 _Size = tuple[int, int]
 
@@ -22,11 +22,10 @@ _MAX_FACTOR = 16
 # Of images with the same problem so many are told one by one; of more the first in one sentence.
 _MOST_TOLD = 4
 _UNDISTORT = "give the sparse model with --model to have them undistorted anew"
-_REMEDIES: dict[object, str] = {
+_REMEDIES: dict[type[Problem], str] = {
     WrongSize: "give the images that the model was made from as --images",
-    "is damaged": "copy them again from where they came from",
-    "is empty": "copy them again from where they came from",
-    "cannot be": "check their permissions",
+    Damaged: "copy them again from where they came from",
+    Unreadable: "check their permissions",
 }
 _SHARES = {2: "half", 3: "a third of", 4: "a quarter of", 8: "an eighth of"}
 _SLASHES = (
@@ -65,7 +64,7 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
 
 
 def tell_problems(
-    model_dir: Path, folder: Path, problems: Mapping[str, str], num_images: int, *, undistorted: bool
+    model_dir: Path, folder: Path, problems: Mapping[str, Problem], num_images: int, *, undistorted: bool
 ) -> None:
     """Warn of images that are left out.
 
@@ -73,8 +72,8 @@ def tell_problems(
     ----------
     model_dir, folder : Path
         The model, and where its images are looked for.
-    problems : mapping of str to str
-        What is wrong with an image, by its name, as `images.image_problem` says it.
+    problems : mapping of str to Problem
+        What is wrong with an image, by its name, as `image_problem` says it.
     num_images : int
         Of the model.
     undistorted : bool
@@ -104,25 +103,20 @@ def tell_problems(
     for name, problem in problems.items():
         instead = f", but there is {spelled[name]!r}" if name in spelled else ""
         alike.setdefault(f"{problem}{instead}", []).append(name)
-    for problem, names in alike.items():
+    for words, names in alike.items():
         for name in names if len(names) <= _MOST_TOLD else ():
-            logger.warning("%s %s; left out", folder / name, problem)
+            logger.warning("%s %s; left out", folder / name, words)
         if len(names) > _MOST_TOLD:
             first = ", ".join(names[:_MOST_TOLD])
-            logger.warning(
-                "%d images in %s, each of which %s; left out: %s, …", len(names), folder, problem, first
-            )
+            logger.warning("%d images in %s, each of which %s; left out: %s, …", len(names), folder, words, first)
     if len(problems) == num_images:
         remedy = _UNDISTORT if undistorted else _remedy(problems.values())
         raise InputError(f"None of the model's {num_images} images in {folder} is usable; {remedy}.")
 
 
-def _remedy(problems: Iterable[str]) -> str:
+def _remedy(problems: Iterable[Problem]) -> str:
     """What to do about the most frequent kind of problem."""
-    kinds = Counter(
-        WrongSize if isinstance(problem, WrongSize) else " ".join(problem.split()[:2]) for problem in problems
-    )
-    kind = kinds.most_common(1)[0][0]
+    (kind, _), *_ = Counter(map(type, problems)).most_common(1)
     return _REMEDIES.get(kind, "check --images")
 
 
@@ -213,7 +207,7 @@ def _other_folder(model_dir: Path, folder: Path, files: Sequence[str], names: Se
     return None
 
 
-def _common_size(folder: Path, problems: Mapping[str, str], undistorted: bool) -> str | None:
+def _common_size(folder: Path, problems: Mapping[str, Problem], undistorted: bool) -> str | None:
     """Say how the sizes of images differ from those of their cameras, if all in one way."""
     wrong = {name: problem for name, problem in problems.items() if isinstance(problem, WrongSize)}
     if not wrong:

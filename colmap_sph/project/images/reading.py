@@ -27,8 +27,14 @@ _BAND_ROWS = 256
 _LUMA = (0.299, 0.587, 0.114)
 
 
-class WrongSize(str):
-    """What is wrong with an image of another size (width, height) than its camera, as the end of a sentence."""
+class Problem(str):
+    """What is wrong with an image, as the end of a sentence; its classes are the kinds of problems."""
+
+    __slots__ = ()
+
+
+class WrongSize(Problem):
+    """It has another size (width, height) than its camera."""
 
     found: tuple[int, int]
     wanted: tuple[int, int]
@@ -41,7 +47,19 @@ class WrongSize(str):
         return problem
 
 
-def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -> str | None:
+class Missing(Problem):
+    """There is no regular file of its name."""
+
+
+class Damaged(Problem):
+    """It is empty, damaged, or no image that is read."""
+
+
+class Unreadable(Problem):
+    """The system does not let it be read."""
+
+
+def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -> Problem | None:
     """Say what is wrong with an image, as the end of a sentence, or return None.
 
     Parameters
@@ -55,16 +73,16 @@ def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -
 
     Returns
     -------
-    str or None
+    Problem or None
         Such as ``"is missing"``; None for a good image.
     """
     try:
         if not path.is_file():
             if is_link(path) and not path.exists():
-                return "is a link to a file that is missing"
-            return "is not a regular file" if path.exists() else "is missing"
+                return Missing("is a link to a file that is missing")
+            return Missing("is not a regular file" if path.exists() else "is missing")
         if not path.stat().st_size:
-            return "is empty"
+            return Damaged("is empty")
         header = read_header(path)
         # Before anything is decoded: a small file can hold a huge image.
         if (header.width, header.height) != (width, height):
@@ -72,9 +90,9 @@ def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -
         if decode:
             read_pixels(path)
     except OSError as error:
-        return f"cannot be read ({reason_of(error)})"
+        return Unreadable(f"cannot be read ({reason_of(error)})")
     except DamagedError as error:
-        return f"is damaged or no image ({error})"
+        return Damaged(f"is damaged or no image ({error})")
     return None
 
 

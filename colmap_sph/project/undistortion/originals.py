@@ -66,7 +66,11 @@ class Originals:
         return path if path is not None and path.is_file() else None
 
     def check_outside(self, workspace: Workspace) -> None:
-        """Raise `InputError` where the model, the images or the masks lie where a workspace is to be written."""
+        """Raise `InputError` where the model, the images or the masks lie where a workspace is to be written.
+
+        And where a new workspace would lie among the images: COLMAP takes all pictures below a folder of images
+        for originals. Where the model lies there, too, that folder is the whole project.
+        """
         root = real_path(workspace.root)
         for option, place in (("model", self.model_dir), ("images", self.image_dir), ("masks", self.mask_dir)):
             if place is not None and real_path(place).is_relative_to(root):
@@ -80,6 +84,14 @@ class Originals:
                     f"{path} is a link into the workspace {workspace.root} that is to be written; choose another "
                     "--output."
                 )
+
+        folder = real_path(self.image_dir)
+        is_among = root.is_relative_to(folder) and not real_path(self.model_dir).is_relative_to(folder)
+        if is_among and not workspace.marker_path.exists():
+            raise InputError(
+                f"The workspace {workspace.root} would lie in {self.image_dir}, where COLMAP would take its "
+                "images for originals; choose another --output."
+            )
 
     def _files(self) -> Iterator[Path]:
         """The files of model, images and masks."""
