@@ -196,7 +196,7 @@ def reconstruct(
     report : RunReport, optional
         What is known of the run so far.
     database : Path, optional
-        COLMAP's database, whose verified matches serve where the model has no tracks.
+        COLMAP's database, whose verified matches serve where the model has no or few tracks.
     expected : collection of str
         Names of images that are reported as skipped where the workspace's model does not have them.
     given : GivenModel, optional
