@@ -163,6 +163,20 @@ def test_noise_of_any_strength_is_blank_and_fine_texture_is_not():
     assert not blank_pixels(soft.astype(np.float32)).any()
 
 
+def test_an_object_before_a_white_backdrop_is_not_blank():
+    """The backdrop's noise is cut off at white, so that only the object could tell what noise there is."""
+    stone = syn.Mottled(syn.Noise(0.0042, seed=1), (0.4, 0.35, 0.3), contrast=0.22)
+    body = syn.Ellipsoid(np.array([0, 0, 0.5]), np.array([0.25, 0.25, 0.5]), stone)
+    R, t = syn.look_at((2.3, 0, 1.2), (0, 0, 0.5))
+    view = syn.render([body], syn.pinhole(520, 480, 360), R, t, 480, 360)
+    is_body = view.surface >= 0
+    picture = np.where(is_body[..., None], view.image, 250).mean(axis=2)
+    picture = np.clip(np.rint(picture + np.random.default_rng(0).normal(0, 1.5, picture.shape)), 0, 255)
+    blank = blank_pixels(picture.astype(np.uint8))
+    assert blank[is_body].mean() < 0.02
+    assert blank[~is_body].mean() > 0.95
+
+
 # ---- faint places ------------------------------------------------------------------------------------------
 
 

@@ -127,8 +127,8 @@ def test_one_panorama_alone_is_told():
 
 
 def test_shared_points_of_all_views_together_count():
-    """Twelve points, two before each view of a panorama: no two views share more than these few."""
-    points = 10 * np.concatenate([np.eye(3), -np.eye(3), np.eye(3) + 0.03, -np.eye(3) - 0.03])
+    """Thirty points, five before each view of a panorama: no two views share more than these few."""
+    points = 10 * np.concatenate([sign * (np.eye(3) + 0.02 * k) for k in range(5) for sign in (1, -1)])
     views = [view for k in range(2) for view in views_of(f"p{k}", (0.8 * k, 0, 0), PANORAMA, half=44)]
     scene = scene_of(views, points)
     most = max(
@@ -136,10 +136,10 @@ def test_shared_points_of_all_views_together_count():
         for a in scene.photographs[0].views
         for b in scene.photographs[1].views
     )
-    assert most == 2
-    assert len(select_pairs(scene, PairOptions(min_shared_points=12)).unique_pairs()) == 1
+    assert most == 5
+    assert len(select_pairs(scene, PairOptions(min_shared_points=30)).unique_pairs()) == 1
     with pytest.raises(NoResultError):
-        select_pairs(scene, PairOptions(min_shared_points=13))
+        select_pairs(scene, PairOptions(min_shared_points=31))
 
 
 def test_lists_name_views_and_mean_photographs():

@@ -338,6 +338,23 @@ def test_frusta_of_a_regular_strip(caplog: pytest.LogCaptureFixture) -> None:
     assert set(partners(selection, "05.jpg")) == {"03.jpg", "04.jpg", "06.jpg", "07.jpg"}
 
 
+def test_few_tracks_do_not_hide_who_overlaps() -> None:
+    """A strip with 60 % overlap and a dozen points to a photograph, of which neighbours share no ten."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-4, -3, 10], [24, 3, 10.1], (52, 3))
+    points = points[np.argsort(points[:, 0])]
+    views = [view_at([4 * i, 0, 0], f"{i}.jpg", range(8 * i, 8 * i + 12)) for i in range(6)]
+    strip = Scene(tuple(views), points)
+    selection = select_pairs(strip, PairOptions())
+    assert selection.source == "frusta" and selection.without_partner == ()
+    neighbours = {(f"{i}.jpg", f"{i + 1}.jpg") for i in range(5)}
+    assert neighbours <= set(selection.unique_pairs())
+    assert set(overlapping_views(strip, 2)["0.jpg"]) == {"1.jpg", "2.jpg"}
+    # Verified matches tell more.
+    matched = select_pairs(strip, PairOptions(), matches=dict.fromkeys(neighbours, 50))
+    assert matched.source == "database" and set(matched.unique_pairs()) == neighbours
+
+
 def test_real_tracks_agree_with_colmap(data_dir: Path) -> None:
     root = data_dir / "penta"
     scene, model = read_scene(root / "sparse" / "0"), pycolmap.Reconstruction(root / "sparse" / "0")

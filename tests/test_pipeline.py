@@ -298,10 +298,11 @@ def test_only_a_forward_pair_and_frame(tmp_path: Path) -> None:
     assert colmap_sph.run(model, options=FEW_PAIRS).images == 2
 
 
-def test_model_without_tracks(project: Path, block: DemoBlock) -> None:
-    """Poses alone: pairs by viewing frusta, and a cloud all the same."""
+@pytest.mark.parametrize("kept", [0, 20])
+def test_model_with_next_to_no_tracks(project: Path, block: DemoBlock, kept: int) -> None:
+    """Poses, and a few points: pairs by viewing frusta, and a cloud all the same."""
     model = pycolmap.Reconstruction(project / "sparse/0")
-    for point_id in list(model.points3D):
+    for point_id in sorted(model.points3D)[kept:]:
         model.delete_point3D(point_id)
     model.write(project / "sparse/0")
     report = colmap_sph.run(project / "sparse/0", options=FEW_PAIRS)

@@ -35,10 +35,9 @@ _NOISE_LEVEL = 1
 _QUIETEST = 5
 _LEAST_NOISE = 0.5
 _USUAL_NOISE = 1.5
-# In poor light they make more, up to this. That is no texture where it falls from full to half size by as much as
-# this: noise of single pixels falls to .5, texture stays at about 1.
+# In poor light they make more, up to this. Its variance falls to a quarter from full to half size, while that of
+# texture stays or grows: so noise has no more variance at half size than was lost on the way there.
 _MOST_NOISE = 5.0
-_FALL_OF_NOISE = 0.7
 # Local noise is the least of so many by so many pixels of the coarsest scale: some of them may hold an edge.
 _LOCAL_SIDE = 5
 # Windows with more than a few pixels of so little or so much light are left out of that: their noise is cut off.
@@ -267,8 +266,8 @@ def _noise(scales: list[Float]) -> tuple[float, Float]:
     noise = max(math.sqrt(quietest), _LEAST_NOISE)
     if noise > _USUAL_NOISE:
         there = lit & (variance[some] <= quietest)
-        full = math.sqrt(np.median(_variances(scales[0], 2)[some][there]))
-        noise = min(noise, max(_FALL_OF_NOISE * full, _USUAL_NOISE), _MOST_NOISE)
+        lost = float(np.median(_variances(scales[0], 2)[some][there])) - quietest
+        noise = min(noise, max(math.sqrt(max(lost, 0.0)), _USUAL_NOISE), _MOST_NOISE)
     mean = cv2.resize(variance, scales[-1].shape[::-1], interpolation=cv2.INTER_AREA)
     local = np.clip(np.sqrt(cv2.erode(mean, np.ones((_LOCAL_SIDE, _LOCAL_SIDE), np.uint8))), _LEAST_NOISE, noise)
     local[cv2.blur(mean, (_SIDE, _SIDE)) > (_MARGIN * noise) ** 2] = 0

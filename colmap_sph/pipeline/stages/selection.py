@@ -10,6 +10,7 @@ from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.pair_lists import read_patch_match_cfg
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
+from colmap_sph.stereo.partners.covisibility import has_enough_tracks
 from colmap_sph.stereo.partners.pairs import PairSelection, report_selection, select_pairs
 
 
@@ -46,7 +47,7 @@ def choose_pairs(
     pair_list = pair_list or _users_list(workspace)
     among = scene.index_of if options.region else None  # images elsewhere are named in vain
     written = None if pair_list is None else read_patch_match_cfg(pair_list, among)
-    matches = None if database is None or scene.has_tracks else read_verified_matches(database)
+    matches = None if database is None or has_enough_tracks(scene) else read_verified_matches(database)
     path = None if workspace is None or not scene_key else workspace.known_path("selection")
     key = "" if path is None else digest(scene_key, options.pairs, written, matches)
     known = None if path is None else read_selection(path, key)

@@ -1,7 +1,7 @@
 """Scene → what its photographs have in common: shared points and their parallax, as a graph of candidates.
 
-Candidates share sparse points. Without tracks the verified matches of COLMAP's database stand in for these, and
-without matches the overlap of the viewing frusta.
+Candidates share sparse points. Without tracks, or with few, the verified matches of COLMAP's database stand in for
+these, and without matches the overlap of the viewing frusta.
 """
 
 import logging
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_sph.scene import Photograph, Scene
-from colmap_sph.stereo.partners.frusta import points_in_view
+from colmap_sph.stereo.partners.frusta import observe_frusta, observe_points, points_in_view
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles, worth_of
 
 logger = logging.getLogger(__name__)
@@ -25,6 +25,10 @@ CovisibilitySource = Literal["tracks", "database", "frusta"]
 _MAX_ANGLE_POINTS = 512
 _MAX_WORTH_POINTS = 512
 _ANGLE_PERCENTILE = 75
+# Photographs that observe fewer points than this (in the median) share hardly any with others that show half of
+# the same. Where views have not even so many points in their image, these do not tell who overlaps whom.
+_ENOUGH_POINTS = 25
+_FEW_POINTS = 8
 
 
 class Covisibility:
@@ -141,10 +145,16 @@ def _percentiles(values: NDArray[np.float64], group: NDArray[np.int64], groups: 
     return result
 
 
+def has_enough_tracks(scene: Scene) -> bool:
+    """Whether photographs observe so many points that what two of them share tells how far they overlap."""
+    counts = [sum(len(view.point_indices) for view in photograph.views) for photograph in scene.photographs]
+    return bool(counts) and float(np.median(counts)) >= _ENOUGH_POINTS
+
+
 def find_covisibility(
     scene: Scene, min_shared_points: int, matches: Mapping[tuple[str, str], int] | None
 ) -> Covisibility:
-    """Find what photographs have in common: tracks, else verified matches, else samples of the frusta.
+    """Find what photographs have in common: tracks, else verified matches, else what the frusta hold.
 
     Parameters
     ----------
@@ -152,15 +162,19 @@ def find_covisibility(
     min_shared_points : int
         Least number of points, or matches, that two photographs must share to be candidates of each other.
     matches : mapping or None
-        Names of two images → number of their verified matches; serves where the model has no tracks.
+        Names of two images → number of their verified matches; serves where the model has no or few tracks.
 
     Returns
     -------
     Covisibility
     """
-    points, of_views, has_tracks = points_in_view(scene)
     photographs = scene.photographs
-    observed = [_together([of_views[scene.index_of[view.name]] for view in each.views]) for each in photographs]
+    points, of_views, has_tracks = points_in_view(scene)
+    if has_tracks and not has_enough_tracks(scene):
+        has_tracks = False
+        points, of_views = _likely_in_view(scene)
+    index_of = scene.index_of
+    observed = [_together([of_views[index_of[view.name]] for view in each.views]) for each in photographs]
     if has_tracks:
         weights = _shared_points(observed, len(points), min_shared_points)
         return Covisibility(photographs, "tracks", weights, points, observed)
@@ -170,6 +184,14 @@ def find_covisibility(
             return Covisibility(photographs, "database", weights, points, observed)
         logger.warning("the database has no verified matches of the model's images")
     return Covisibility(photographs, "frusta", _shared_points(observed, len(points), 1), points, observed)
+
+
+def _likely_in_view(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """What each view has in its image: of the scene's points or, where these are too few, of the frusta's."""
+    points = scene.points[np.isfinite(scene.points).all(axis=1)]
+    in_view = observe_points(scene, points)
+    are_few = np.median([len(rows) for rows in in_view]) < _FEW_POINTS
+    return observe_frusta(scene) if are_few else (points, in_view)
 
 
 def _together(observed: list[NDArray[np.int64]]) -> NDArray[np.int64]:

@@ -1,8 +1,8 @@
 """Scene → for every image the partners it is matched with, best first.
 
 Candidates share sparse points (3D points both images observe), seen under some parallax; the best of them together
-see all of the image. Without tracks the verified matches of COLMAP's database stand in for the shared points, and
-without these the overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
+see all of the image. Without tracks, or with few, the verified matches of COLMAP's database stand in for these
+points, and without matches the overlap of the viewing frusta. A ``patch-match.cfg`` that the user wrote is obeyed.
 """
 
 import itertools
@@ -133,7 +133,7 @@ def select_pairs(
         ``patch-match.cfg`` as `read_patch_match_cfg` returns it. Only its reference images are processed;
         their lists are obeyed without any gate; ``__auto__`` means the choice made here.
     matches : mapping, optional
-        Names of two images → number of their verified matches; serves where the model has no tracks.
+        Names of two images → number of their verified matches; serves where the model has no or few tracks.
 
     Returns
     -------
@@ -179,7 +179,7 @@ def select_pairs(
 class Overlap:
     """Tells which views overlap each view of a scene; may be used by several threads.
 
-    Where the model has no tracks, projected points or the frusta say what overlaps.
+    Where the model has no or few tracks, projected points or the frusta say what overlaps.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -291,8 +291,8 @@ def report_selection(selection: PairSelection, options: PairOptions) -> None:
     """Log what was chosen; `NoResultError` where no image has a partner."""
     words = {
         "tracks": "the sparse points that images share",
-        "database": "the verified matches in the database, as the model has no tracks",
-        "frusta": "the overlap of the viewing frusta, as the model has no tracks",
+        "database": "the verified matches in the database, as the model has no or few tracks",
+        "frusta": "the overlap of the viewing frusta, as the model has no or few tracks",
         "patch-match.cfg": "patch-match.cfg",
     }
     num_unique = len(selection.unique_pairs())
