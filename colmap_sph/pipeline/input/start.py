@@ -41,7 +41,7 @@ class Request:
     report : RunReport
         What is known of the run so far.
     database : Path or None
-        COLMAP's database, whose verified matches serve where the model has no tracks.
+        COLMAP's database, whose verified matches serve where the model has no or few tracks.
     expected : collection of str
         Names of images that are reported as skipped where the workspace's model does not have them.
     given : GivenModel or None
