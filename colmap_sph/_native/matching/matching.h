@@ -54,8 +54,7 @@ typedef struct {
     const uint64_t *grey;
 } census_image;
 
-/* Bit set where the neighbour is darker by more than CENSUS_MARGIN. Rows of `census` begin `stride` words apart.
- */
+/* Bit set where the neighbour is darker by more than CENSUS_MARGIN. Rows begin `stride` words apart. */
 typedef void census_fn(census_image image, ptrdiff_t stride, uint64_t *census);
 
 /* GREY_CODES of them; steps in 1/64 grey value, at least 1. */
