@@ -26,16 +26,18 @@ def census(
     padded: NDArray[np.int16],
     valid: NDArray[np.uint8],
     fine: bool,
+    grey_step: int,
     first: int,
     census: NDArray[np.uint64],
     /,
 ) -> None:
-    """Census words, weighed if fine, from column `first` on; bit 63 where a pixel is not valid.
+    """Census words from column `first` on, with grey values in steps if not 0; bit 63 where a pixel is not valid.
 
     backend : str
     padded : (H + 6, W + 8) int16
     valid : (H, W) uint8
     fine : bool
+    grey_step : int
     first : int
     census : (H, TARGET_W) uint64, written
     """

@@ -180,7 +180,7 @@ def census_pair(scene: Scene) -> tuple[NDArray[np.uint64], NDArray[np.uint64]]:
     """Census of both images, which are valid everywhere."""
     left, right = np.empty(scene.shape, np.uint64), np.empty(scene.shape, np.uint64)
     for image, census in ((scene.left, left), (scene.right, right)):
-        _native.census("scalar", with_border(image), np.full(scene.shape, 255, np.uint8), False, 0, census)
+        _native.census("scalar", with_border(image), np.full(scene.shape, 255, np.uint8), False, 0, 0, census)
     return left, right
 
 
@@ -285,7 +285,7 @@ def image_kernels(scene: Scene) -> list[Kernel]:
         Kernel("upsample_offsets", upsample_offsets, [unwarped], pixels),
         Kernel("search_windows", search_windows, [unwarped], pixels),
         Kernel(
-            "census", lambda backend: _native.census(backend, padded, valid, False, 0, census), [census], pixels
+            "census", lambda backend: _native.census(backend, padded, valid, False, 0, 0, census), [census], pixels
         ),
         Kernel(
             "fit_offsets",

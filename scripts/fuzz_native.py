@@ -60,7 +60,15 @@ def census(rng: Random) -> Arguments:
     padded = filled(rng, (h + 6, w + 8), np.int16)
     first, spare = rng.integers(0, 9, 2).tolist()
     words = np.zeros((h, first + w + spare), np.uint64)
-    return [backend(rng), padded, filled(rng, (h, w), np.uint8), bool(rng.integers(2)), first, words]
+    return [
+        backend(rng),
+        padded,
+        filled(rng, (h, w), np.uint8),
+        bool(rng.integers(2)),
+        int(rng.integers(0, 9)),
+        first,
+        words,
+    ]
 
 
 def matching_cost(rng: Random) -> Arguments:

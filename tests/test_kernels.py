@@ -72,9 +72,9 @@ def p2_table(rng, p1, least, most):
     return table
 
 
-def run_census(backend, padded, valid, *, fine=False):
+def run_census(backend, padded, valid, *, fine=False, grey_step=0):
     census = np.full(valid.shape, 7, dtype=np.uint64)
-    _native.census(backend, padded, valid, fine, 0, census)
+    _native.census(backend, padded, valid, fine, grey_step, 0, census)
     return census
 
 
@@ -173,29 +173,47 @@ def test_census_goes_into_some_columns_of_wider_rows(backend, size, before, afte
     rows = np.full((size[0], before + size[1] + after), 7, dtype=np.uint64)
     expected = rows.copy()
     expected[:, before : before + size[1]] = oracle.census(padded, valid)
-    _native.census(backend, padded, valid, False, before, rows)
+    _native.census(backend, padded, valid, False, 0, before, rows)
     np.testing.assert_array_equal(rows, expected)
 
 
 @every_backend
 @property_test
-@given(size=sizes, invalid=shares, seed=seeds)
-def test_fine_census_counts_near_neighbours_twice(backend, size, invalid, seed):
-    """Of what differs: neighbours within two pixels twice, others within the root of 10 once; content always."""
+@given(
+    size=sizes, fine=st.booleans(), step=st.sampled_from([0, 1, 64, 150, 5000, 70000]), invalid=shares, seed=seeds
+)
+def test_weighed_census_counts_near_neighbours_and_grey_steps(backend, size, fine, step, invalid, seed):
+    """What differs: of fine images the neighbours within 5 x 5 twice; with grey values those within 7 x 7, and
+    steps between grey values, of which the 28th is the first again; content always."""
     rng = np.random.default_rng(seed)
-    images = [rng.integers(0, 200, (size[0] + 6, size[1] + 8)).astype(np.int16) for _ in range(2)]
+    reach = rng.choice([100, 4000, 32768])
+    shape = (size[0] + 6, size[1] + 8)
+    images = [rng.integers(-reach, reach, shape).astype(np.int16) for _ in range(2)]
     contents = [(rng.random(size) >= invalid).astype(np.uint8) for _ in range(2)]
     first, second = (oracle.census(*each) for each in zip(images, contents, strict=True))
-    weighed = [run_census(backend, *each, fine=True) for each in zip(images, contents, strict=True)]
-    differing = first ^ second
+    weighed = [
+        run_census(backend, *each, fine=fine, grey_step=step) for each in zip(images, contents, strict=True)
+    ]
     neighbours = [(y, x) for y in range(-3, 4) for x in range(-4, 5) if (y, x) != (0, 0)]
-    times = [2 if max(abs(y), abs(x)) <= 2 else int(y * y + x * x <= 10) for y, x in neighbours]
-    assert sum(times) == 60
+    if fine:
+        times = [2 * (max(abs(y), abs(x)) <= 2) for y, x in neighbours]
+    else:
+        times = [int(abs(x) <= 3 or step == 0) for y, x in neighbours]
+    assert sum(times) == (62 if step == 0 and not fine else 48)
     differing = first ^ second
-    expected = differing >> np.uint64(63)
+    expected = (differing >> np.uint64(63)).astype(int)
     for bit, number in enumerate(times):
-        expected += np.uint64(number) * ((differing >> np.uint64(bit)) & np.uint64(1))
-    np.testing.assert_array_equal(np.bitwise_count(weighed[0] ^ weighed[1]), expected)
+        expected += number * ((differing >> np.uint64(bit)) & np.uint64(1)).astype(int)
+    if step > 0:
+        # Values are known to a quarter of a grey value.
+        levels = [((image[3:-3, 4:-4].astype(int) + 32768) // 16 * 16 + 8) // step for image in images]
+        apart = (levels[0] - levels[1]) % 28
+        expected += np.where((contents[0] & contents[1]) > 0, np.minimum(apart, 28 - apart), 0)
+    found = np.bitwise_count(weighed[0] ^ weighed[1])
+    both = (contents[0] & contents[1]) > 0
+    np.testing.assert_array_equal(found[both], expected[both])
+    for words, content in zip(weighed, contents, strict=True):
+        np.testing.assert_array_equal(words >> np.uint64(63), 1 - content)
 
 
 # ---- matching cost -----------------------------------------------------------------------------------------

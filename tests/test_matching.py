@@ -26,7 +26,7 @@ from colmap_sph.stereo.matching import (
 )
 from colmap_sph.stereo.rectification import RectificationOptions, rectify_pair
 from colmap_sph.stereo.resampling import resample
-from colmap_sph.stereo.search import offsets
+from colmap_sph.stereo.search import brightness, offsets
 
 SIZE = (240, 180)
 FOCAL = 300.0
@@ -194,6 +194,25 @@ def test_edges_of_fine_images_are_wider_by_less():
         nearer.append((error > 1).mean())
     assert wrong[1] < min(0.9 * wrong[0], 0.1)
     assert nearer[1] < min(0.9 * nearer[0], 0.07)
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_grey_values_tell_where_surfaces_end(monkeypatch, fine):
+    """Beside edges, more is right and less is wrong than with steps so large that grey values tell nothing."""
+    matched = matched_scene("convergent")
+    left, right = matched.images
+    low, high = matched.pair.min_disparity, matched.pair.max_disparity
+    step = ndimage.maximum_filter(matched.truth, 9) - ndimage.minimum_filter(matched.truth, 9)
+    rights, wrongs = [], []
+    for least_step in (brightness._LEAST_STEP, 1000.0):
+        monkeypatch.setattr(brightness, "_LEAST_STEP", least_step)
+        options = replace(OPTIONS, max_coarsest_disparities=32)  # such small images have no other level else
+        disparity = match_pair(left, right, low, high, options, fine=fine)
+        error = np.abs(disparity - matched.truth)[matched.seen & (step > 4)]
+        rights.append((error <= 1).mean())
+        wrongs.append((error > 1).mean())
+    assert rights[0] > rights[1] + 0.01
+    assert wrongs[0] < 0.9 * wrongs[1]
 
 
 def test_what_a_step_hides_is_left_out():

@@ -29,6 +29,7 @@ def arguments(function):
             "padded": np.zeros((H + 6, W + 8), np.int16),
             "valid": np.ones((H, W), u8),
             "fine": True,
+            "grey_step": 100,
             "first": 3,
             "out census": np.zeros((H, W + 5), np.uint64),
         },
@@ -818,6 +819,11 @@ def test_census_must_fit_into_the_rows(change):
         call("census", {**arguments("census"), **change})
 
 
+def test_steps_of_grey_values_must_not_be_negative():
+    with pytest.raises(ValueError, match="negative"):
+        call("census", {**arguments("census"), "grey_step": -1})
+
+
 def test_columns_must_have_room_for_the_warped_image():
     call("warp", {**arguments("warp"), "out columns": np.zeros((H, TARGET + 1), np.int32)})
     with pytest.raises(ValueError, match="room"):
@@ -1067,7 +1073,7 @@ def test_empty_images_are_no_work(backend, size, target_width):
     target = np.zeros((size[0], target_width), np.uint64)
     shown = np.zeros((size[0], target_width), np.int32), 9
     volume, sums = np.zeros((*size, 32), np.uint8), np.zeros((*size, 32), np.uint8)
-    _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.int16), image, True, 0, words)
+    _native.census(backend, np.zeros((size[0] + 6, size[1] + 8), np.int16), image, True, 100, 0, words)
     _native.matching_cost(backend, words, target, base, volume)
     _native.aggregation(backend, volume, base, image, 10, np.full(256, 60, np.uint8), 2, volume.copy(), sums)
     offset = np.zeros(size, np.int32)

@@ -15,6 +15,7 @@ from colmap_sph.stereo.resampling import half_size
 
 CENSUS_INVALID = np.uint64(1 << 63)
 """Census of a pixel without image content."""
+_STEPS = 64  # of a grey value, in which the kernels count
 _BORDER = (3, 4)  # rows at the top and at the bottom, columns at either side
 # Unsharp masking, which gives back some of what lenses and resampling took away: so much of the difference from
 # the binomial mean of 3 x 3 pixels is added.
@@ -47,19 +48,40 @@ def pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
     return images
 
 
-def census(image: RectifiedImage, *, fine: bool = False) -> NDArray[np.uint64]:
-    """(H, W) uint64: a bit for each neighbour, set where it is darker, and `CENSUS_INVALID` without content.
+@dataclass(frozen=True)
+class Compared:
+    """What of two windows is compared.
 
-    Of a `fine` image, neighbours within 5 x 5 pixels have two bits, and distant ones none.
+    Attributes
+    ----------
+    fine : bool
+        Neighbours within 5 x 5 pixels have two bits, and others none.
+    grey_step : float
+        Not only neighbours: the pixels' own grey values, too, a bit for each step between them, up to 14, in place
+        of the neighbours in the outermost columns. 0: neighbours alone.
     """
+
+    fine: bool = False
+    grey_step: float = 0.0
+
+
+NEIGHBOURS = Compared()
+"""A bit for each neighbour, whatever the brightness."""
+
+
+def census(image: RectifiedImage, compared: Compared = NEIGHBOURS) -> NDArray[np.uint64]:
+    """(H, W) uint64: a bit for each neighbour, set where it is darker, and `CENSUS_INVALID` without content."""
     words = np.empty(image.image.shape, dtype=np.uint64)
-    put_census(image, words, fine=fine)
+    put_census(image, words, compared=compared)
     return words
 
 
-def put_census(image: RectifiedImage, words: NDArray[np.uint64], first: int = 0, *, fine: bool = False) -> None:
+def put_census(
+    image: RectifiedImage, words: NDArray[np.uint64], first: int = 0, compared: Compared = NEIGHBOURS
+) -> None:
     """Set `words`, from their column `first` on, to the census of an image; see `census`."""
     height, width = image.image.shape
     padded = np.empty((height + 2 * _BORDER[0], width + 2 * _BORDER[1]), dtype=np.int16)
     _native.sharpen(backend(), np.ascontiguousarray(image.image), _SHARPENING, padded)
-    _native.census(backend(), padded, np.ascontiguousarray(image.valid), fine, first, words)
+    step = round(compared.grey_step * _STEPS)
+    _native.census(backend(), padded, np.ascontiguousarray(image.valid), compared.fine, step, first, words)

@@ -1,8 +1,9 @@
 """Rectified pair → disparity map: hierarchical semi-global matching.
 
-Census (9 × 7) of the sharpened images, Hamming cost, aggregation along 8 paths (Hirschmüller 2008), comparison
-of the matches from left and from right, sub-pixel fit without pixel locking, and removal of small segments, on an
-image pyramid, each level about what the one above it predicts (Rothermel et al. 2012, "tSGM"; see `prediction`).
+Census (9 × 7) and grey values of the sharpened images, Hamming cost, aggregation along 8 paths (Hirschmüller
+2008), comparison of the matches from left and from right, sub-pixel fit without pixel locking, and removal of
+small segments, on an image pyramid, each level about what the one above it predicts (Rothermel et al. 2012,
+"tSGM"; see `prediction`).
 
 This module and `prediction` are the only callers of the matching kernels. Their convention is an *offset*, target
 column minus reference column; with the left image as reference it is minus the disparity.
@@ -16,8 +17,9 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
-from colmap_sph.stereo.census import RectifiedImage, census, pyramid
+from colmap_sph.stereo.census import Compared, RectifiedImage, census, pyramid
 from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.search.brightness import equally_bright
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
 from colmap_sph.stereo.search.prediction import (
     Prediction,
@@ -236,9 +238,11 @@ def match_pair(
         unseeded: Matches | None = None
         if offset is None and level > 0 and seeds is not None and len(seeds):
             whole_range = from_seeds(None, shape, level, low, high)
-            unseeded = _match_level(lefts[-1], rights[-1], whole_range, options, scratch, finest=False, fine=False)
+            unseeded = _match_level(
+                lefts[-1], rights[-1], whole_range, None, options, scratch, finest=False, fine=False
+            )
         matches = _match_level(
-            lefts.pop(), rights.pop(), prediction, options, scratch, finest=level == 0, fine=fine
+            lefts.pop(), rights.pop(), prediction, offset, options, scratch, finest=level == 0, fine=fine
         )
         offset = matches.offset if unseeded is None else matches.or_better(unseeded)
         del matches, unseeded
@@ -279,6 +283,7 @@ def _match_level(
     left: RectifiedImage,
     right: RectifiedImage,
     prediction: Prediction,
+    coarser: NDArray[np.int32] | None,
     options: MatchingOptions,
     scratch: Scratch,
     *,
@@ -287,9 +292,13 @@ def _match_level(
 ) -> Matches:
     """Matches of one level; those of the finest with a sub-pixel fit to the raw costs."""
     kernels = backend()
-    target = make_target(right, prediction, scratch.targets, fine=fine and finest)
-    left_census = census(left, fine=fine and finest)
     image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
+    compared = Compared(fine and finest)
+    if coarser is not None:
+        left, grey_step = equally_bright(left, right, coarser)
+        compared = Compared(fine and finest, grey_step)
+    target = make_target(right, prediction, scratch.targets, compared)
+    left_census = census(left, compared)
     del left, right
     offset = np.empty(image.shape, dtype=np.int32)
     _native.match(

@@ -60,6 +60,6 @@ static inline void census_32_pixels(const int16_t *window, ptrdiff_t stride, uin
     store_words(bytes, words);
 }
 
-void census_avx2(census_image image, int fine, ptrdiff_t stride, uint64_t *census) {
-    census_in_blocks(census_32_pixels, LANES, image, fine, stride, census);
+void census_avx2(census_image image, ptrdiff_t stride, uint64_t *census) {
+    census_in_blocks(census_32_pixels, LANES, image, stride, census);
 }

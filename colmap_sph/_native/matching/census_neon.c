@@ -33,6 +33,6 @@ static inline void census_8_pixels(const int16_t *window, ptrdiff_t stride, uint
     vst4q_u16((uint16_t *)(void *)words, parts);
 }
 
-void census_neon(census_image image, int fine, ptrdiff_t stride, uint64_t *census) {
-    census_in_blocks(census_8_pixels, LANES, image, fine, stride, census);
+void census_neon(census_image image, ptrdiff_t stride, uint64_t *census) {
+    census_in_blocks(census_8_pixels, LANES, image, stride, census);
 }

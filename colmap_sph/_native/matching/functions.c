@@ -65,25 +65,33 @@ static match_size warped_size_of(const sizes *size, int source_width) {
     X(IN, int16, padded, H + 6, W + 8) \
     X(IN, uint8, valid, H, W) \
     X(VALUE, flag, fine) \
+    X(VALUE, int, grey_step) \
     X(VALUE, ptrdiff, first) \
     X(OUT, uint64, census, H, TARGET_W)
 ARGUMENTS(census, CENSUS);
 
 static int check_census(const void *arguments) {
     const census_arguments *a = arguments;
-    return check(a->first >= 0 && a->first <= a->size.TARGET_W - a->size.W,
+    return check(a->grey_step >= 0, "the step must not be negative") &&
+           check(a->first >= 0 && a->first <= a->size.TARGET_W - a->size.W,
                  "the words must fit into the rows from the first column on");
 }
 
 static int run_census(void *arguments) {
     const census_arguments *a = arguments;
-    const census_image image = {a->padded, a->valid, a->size.H, a->size.W};
-    a->backend->census(image, a->fine, a->size.TARGET_W, a->census + a->first);
+    uint64_t codes[GREY_CODES];
+    if (a->grey_step > 0) {
+        make_grey_codes(a->grey_step, codes);
+    }
+    const uint64_t *grey = a->grey_step > 0 ? codes : NULL;
+    const census_image image = {a->padded, a->valid, a->size.H, a->size.W, a->fine, grey};
+    a->backend->census(image, a->size.TARGET_W, a->census + a->first);
     return 0;
 }
 
-FUNCTION(census, CENSUS, check_census,
-         "Census words, weighed if fine, from column `first` on; bit 63 where a pixel is not valid.");
+FUNCTION(
+    census, CENSUS, check_census,
+    "Census words from column `first` on, with grey values in steps if not 0; bit 63 where a pixel is not valid.");
 
 #define MATCHING_COST(X) \
     X(VALUE, backend, backend) \

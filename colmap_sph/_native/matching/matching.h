@@ -38,16 +38,27 @@ typedef struct {
     ptrdiff_t source_width;
 } match_size;
 
-/* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}. */
+/* Grey values, counted in steps, have a code of GREY_BITS: of two values it differs in as many bits as there are
+ * steps between them (Johnson's counter), up to GREY_BITS, and beyond in fewer again. Codes are looked up by every
+ * GREY_CODE_STEP of the values that an image may have. */
+enum { GREY_BITS = 14, GREY_CODE_STEP = 16, GREY_CODES = (UINT16_MAX + 1) / GREY_CODE_STEP };
+
+/* `padded` is the image with a border of CENSUS_RADIUS_{Y,X}. Of a `fine` one, neighbours within 5 x 5 pixels have
+ * two bits, and others none. With `grey`, codes of make_grey_codes, the pixel's own grey value takes the places of
+ * the neighbours in the outermost columns. */
 typedef struct {
     const int16_t *padded;
     const uint8_t *valid;
     ptrdiff_t height, width;
+    int fine;
+    const uint64_t *grey;
 } census_image;
 
-/* Bit set where the neighbour is darker by more than CENSUS_MARGIN; words of a `fine` image are weighed, see
- * weighed_census.h. Rows of `census` begin `stride` words apart. */
-typedef void census_fn(census_image image, int fine, ptrdiff_t stride, uint64_t *census);
+/* Bit set where the neighbour is darker by more than CENSUS_MARGIN. Rows begin `stride` words apart. */
+typedef void census_fn(census_image image, ptrdiff_t stride, uint64_t *census);
+
+/* GREY_CODES of them; steps in 1/64 grey value, at least 1. */
+void make_grey_codes(int step, uint64_t *codes);
 
 typedef int cost_fn(const uint64_t *reference, const uint64_t *target, const int32_t *base, match_size size,
                     uint8_t *cost);

@@ -1,18 +1,26 @@
-/* Census words in which the neighbours within 5 x 5 pixels count twice, the 12 next ones once and others not: 60
- * bits. */
+/* What becomes of census words once all neighbours are compared. */
 #ifndef COLMAP_SPH_WEIGHED_CENSUS_H
 #define COLMAP_SPH_WEIGHED_CENSUS_H
 
 #include "matching/matching.h"
 
-/* Bits of a word that stay: the neighbours within 5 x 5 pixels, and those of the others that are nearest. */
-#define KEPT (UINT64_C(0x0707c7f3f3f8f838) | CENSUS_INVALID)
+/* Bits of the neighbours within 5 x 5 pixels, and of those in the window's outermost columns. */
+#define WITHIN_5_X_5 UINT64_C(0x7c3e1e1f0f800)
+#define OUTERMOST UINT64_C(0x2030180c0c060301)
 
-/* Second bits of the 5 x 5 stand in places of those that are left out. */
-ALWAYS_INLINE uint64_t weighed_census(uint64_t word) {
-    return (word & KEPT) | (word & UINT64_C(0x7018180e0f800)) >> 5 | (word & UINT64_C(0xc26000000000)) << 14 |
-           (word & UINT64_C(0x60000000)) << 24 | (word & UINT64_C(0x100000)) >> 18 |
-           (word & UINT64_C(0x1000000)) >> 23;
+/* Neighbours within 5 x 5 pixels count twice, others not: second bits stand in the places of those around them,
+ * within 7 x 7. */
+ALWAYS_INLINE uint64_t near_twice(uint64_t word) {
+    return (word & WITHIN_5_X_5) | (word & UINT64_C(0xc24120909000)) << 13 |
+           (word & UINT64_C(0x8041600000)) >> 20 | (word & UINT64_C(0x7000000000000)) << 8 |
+           (word & UINT64_C(0x6800)) >> 8 | (word & UINT64_C(0x10080000000)) >> 24 |
+           (word & UINT64_C(0x2000000000)) << 18;
+}
+
+/* The word of a pixel with content; see census_image. */
+ALWAYS_INLINE uint64_t weighed_census(uint64_t word, int16_t centre, int fine, const uint64_t *grey) {
+    const uint64_t near = fine ? near_twice(word) : word;
+    return grey ? (near & ~OUTERMOST) | grey[(centre - INT16_MIN) / GREY_CODE_STEP] : near;
 }
 
 #endif

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
-from colmap_sph.stereo.census import RectifiedImage, census, put_census
+from colmap_sph.stereo.census import NEIGHBOURS, Compared, RectifiedImage, census, put_census
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL
 from colmap_sph.stereo.search.prediction import Prediction
@@ -136,7 +136,7 @@ class Matches:
 
 
 def make_target(
-    right: RectifiedImage, prediction: Prediction, room: TargetRoom | None = None, *, fine: bool = False
+    right: RectifiedImage, prediction: Prediction, room: TargetRoom | None = None, compared: Compared = NEIGHBOURS
 ) -> Target:
     """Warp a level's right image as predicted.
 
@@ -148,7 +148,7 @@ def make_target(
         Of the left image's (H, W) pixels.
     room : TargetRoom, optional
         What the target may be in until the next one is made.
-    fine : bool
+    compared : Compared
         As of `census`.
 
     Returns
@@ -159,20 +159,20 @@ def make_target(
     if not prediction.warps:
         own_columns = np.broadcast_to(np.arange(right_width, dtype=np.int32), (height, right_width))
         columns = np.ascontiguousarray(own_columns)
-        return Target(census(right, fine=fine), columns, prediction.base, right_width, 0, prediction)
+        return Target(census(right, compared), columns, prediction.base, right_width, 0, prediction)
     warped_width = prediction.offset.shape[1] + 2 * prediction.margin
     if prediction.torn is None:
         words, columns = TargetRoom().arrays(height, warped_width)
-        put_census(_warped(right, prediction, columns), words, fine=fine)
+        put_census(_warped(right, prediction, columns), words, compared=compared)
         base = prediction.base + np.int32(prediction.margin)
         return Target(words, columns, base, right_width, warped_width, prediction)
     # Windows of torn pixels that begin left of the right image must not reach what lies before it here.
     gap = prediction.depth
     as_it_is = warped_width + gap
     words, columns = (room or TargetRoom()).arrays(height, as_it_is + right_width)
-    put_census(_warped(right, prediction, columns), words, fine=fine)
+    put_census(_warped(right, prediction, columns), words, compared=compared)
     _native.join_targets(warped_width, right_width, words, columns)
-    put_census(right, words, as_it_is, fine=fine)
+    put_census(right, words, as_it_is, compared)
     base = np.empty_like(prediction.base)
     _native.target_bases(prediction.base, prediction.torn_bytes, prediction.margin, as_it_is, gap, base)
     return Target(words, columns, base, right_width, as_it_is, prediction)
