@@ -237,12 +237,14 @@ class VoteStage(RememberingStage[str, VoteTask]):
             key,
             maps_key,
         )
-        return Job(key, self.found(task), self._cost(view, window.num_pixels, files, is_voted), task)
+        done = self.found(task)
+        only_maps = is_voted and done is None  # to make, or to remove
+        return Job(key, done, self._cost(view, window.num_pixels, files, only_maps), task)
 
-    def _cost(self, view: View, pixels: int, files: tuple[Path, ...], is_voted: bool) -> Cost:
+    def _cost(self, view: View, pixels: int, files: tuple[Path, ...], only_maps: bool) -> Cost:
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
-        seconds = 0.0 if is_voted else vote_seconds(len(files))
-        disk = 0.0 if is_voted else _ESTIMATE_BYTES * pixels
+        seconds = 0.0 if only_maps else vote_seconds(len(files))
+        disk = 0.0 if only_maps else _ESTIMATE_BYTES * pixels
         maps = 0.0
         if self.context.wants_photometric:
             seconds += normals_seconds(self.context.options.normals)
