@@ -162,7 +162,7 @@ def faces_of(lens: Lens, scale: float = 1.0, max_size: int = -1) -> tuple[Face, 
         faces = _needed(lens, _cube(focal), rays)
     longest = max(max(face.width, face.height) for face in faces)
     if max_size > 0 and longest > max_size:
-        return faces_of(lens, scale * (max_size - 1) / longest)
+        return faces_of(lens, scale * (max_size - 1) / longest, max_size)
     return tuple(faces)
 
 
