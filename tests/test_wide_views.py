@@ -373,6 +373,17 @@ def test_a_damaged_table_is_named(project: Path, text: str) -> None:
         read_scene(workspace.sparse_dir)
 
 
+@pytest.mark.parametrize("old", ["upper_left/C_0_00.png", '"original": "C_0_00.png"'])
+def test_a_table_whose_names_lead_elsewhere_is_damaged(project: Path, old: str) -> None:
+    workspace = prepare(model_in(project), project / "dense")
+    table = workspace.sparse_dir / TABLE_NAME
+    whole = table.read_text()
+    assert old in whole
+    table.write_text(whole.replace(old, old.replace("C_0", "../../../C_0")))
+    with pytest.raises(InputError, match=rf"{TABLE_NAME} cannot be used .* --overwrite"):
+        read_cuts(workspace.sparse_dir)
+
+
 # ---- range maps ----------------------------------------------------------------------------------------------
 
 

@@ -15,6 +15,7 @@ from colmap_sph.project.state.typed import from_json
 from colmap_sph.project.wide.cuts import Cut
 from colmap_sph.project.wide.layout import Face
 from colmap_sph.project.wide.projection import Lens, number_of_parameters
+from colmap_sph.project.workspace import checked_name
 
 TABLE_NAME = "wide_images.json"
 
@@ -74,8 +75,11 @@ def read_cuts(model_dir: Path) -> dict[str, Cut]:
         if read.version != _VERSION:
             raise ValueError(f"it is of version {read.version}")
         lenses, faces = [_lens(each) for each in read.lenses], [_face(each) for each in read.faces]
-        return {name: Cut(view.original, lenses[view.lens], faces[view.face]) for name, view in read.views.items()}
-    except (OSError, ValueError, IndexError) as error:
+        return {
+            checked_name(name): Cut(checked_name(view.original), lenses[view.lens], faces[view.face])
+            for name, view in read.views.items()
+        }
+    except (OSError, ValueError, IndexError, InputError) as error:
         reason = reason_of(error) if isinstance(error, OSError) else "it does not say from what views were cut"
         raise InputError(f"{path} cannot be used ({reason}); make the workspace anew with --overwrite.") from error
 
