@@ -49,11 +49,11 @@ def equally_bright(
     -------
     left : RectifiedImage
     step : float
-        Steps, in grey values, in which to compare the two.
+        Steps, in grey values, in which to compare the two; 0: not at all, as nothing tells how bright they are.
     """
     difference, matched = _differences(left, right, offset)
     if not matched.any():
-        return left, _LEAST_STEP
+        return left, 0.0
     usual = float(np.median(difference[matched]))
     middle = _local_median(np.where(matched, difference, usual))
     off = np.abs(difference - middle)
