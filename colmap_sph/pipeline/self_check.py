@@ -185,8 +185,9 @@ def _doubts(doubted: Mapping[str, float]) -> str:
     shares = sorted((share, name) for name, share in doubted.items())
     named = _named([f"{name} ({share:.0%})" for share, name in shares])
     return (
-        f"Few of the sparse points that these images observe agree with their depth maps: {named}. Their poses, "
-        "cameras or pixels may not be those of the model, or they could hardly be matched."
+        "Few of the sparse points that these images observe agree with their depth maps, or far fewer than in the "
+        f"other images: {named}. Their poses, cameras or pixels may not be those of the model, or they could "
+        "hardly be matched."
     )
 
 
