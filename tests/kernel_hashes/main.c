@@ -138,9 +138,11 @@ static void run_census(const kernel_table *k, image_size size) {
     FILL(int16_t, padded, padded_size, seldom(3) ? greys[between(0, 7)] : between(0, 16320))
     FILL(uint8_t, valid, PIXELS, !seldom(9))
     MAKE(uint64_t, census, PIXELS);
-    const census_image image = {padded, valid, size.height, size.width};
-    for (int fine = 0; fine < 2; fine++) {
-        EACH_TIME k->census(image, fine, size.width, census);
+    uint64_t codes[GREY_CODES];
+    make_grey_codes(between(1, 200), codes);
+    for (int kind = 0; kind < 4; kind++) {
+        const census_image image = {padded, valid, size.height, size.width, kind & 1, kind & 2 ? codes : NULL};
+        EACH_TIME k->census(image, size.width, census);
         HASH(census, PIXELS);
     }
 }
