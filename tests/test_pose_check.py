@@ -11,7 +11,8 @@ import pytest
 from rendered import SIDES, grey
 
 from colmap_sph import synthetic as syn
-from colmap_sph.errors import NoResultError
+from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.pipeline import pose_check
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.reconstruct import run
@@ -142,6 +143,24 @@ def test_right_poses_without_points_are_not(project: Path) -> None:
     assert plan.pairs > plan.pairs_done == 0
     report = run(project / "sparse/0", options=OPTIONS)
     assert report.points > 10_000
+
+
+def test_an_image_that_cannot_be_read_tells_nothing(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every other stage goes on without it, too."""
+    without_points(project)
+    read = pose_check.read_whole_grey
+    asked = []
+
+    def reading(path: Path, size: tuple[int, int]) -> np.ndarray:
+        asked.append(path)
+        if len(asked) == 1:
+            raise InputError(f"{path} cannot be read.")
+        return read(path, size)
+
+    monkeypatch.setattr(pose_check, "read_whole_grey", reading)
+    monkeypatch.setattr(pose_check, "_SOUND_SHARE", 2.0)  # features are compared whatever the ties say
+    assert run(project / "sparse/0", options=OPTIONS).points > 10_000
+    assert len(asked) > 1
 
 
 def test_images_of_something_else_are_refused(project: Path) -> None:

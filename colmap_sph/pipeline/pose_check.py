@@ -6,10 +6,11 @@ any. So have some with right poses; where most pairs have few, features of the i
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from statistics import median
 
-from colmap_sph.errors import NoResultError
+from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.images.reading import read_whole_grey
@@ -57,13 +58,17 @@ def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
 
 def _judge(context: Context, pairs: Sequence[Pair]) -> None:
     @cache
-    def features_of(lead: str) -> Features:
-        return find_features([_shown(context, view) for view in context.scene.photograph(lead).views])
+    def features_of(lead: str) -> Features | None:
+        with suppress(InputError):  # cannot be read for a moment, and so tells nothing
+            return find_features([_shown(context, view) for view in context.scene.photograph(lead).views])
+        return None
 
     fitting: list[int] = []
     contradicting: list[int] = []
     for left, right in pairs:
         first, second = features_of(left), features_of(right)
+        if first is None or second is None:
+            continue
         matches = match_features(first, second)
         if len(matches) < _TELLING:
             continue
@@ -75,7 +80,7 @@ def _judge(context: Context, pairs: Sequence[Pair]) -> None:
     if len(contradicting) > len(fitting) and sum(contradicting) >= _ENOUGH:
         finding = f"lie on each other's epipolar lines in only {len(fitting)} of {told} pairs"
         raise NoResultError(_refusal(finding))
-    usual = median(len(features_of(name)) for pair in pairs for name in pair)
+    usual = median(len(features_of(name) or ()) for pair in pairs for name in pair)
     if not told and usual >= _MANY_FEATURES and len(pairs) >= _MANY_PAIRS:
         raise NoResultError(_refusal(f"match in none of {len(pairs)} pairs that should show the same"))
 
