@@ -321,6 +321,23 @@ def test_views_that_another_version_cut_give_way(project: Path, monkeypatch: pyt
     assert of_the_user.exists()
 
 
+def test_views_of_another_size_get_a_model_of_their_own(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Their names are the same; another version of the program let them reach farther."""
+    layout.faces_of.cache_clear()
+    monkeypatch.setattr(layout, "_OVERLAP", 14.0)
+    before = read_scene(prepare(model_in(project), project / "dense").sparse_dir)
+    monkeypatch.undo()
+    layout.faces_of.cache_clear()
+    workspace = prepare(model_in(project), project / "dense")
+    after = read_scene(workspace.sparse_dir)
+    assert before.index_of.keys() == after.index_of.keys()
+    for view in after.views:
+        image = cv2.imread(str(workspace.image_path(view.name)))
+        assert image is not None
+        assert image.shape[:2] == (view.height, view.width)
+        assert view.num_pixels < before.view(view.name).num_pixels
+
+
 def test_the_scale_has_no_part_in_other_workspaces(project: Path) -> None:
     model = pycolmap.Reconstruction(model_in(project))
     model.camera(1).model = pycolmap.CameraModelId.PINHOLE

@@ -56,6 +56,7 @@ from colmap_sph.project.undistortion.model import (
 )
 from colmap_sph.project.undistortion.originals import read_originals
 from colmap_sph.project.undistortion.process import ChildProcess
+from colmap_sph.project.wide.cuts import Cut
 from colmap_sph.project.wide.table import read_cuts
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import NO_SCENE, Scene
@@ -230,13 +231,17 @@ class Preparation:
 
     def _remove_former_views(self) -> None:
         """Remove views that are no longer cut: another version of the program cut wide images otherwise."""
-        former: Collection[str] = ()
-        with suppress(InputError):  # a damaged table is replaced
-            former = read_cuts(self.workspace.sparse_dir).keys() - self._originals.cuts.views.keys()
+        former = self._cut_before().keys() - self._originals.cuts.views.keys()
         for name in former:
             remove_image(self.workspace, name)
         if former:
             remove_empty_folders(self.workspace.images_dir, self.workspace.masks_dir, self.workspace.stereo_dir)
+
+    def _cut_before(self) -> Mapping[str, Cut]:
+        """How the views of the workspace were cut; a damaged table of it is replaced."""
+        with suppress(InputError):
+            return read_cuts(self.workspace.sparse_dir)
+        return {}
 
     def given_model(self) -> GivenModel:
         """What polishing has to know of the model as it was given."""
@@ -275,7 +280,10 @@ class Preparation:
                 "%s was changed since this program made it; it is used as it is", self.workspace.sparse_dir
             )
             return True
-        return list(found.images) == list(names) and has_given_model(self.workspace, found)
+        if list(found.images) != list(names) or not has_given_model(self.workspace, found):
+            return False
+        before, cuts = self._cut_before(), self._originals.cuts.views
+        return all(before.get(name) == cuts.get(name) for name in names)
 
     def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
         """Undistort the model in a process of its own; return the folder where it is."""

@@ -12,7 +12,7 @@ from colmap_sph.project.wide.lenses import wide_lenses
 from colmap_sph.project.wide.projection import Lens
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Cut:
     """A view that is cut from an image.
 
