@@ -89,6 +89,23 @@ def test_maps_of_a_model_that_was_moved_and_turned_are_its_own(aligned):
     check_maps(workspace)
 
 
+@pytest.mark.parametrize("what", [["export"], ["mesh", "--method", "poisson"]], ids=["export", "mesh"])
+def test_a_cloud_of_a_model_that_was_moved_since_is_refused(what, tmp_path, capsys):
+    """As where a model is aligned after dense reconstruction: its maps are still right, its cloud is not."""
+    workspace = make_workspace(tmp_path / "dense")
+    root = str(workspace.root)
+    paths = ["--workspace_path", root, "--output_path", str(workspace.fused_path)]
+    assert cli.main(["stereo_fusion", *paths]) == 0
+    assert cli.main(["export", root, "--output", str(tmp_path / "before")]) == 0
+    model = pycolmap.Reconstruction(workspace.sparse_dir)
+    model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), np.array([3.0, 0.0, 0.0])))
+    model.write(workspace.sparse_dir)
+    capsys.readouterr()
+    assert cli.main([*what, root]) == 2
+    refusal = r"error: The cloud in \S+ is not of the model in \S+sparse: only \d\.\d% of .* Fuse again\.\n$"
+    assert re.search(refusal, capsys.readouterr().err)
+
+
 def agreement_of(scene, name, depth, mask=None):
     return Agreement(*compare_with_sparse(scene.view(name), depth, SparseTracks(scene).sights(name), mask))
 

@@ -21,7 +21,7 @@ from small_workspaces import ALTITUDE, FOCAL, HEIGHT, WIDTH, ground_workspace
 
 from colmap_sph.app import cli
 from colmap_sph.errors import ColmapSphError, InputError, NoResultError, OptionError, OutputError
-from colmap_sph.products.clouds import copc, octree
+from colmap_sph.products.clouds import copc, octree, spread
 from colmap_sph.products.crs import read_crs, utm_zone_of, wkt_of
 from colmap_sph.products.export import Exporter, ExportFormat, ExportOptions, export
 from colmap_sph.products.georeference import Georeference
@@ -61,8 +61,9 @@ def write_far_cloud(path: Path, points: np.ndarray, images: list[list[int]]) -> 
 
 
 @pytest.fixture
-def workspace(tmp_path: Path) -> Workspace:
-    """Cameras above the ground near UTM, with a cloud there."""
+def workspace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Workspace:
+    """Cameras above the ground near UTM, with a cloud there, though not of what their maps show."""
+    monkeypatch.setattr(spread, "_LEAST_SHOWN", 0.0)
     made = ground_workspace(tmp_path / "dense", NAMES)
     model = pycolmap.Reconstruction(made.sparse_dir)
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(), UTM))

@@ -3,14 +3,14 @@
 import os
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from colmap_sph.errors import OptionError, OutputError
-from colmap_sph.products.clouds.source import Cloud, open_cloud
-from colmap_sph.products.clouds.spread import DepthSpread
+from colmap_sph.products.clouds.source import Cloud
+from colmap_sph.products.clouds.spread import measured_cloud
 from colmap_sph.products.clouds.thinning import ThinCloud, thinned
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.maps.files import write_exr, write_npz, write_png
@@ -66,10 +66,8 @@ class Exporter:
 
     @cached_property
     def cloud(self) -> Cloud:
-        """The fused cloud; what the maps say of its points is measured where there are maps."""
-        cloud = open_cloud(self.workspace)
-        spread = DepthSpread(self.workspace)
-        return replace(cloud, measure=spread.of) if cloud.has_images and spread.has_maps else cloud
+        """The fused cloud, measured."""
+        return measured_cloud(self.workspace)
 
     @cached_property
     def extent(self) -> "Extent":

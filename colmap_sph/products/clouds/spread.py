@@ -1,11 +1,14 @@
 """Points of a cloud and the depth maps they come from → how far the images disagree about each point."""
 
+from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.products.clouds.source import UNKNOWN, CloudPiece
+from colmap_sph.errors import InputError
+from colmap_sph.products.clouds.source import UNKNOWN, Cloud, CloudPiece, open_cloud
 from colmap_sph.products.maps.reading import at_map_size
 from colmap_sph.project.map_files import depth_on_disk
 from colmap_sph.project.scene_reader import read_scene
@@ -15,6 +18,34 @@ from colmap_sph.scene import View
 # Depth beyond that, relative, is of another surface: fusion's own bound.
 _SAME_SURFACE = 0.01
 _OPEN_MAPS = 256
+# Of the images that see a point, as a cloud itself says, nearly all have its surface in their maps; next to none
+# has where the cloud is of other poses. So many points are asked; fewer sightings say nothing.
+_ASKED = 4096
+_FEWEST_SIGHTINGS = 100
+_LEAST_SHOWN = 0.1
+
+
+def measured_cloud(workspace: Workspace) -> Cloud:
+    """The fused cloud of a workspace; what its maps say of the points is measured where there are maps.
+
+    Raises
+    ------
+    InputError, NoResultError
+        As of `open_cloud`; or the cloud is of other poses than the model, which was moved after the fusion.
+    """
+    cloud, spread = open_cloud(workspace), DepthSpread(workspace)
+    if not cloud.has_images or not spread.has_maps:
+        return cloud
+    piece = next(cloud.pieces())
+    number = len(piece.xyz)
+    sightings, shown = spread.shown(piece.only(np.arange(number) % -(-number // _ASKED or 1) == 0))
+    if sightings >= _FEWEST_SIGHTINGS and shown < _LEAST_SHOWN * sightings:
+        raise InputError(
+            f"The cloud in {workspace.root} is not of the model in {workspace.sparse_dir}: only "
+            f"{shown / sightings:.1%} of the images that see a point have its surface there. Was the model moved, "
+            "aligned or replaced after the fusion? Fuse again."
+        )
+    return replace(cloud, measure=spread.of)
 
 
 class DepthSpread:
@@ -59,19 +90,31 @@ class DepthSpread:
         """
         number = len(piece.xyz)
         sums = np.zeros((3, number))
-        if piece.counts is not None and piece.images is not None:
-            owners = np.repeat(np.arange(number), piece.counts)
-            for index in np.unique(piece.images).tolist():
-                rows = owners[piece.images == index]
-                known = self._map_of(index)
-                if known is not None:
-                    kept, distances = self._distances(piece, rows, *known)
-                    for power in range(3):
-                        sums[power] += np.bincount(kept, distances**power, number)
+        for _, kept, distances in self._sightings(piece):
+            for power in range(3):
+                sums[power] += np.bincount(kept, distances**power, number)
         count, total, squares = sums
         with np.errstate(divide="ignore", invalid="ignore"):
             variance = (squares - total**2 / count) / (count - 1)
         return np.where(count >= 2, np.sqrt(np.maximum(variance, 0)), UNKNOWN).astype(np.float32)
+
+    def shown(self, piece: CloudPiece) -> tuple[int, int]:
+        """How many times images that have maps see points, and how many times the map has their surface there."""
+        counts = [(len(rows), len(kept)) for rows, kept, _ in self._sightings(piece)]
+        return sum(all_of for all_of, _ in counts), sum(shown for _, shown in counts)
+
+    def _sightings(
+        self, piece: CloudPiece
+    ) -> Iterator[tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]]:
+        """Of each image that has a map: the points it sees, those the map shows, and how far it is from these."""
+        if piece.counts is None or piece.images is None:
+            return
+        owners = np.repeat(np.arange(len(piece.xyz)), piece.counts)
+        for index in np.unique(piece.images).tolist():
+            rows = owners[piece.images == index]
+            known = self._map_of(index)
+            if known is not None:
+                yield rows, *self._distances(piece, rows, *known)
 
     def _open(self, index: int) -> tuple[View, NDArray[np.float32]] | None:
         """An image's view and depth map, where it has both."""

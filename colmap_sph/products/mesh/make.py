@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
+from colmap_sph.products.clouds.spread import measured_cloud
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.obj import write_obj
@@ -152,6 +153,7 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
     cloud = (workspace.local_dir / "fused.ply") if scene.origin.any() else workspace.fused_path
     if not cloud.is_file():
         raise InputError(f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run first.")
+    measured_cloud(workspace)  # refuses one of other poses
     wanted = round(math.log2(max(_size(seen) / cell, 1.0)))
     depth = int(np.clip(wanted, *_DEPTHS))
     if wanted > depth:
