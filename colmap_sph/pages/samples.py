@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.project.map_files import map_size, read_some_pixels
 from colmap_sph.project.masks import read_mask
-from colmap_sph.project.state.array_file import SUFFIX, first_array
-from colmap_sph.project.state.ownership import map_place
+from colmap_sph.project.state.array_file import first_array
+from colmap_sph.project.state.ownership import estimate_path, map_place
 from colmap_sph.project.state.records import altered_files, read_record
 from colmap_sph.project.wide.projection import Lens
 from colmap_sph.project.workspace import MapKind, Workspace
@@ -154,7 +154,7 @@ def _voted(
 ) -> NDArray[np.float32] | None:
     """What was voted for pixels of a view, maybe in a part of it only; None where there is nothing of it."""
     try:
-        head, voted = first_array(workspace.photometric_dir / f"{view.name}{SUFFIX}", "estimate")
+        head, voted = first_array(estimate_path(workspace, view.name), "estimate")
         left, top = map(int, head.numbers[:2])
         height, width = voted.shape
     except (OSError, ValueError, OverflowError):

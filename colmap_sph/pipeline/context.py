@@ -19,7 +19,7 @@ from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.maps import MapFiles
 from colmap_sph.project.region_file import AUTO, as_given, read_region
 from colmap_sph.project.state.array_file import SUFFIX
-from colmap_sph.project.state.ownership import Place, cloud_place, map_place
+from colmap_sph.project.state.ownership import Place, cloud_place, estimate_path, map_place
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Region, Scene
 from colmap_sph.stereo.agreement import SparseTracks
@@ -185,7 +185,7 @@ class Context:
 
     def estimate_path(self, name: str) -> Path:
         """Photometric depth of an image with its standard deviation and support."""
-        return self.workspace.photometric_dir / f"{name}{SUFFIX}"
+        return estimate_path(self.workspace, name)
 
     def map_files(self, name: str, kind: MapKind) -> MapFiles:
         """Depth and normal map of an image, and the record that vouches for them."""

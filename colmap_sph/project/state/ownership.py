@@ -51,6 +51,11 @@ def map_place(workspace: Workspace, name: str, kind: MapKind) -> Place:
     return Place(workspace.records_dir / f"{name}.{kind}.json", files)
 
 
+def estimate_path(workspace: Workspace, name: str) -> Path:
+    """Where the photometric depth of an image is, with its standard deviation and support."""
+    return workspace.photometric_dir / f"{name}{SUFFIX}"
+
+
 def range_place(workspace: Workspace, original: str) -> Place:
     """The range map of a wide image."""
     return Place(workspace.records_dir / f"{original}{_RANGE}", (workspace.range_map_path(original),))
@@ -238,7 +243,7 @@ def remove_image(workspace: Workspace, name: str) -> None:
     _remove(
         [undistorted_place(workspace, name), *(map_place(workspace, name, kind) for kind in get_args(MapKind))]
     )
-    estimate = workspace.photometric_dir / f"{name}{SUFFIX}"
+    estimate = estimate_path(workspace, name)
     if is_array_file(estimate):
         remove(estimate)
 
