@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from colmap_sph.scene import Photograph, Scene
-from colmap_sph.stereo.partners.frusta import observe_frusta, observe_points, points_in_view
+from colmap_sph.stereo.partners.frusta import likely_in_view, points_in_view
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles, worth_of
 
 logger = logging.getLogger(__name__)
@@ -172,7 +172,7 @@ def find_covisibility(
     points, of_views, has_tracks = points_in_view(scene)
     if has_tracks and not has_enough_tracks(scene):
         has_tracks = False
-        points, of_views = _likely_in_view(scene)
+        points, of_views = likely_in_view(scene, _FEW_POINTS)
     index_of = scene.index_of
     observed = [_together([of_views[index_of[view.name]] for view in each.views]) for each in photographs]
     if has_tracks:
@@ -184,14 +184,6 @@ def find_covisibility(
             return Covisibility(photographs, "database", weights, points, observed)
         logger.warning("the database has no verified matches of the model's images")
     return Covisibility(photographs, "frusta", _shared_points(observed, len(points), 1), points, observed)
-
-
-def _likely_in_view(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
-    """What each view has in its image: of the scene's points or, where these are too few, of the frusta's."""
-    points = scene.points[np.isfinite(scene.points).all(axis=1)]
-    in_view = observe_points(scene, points)
-    are_few = np.median([len(rows) for rows in in_view]) < _FEW_POINTS
-    return observe_frusta(scene) if are_few else (points, in_view)
 
 
 def _together(observed: list[NDArray[np.int64]]) -> NDArray[np.int64]:

@@ -54,10 +54,29 @@ def points_in_view(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
     ]
     if any(len(indices) for indices in observed):
         return scene.points, observed, True
-    points = scene.points[finite]
+    return *likely_in_view(scene), False
+
+
+def likely_in_view(scene: Scene, fewest: int = 0) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+    """What each view's frustum holds of the scene's points or, where there are none, of samples of the frusta.
+
+    Parameters
+    ----------
+    scene : Scene
+    fewest : int
+        Where views (the median) hold fewer points than so many, samples serve, too.
+
+    Returns
+    -------
+    points, observed
+        As of `points_in_view`.
+    """
+    points = scene.points[np.isfinite(scene.points).all(axis=1)]
     if len(points):
-        return points, observe_points(scene, points), False
-    return *observe_frusta(scene), False
+        in_view = observe_points(scene, points)
+        if not fewest or np.median([len(rows) for rows in in_view]) >= fewest:
+            return points, in_view
+    return observe_frusta(scene)
 
 
 def observe_points(scene: Scene, points: NDArray[np.float64]) -> list[NDArray[np.int64]]:
