@@ -23,12 +23,17 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
-from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, refuse_disagreement
+from colmap_sph.pipeline.self_check import (
+    judge_agreement,
+    judge_reprojection,
+    refuse_disagreement,
+    share_in_sight,
+)
 from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.products.maps.reading import check_maps
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.project import Project
-from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.scene_reader import read_scene, scene_of_model
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.agreement import SparseTracks, compare_with_sparse
@@ -413,4 +418,18 @@ def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):
     assert judge_reprojection(sound, scene) == 0
     assert sound.doubts == ""
     with pytest.raises(NoResultError, match="cameras or poses of the model are not those"):
+        colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)
+
+
+def test_points_that_no_image_has_in_sight_are_told(project):
+    """The principal point lies outside of the images: no depth map can be checked, and there was a cloud of it."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    assert share_in_sight(scene_of_model(model, project)) > 0.99
+    for camera in model.cameras.values():
+        camera.params = [*camera.params[:2], 3 * camera.width, camera.params[3]]
+    wrong = project / "wrong"
+    wrong.mkdir()
+    model.write_binary(wrong)
+    assert share_in_sight(read_scene(wrong)) == 0
+    with pytest.raises(NoResultError, match="only 0% of them into these images at all"):
         colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)

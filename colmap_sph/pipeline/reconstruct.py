@@ -24,7 +24,13 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.pose_check import check_poses
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.report_files import command_of, keep_or_make_page, write_report
-from colmap_sph.pipeline.self_check import judge_agreement, judge_reprojection, judge_rows, refuse_disagreement
+from colmap_sph.pipeline.self_check import (
+    judge_agreement,
+    judge_reprojection,
+    judge_rows,
+    refuse_disagreement,
+    share_in_sight,
+)
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage
@@ -205,7 +211,7 @@ def reconstruct(
             context = go_through_stages_within(
                 Within(limit, context, selection, goes_on=not request.overwrite), executor
             )
-        judge_agreement(report, misplaced=misplaced)
+        judge_agreement(report, misplaced=misplaced, in_sight=share_in_sight(context.scene))
     write_report(context)
     keep_or_make_page(context)
     refuse_disagreement(report)

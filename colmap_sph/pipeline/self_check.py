@@ -8,6 +8,7 @@ from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.scene import Scene
+from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.partners.pairing import Pair
 
 logger = logging.getLogger(__name__)
@@ -38,7 +39,7 @@ _IMPRECISE_PIXELS = 0.4
 _NAMED_WORST = 3
 
 
-def judge_agreement(report: RunReport, *, misplaced: float) -> None:
+def judge_agreement(report: RunReport, *, misplaced: float, in_sight: float = 1.0) -> None:
     """Put into the report which images agree with few sparse points, or that hardly any image does.
 
     Parameters
@@ -47,6 +48,8 @@ def judge_agreement(report: RunReport, *, misplaced: float) -> None:
         With the agreement of its images.
     misplaced : float
         Share of the images in which sparse points do not project to their observations, see `judge_reprojection`.
+    in_sight : float
+        Share of the observed points that project into the images at all, see `share_in_sight`.
     """
     total = report.sparse_points
     is_enough = total.tested >= _FEWEST
@@ -58,10 +61,13 @@ def judge_agreement(report: RunReport, *, misplaced: float) -> None:
         for name, share in shares.items()
         if share < _DOUBTED_SHARE or of_found.get(name, usual) < _DOUBTED_OF_USUAL * usual
     }
-    if not total.tested:
+    if misplaced > 0.5 and in_sight < 0.5:
+        report.refusal = _refusal_of_misplaced(f"only {in_sight:.0%} of them into these images at all")
+    elif not total.tested:
         logger.info("There are no sparse points to check the depth maps against")
     elif is_enough and misplaced > 0.5 and total.agreeing < _REFUSED_SHARE_OF_MISPLACED * total.tested:
-        report.refusal = _refusal_of_misplaced(total)
+        share = total.agreeing / total.tested
+        report.refusal = _refusal_of_misplaced(f"only {share:.1%} of them agree with the depth maps")
     elif is_enough and total.agreeing < _REFUSED_SHARE * total.tested:
         is_right = total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found
         if is_right and total.agreeing >= _LEAST_SHARE * total.tested:
@@ -105,6 +111,13 @@ def judge_reprojection(report: RunReport, scene: Scene) -> float:
         )
         _doubt(report, words)
     return len(far) / max(len(scene.views), 1)
+
+
+def share_in_sight(scene: Scene) -> float:
+    """Share of the points that images observe which project into them; 1 where these are too few to tell."""
+    seen = [sees(view, scene.points[view.point_indices]) for view in scene.views]
+    number = sum(map(len, seen))
+    return sum(int(inside.sum()) for inside in seen) / number if number >= _FEWEST else 1.0
 
 
 def judge_rows(report: RunReport, scene: Scene, residuals: Mapping[Pair, float | None]) -> None:
@@ -165,11 +178,10 @@ def _refusal(total: Agreement) -> str:
     )
 
 
-def _refusal_of_misplaced(total: Agreement) -> str:
+def _refusal_of_misplaced(fact: str) -> str:
     return (
-        "Sparse points do not project to where most images observe them, and only "
-        f"{total.agreeing / total.tested:.1%} of them agree with the depth maps: cameras or poses of the model "
-        "are not those that its points were made with. Give the model as it was adjusted, with its cameras. "
+        f"Sparse points do not project to where most images observe them, and {fact}: cameras or poses of the "
+        "model are not those that its points were made with. Give the model as it was adjusted, with its cameras. "
         "What was made is left on disk."
     )
 
