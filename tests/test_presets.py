@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -15,7 +16,7 @@ from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.run_command import RunCommand
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.presets import PRESETS, FusionMethod, Quality, preset
+from colmap_sph.pipeline.presets import PRESETS, FusionMethod, Quality, changed_options, preset
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_0.jpg", "N_1_1.jpg", "N_1_2.jpg"]
 
@@ -104,3 +105,14 @@ def test_preview_matches_less(project: Path) -> None:
     assert reports["normal"].sampling is not None
     assert reports["preview"].sampling == pytest.approx(0.5 * reports["normal"].sampling, abs=0.01)
     assert reports["preview"].pairs < reports["normal"].pairs <= reports["best"].pairs
+
+
+def test_a_quality_is_told_by_its_name() -> None:
+    """Not by options that nobody typed; what is given beside it is told, too."""
+    preview = preset("preview")
+    assert changed_options(preview, "rectification", "vote") == ["--quality preview"]
+    given = replace(preview, vote=replace(preview.vote, min_support=3))
+    assert changed_options(given, "rectification", "vote") == ["--quality preview", "--vote.min-support 3"]
+    other = replace(preview, pairs=replace(preview.pairs, num_pairs=4))
+    assert changed_options(other, "rectification", "vote") == ["--rectification.sampling 0.5"]
+    assert changed_options(RunOptions(), "rectification", "vote") == []

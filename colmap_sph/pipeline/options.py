@@ -1,6 +1,6 @@
 """Options of all stages in one record: what the command line, the Python API and the pipeline share."""
 
-from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from dataclasses import dataclass, field, fields, is_dataclass
 
 from colmap_sph.errors import OptionError
 from colmap_sph.pipeline.memory import budget, parse_memory
@@ -73,15 +73,6 @@ class RunOptions:
         if folder is not None and not folder.is_dir():
             raise OptionError(f"fusion.mask_path: the folder {folder} does not exist.", "fusion.mask_path")
         backend()  # what COLMAP_SPH_KERNELS asks for must be there, too
-
-    def changed(self, *stages: str) -> list[str]:
-        """Options of some stages that are not at their defaults, as they are typed: "--vote.tolerance 1.0"."""
-        changed = []
-        for stage in stages:
-            chosen, usual = (asdict(getattr(each, stage)) for each in (self, RunOptions()))
-            different = {name: value for name, value in chosen.items() if value != usual[name]}
-            changed += [f"--{stage}.{name.replace('_', '-')} {value}" for name, value in different.items()]
-        return changed
 
     @property
     def num_threads(self) -> int:

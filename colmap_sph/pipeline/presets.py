@@ -1,7 +1,7 @@
 """Qualities of a run: named sets of options."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any, Literal
 
 from colmap_sph.errors import OptionError
@@ -67,3 +67,25 @@ def preset(quality: Quality, *, fusion_method: FusionMethod = "best-pixel") -> R
         stage, name = place.split(".")
         options = replace(options, **{stage: replace(getattr(options, stage), **{name: value})})
     return options
+
+
+def changed_options(options: RunOptions, *stages: str) -> list[str]:
+    """Options of some stages that are not at their defaults, as they are typed: "--vote.tolerance 1.0".
+
+    What a quality sets, where all of it is so, is told as this quality: "--quality preview".
+    """
+    chosen, usual = asdict(options), asdict(RunOptions())
+    different = {
+        f"{stage}.{name}": value
+        for stage in stages
+        for name, value in chosen[stage].items()
+        if value != usual[stage][name]
+    }
+    changed = []
+    for quality in PRESETS:
+        values = values_of(quality, options.fusion.method)
+        places = [place.split(".") for place in values]
+        if values and all(chosen[stage][name] == values[f"{stage}.{name}"] for stage, name in places):
+            changed.append(f"--quality {quality}")
+            different = {place: value for place, value in different.items() if place not in values}
+    return changed + [f"--{place.replace('_', '-')} {value}" for place, value in different.items()]
