@@ -224,12 +224,33 @@ def test_impossible_points_are_left_out(tmp_path: Path, coordinate: float) -> No
     assert np.abs(scene.points).max() < 10
 
 
-@pytest.mark.parametrize("params", [[1e300, 320, 240], [500, 1e300, 240], [1e-30, 320, 240], [np.inf, 320, 240]])
-def test_impossible_calibrations_are_told(tmp_path: Path, params: list[float]) -> None:
+@pytest.mark.parametrize(
+    ("params", "words"),
+    [
+        ([1e300, 320, 240], "the focal length of its camera is 1e[+]300"),
+        ([500, 1e300, 240], "the principal point of its camera is 1e[+]300 and 240 pixels"),
+        ([1e-30, 320, 240], "the focal length of its camera is 1e-30"),
+        ([-500, 320, 240], "the focal length of its camera is -500"),
+        ([np.inf, 320, 240], "the focal length of its camera is inf"),
+    ],
+)
+def test_impossible_calibrations_are_told(tmp_path: Path, params: list[float], words: str) -> None:
     model = make_model("SIMPLE_PINHOLE")
     model.camera(1).params = params
     model.write_binary(tmp_path)
-    with pytest.raises(InputError, match="No image of the model"):
+    with pytest.raises(InputError, match=f"No image of the model .* {words}"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [(1e15, "some .e[+]15 units from"), (1e-30, "only .e-30 units apart")]
+)
+def test_a_model_in_an_impossible_unit_is_told_as_one(tmp_path: Path, scale: float, words: str) -> None:
+    """Every pose and every point was called impossible, or no depth was found; now what is wrong is said."""
+    model = make_model()
+    model.transform(pycolmap.Sim3d(scale, pycolmap.Rotation3d(), np.array([0.0, 0.0, 3 * scale])))
+    model.write_binary(tmp_path)
+    with pytest.raises(InputError, match=f"lie {words}.*; bring it to metres"):
         read_scene(tmp_path)
 
 

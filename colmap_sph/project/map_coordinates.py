@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_sph.errors import InputError
 from colmap_sph.project.files import atomic_file
 
 # A model is far when its origin is this many times farther away than its own size: 32-bit floats then resolve a
@@ -20,6 +21,8 @@ _FAR = 20.0
 _SAMPLED_POINTS = 1000
 # In whatever unit: what lies beyond comes from damage, and its square may be more than a float holds.
 _MAX_COORDINATE = 1e12
+# Depth maps are of 32-bit floats, which lose their digits, and whose squares vanish, far below.
+_MIN_SIZE = 1e-15
 _CHUNK_POINTS = 1_000_000
 _PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
 
@@ -27,6 +30,33 @@ _PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
 def is_plausible(places: NDArray[np.float64]) -> NDArray[np.bool_]:
     """(N,) bool: which of (N, 3) world coordinates are finite and not absurdly far."""
     return np.asarray((np.abs(places) < _MAX_COORDINATE).all(axis=1))
+
+
+def check_size(model: pycolmap.Reconstruction, sparse_dir: Path) -> None:
+    """Raise `InputError` where the places of a model's images are in a unit in which nothing can be computed.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    sparse_dir : Path
+        Where it was read from, for the message.
+    """
+    places = np.array([model.image(image_id).projection_center() for image_id in model.reg_image_ids()])
+    places = places[np.isfinite(places).all(axis=1)] if len(places) else np.zeros((0, 3))
+    if not len(places):
+        return
+    farthest = float(np.median(np.abs(places).max(axis=1)))
+    apart = float(np.abs(places - places.mean(axis=0)).max())
+    if farthest >= _MAX_COORDINATE:
+        what = f"lie some {farthest:.0e} units from its origin"
+    elif 0.0 < apart < _MIN_SIZE:
+        what = f"lie only {apart:.0e} units apart"
+    else:
+        return
+    raise InputError(
+        f"The images of the model in {sparse_dir} {what}; bring it to metres or the like, by COLMAP's "
+        "model_transformer."
+    )
 
 
 def local_origin(model: pycolmap.Reconstruction) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.cameras import is_pinhole
 from colmap_sph.project.given.binary_arrays import Observations, read_observations, read_points
 from colmap_sph.project.given.poses import check_points_in_front
-from colmap_sph.project.map_coordinates import is_plausible, local_origin
+from colmap_sph.project.map_coordinates import check_size, is_plausible, local_origin
 from colmap_sph.project.sparse_model import is_text, load_model, model_files
 from colmap_sph.project.wide.cuts import Cut
 from colmap_sph.project.wide.table import read_cuts
@@ -48,8 +48,8 @@ def read_scene(sparse_dir: Path) -> Scene:
     Raises
     ------
     InputError
-        No readable model in the folder, no registered image, a distorted camera, damaged `wide_images.json`, or
-        points behind the images that observe them.
+        No readable model in the folder, one in an impossible unit, no usable image, a distorted camera, damaged
+        `wide_images.json`, or points behind the images that observe them.
     """
     files = model_files(sparse_dir)
     model = load_model(sparse_dir)
@@ -103,6 +103,7 @@ def _observations(image: pycolmap.Image, moved: Moved | None) -> Observations:
 
 
 def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse, cuts: Mapping[str, Cut]) -> Scene:
+    check_size(model, sparse_dir)
     origin = local_origin(model)
     if origin.any():
         logger.info("%s is in map coordinates; worked on relative to %s", sparse_dir, tuple(origin.tolist()))
@@ -120,12 +121,17 @@ def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse, cu
             if view.name in cuts:
                 view = replace(view, original=cuts[view.name].original)
             views[image_id] = _with_observations(view, observations, rows_of, points)
-    usable = [views[image_id] for image_id in model.reg_image_ids() if _is_possible(views[image_id])]
-    for view in views.values():
-        if not _is_possible(view):
-            logger.warning("%s: the pose or calibration in %s is impossible; left out", view.name, sparse_dir)
+    faults = {image_id: _fault(view) for image_id, view in views.items()}
+    usable = [views[image_id] for image_id in model.reg_image_ids() if not faults[image_id]]
     if not usable:
-        raise InputError(f"No image of the model in {sparse_dir} has a usable pose; run COLMAP's mapper again.")
+        told = ", ".join(f"{views[image_id].name}: {fault}" for image_id, fault in list(faults.items())[:1])
+        raise InputError(
+            f"No image of the model in {sparse_dir} has a usable pose and camera ({told}); run COLMAP's mapper "
+            "again, or give the model as it was made."
+        )
+    for image_id, fault in faults.items():
+        if fault:
+            logger.warning("%s in %s: %s; left out", views[image_id].name, sparse_dir, fault)
     check_points_in_front(model, sparse_dir)
     views_by_name = tuple(sorted(usable, key=lambda view: view.name))
     return Scene(views_by_name, points, origin, image_ids=tuple(model.reg_image_ids()))
@@ -197,16 +203,22 @@ def _reprojection_error(view: View, observed: NDArray[np.float64], points: NDArr
     return float(np.median(known)) if len(known) else math.nan
 
 
-def _is_possible(view: View) -> bool:
+def _fault(view: View) -> str:
+    """What makes the pose or calibration of a view impossible; empty where nothing does."""
     size = max(view.width, view.height)
     focal = np.array([view.K[0, 0], view.K[1, 1]])
-    return bool(
-        min(view.width, view.height) > 0
-        # Fields of view from half a second of arc to just under 180 degrees.
-        and (focal > 1e-3 * size).all()
-        and (focal < 1e6 * size).all()
-        and (np.abs(view.K[:2, 2]) < 1e3 * size).all()
-        and is_plausible(view.t[None])[0]
-        and (np.abs(view.R) < 1.01).all()
-        and abs(np.linalg.det(view.R) - 1.0) < 1e-3
-    )
+    if min(view.width, view.height) <= 0:
+        return f"its camera has {view.width} x {view.height} pixels"
+    # Fields of view from half a second of arc to just under 180 degrees.
+    if not ((focal > 1e-3 * size) & (focal < 1e6 * size)).all():
+        return f"the focal length of its camera is {_pixels(focal)}, of an image of {view.width} x {view.height}"
+    if not (np.abs(view.K[:2, 2]) < 1e3 * size).all():
+        return f"the principal point of its camera is {_pixels(view.K[:2, 2])}"
+    is_rotation = (np.abs(view.R) < 1.01).all() and abs(np.linalg.det(view.R) - 1.0) < 1e-3
+    if not (is_rotation and is_plausible(view.t[None])[0]):
+        return "its pose is no rotation and translation"
+    return ""
+
+
+def _pixels(values: NDArray[np.float64]) -> str:
+    return f"{' and '.join(f'{value:g}' for value in values)} pixels"

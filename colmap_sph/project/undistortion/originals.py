@@ -14,6 +14,7 @@ from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.given.poses import check_points_in_front
 from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.files import LENS_FIELDS_NAME, read_lens_fields
+from colmap_sph.project.map_coordinates import check_size
 from colmap_sph.project.project import Project
 from colmap_sph.project.sparse_model import image_names, load_model, model_files
 from colmap_sph.project.undistortion.options import UndistortionOptions
@@ -119,10 +120,12 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
     Raises
     ------
     InputError
-        No readable model, points behind its images, a camera that is no lens, damaged lens fields, or no images.
+        No readable model, one in an impossible unit, points behind its images, a camera that is no lens, damaged
+        lens fields, or no images.
     """
     assert project.model is not None
     model = load_model(project.model)
+    check_size(model, project.model)
     check_points_in_front(model, project.model)
     _tell_newer_text(project.model)
     images = project.images
