@@ -49,9 +49,14 @@ def test_nothing_is_refused(text):
         parse_memory(text)
 
 
-@pytest.mark.parametrize("amount", [1, 1 << 20, 700 << 20, 3 * GIB, 100 * GIB])
+@pytest.mark.parametrize("amount", [1, 1000, 1500, 1 << 20, 700 << 20, 3 * GIB, 100 * GIB])
 def test_a_written_amount_is_enough(amount):
     assert amount <= parse_memory(format_memory(amount)) <= amount + max(1 << 20, amount // 8)
+
+
+@pytest.mark.parametrize("text", ["7B", "1KiB", "900KiB", "1MiB", "6144MiB", "12GiB"])
+def test_an_amount_is_told_as_it_was_given(text):
+    assert format_memory(parse_memory(text)) == text
 
 
 def test_the_default_leaves_something_to_others():

@@ -46,7 +46,9 @@ def parse_memory(text: str) -> int:
 
 
 def format_memory(amount: float) -> str:
-    """Amount in MiB or GiB, rounded up, as `parse_memory` reads it."""
+    """Amount in MiB or GiB (below one, in KiB or bytes), rounded up, as `parse_memory` reads it."""
+    if amount < 1 << 20:
+        return f"{int(-(-amount // 1024))}KiB" if amount >= 1024 else f"{int(amount)}B"
     mebibytes = int(-(-amount // (1 << 20)))
     return f"{mebibytes}MiB" if mebibytes < 10240 else f"{-(-mebibytes // 1024)}GiB"
 
