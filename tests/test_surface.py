@@ -496,8 +496,23 @@ def test_nothing_is_made_of_a_workspace_where_a_run_is_at_work(what, workspace, 
     typed = [*what.split(), str(workspace.root), "--output", str(tmp_path / "out")]
     with claimed(workspace):
         assert cli.main(typed) == 3
-    assert f"Another run is at work in {workspace.root}; wait for its end" in capsys.readouterr().err
+    assert f"Another run is at work in {workspace.root}, or" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("what", ["surface", "mesh", "export"])
+def test_no_run_begins_where_a_product_is_being_made(what, workspace, tmp_path, monkeypatch):
+    """It would be made of some maps of before and some of after."""
+
+    def a_run_begins(*_, **__):
+        workspace.state_dir.mkdir(exist_ok=True)
+        with claimed(workspace):
+            raise AssertionError("a run began")
+
+    made = "export" if what == "export" else f"make_{what}"
+    monkeypatch.setattr(f"colmap_sph.app.products.{what}_command.{made}", a_run_begins)
+    workspace.state_dir.mkdir(exist_ok=True)
+    assert cli.main([what, str(workspace.root), "--output", str(tmp_path / "out")]) == 3
 
 
 def test_small_pictures_show_the_surface(products, workspace, tmp_path):

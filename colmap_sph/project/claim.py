@@ -141,7 +141,8 @@ def _held(workspace: Workspace, *, shared: bool = False) -> Iterator[None]:
             held.enter_context(holding(workspace.state_dir, shared=shared))
         except BlockingIOError as error:
             raise OutputError(
-                f"Another run is at work in {workspace.root}; wait for its end or choose another --output."
+                f"Another run is at work in {workspace.root}, or a product is being made of it; wait for its end "
+                "or choose another --output."
             ) from error
         except OSError as error:
             raise OutputError(

@@ -31,9 +31,9 @@ class ExportCommand:
 def export_command(command: ExportCommand, terminal: Terminal) -> int:
     """`colmap_sph export`: paths of what was made on the standard output."""
     command.options.check()
-    workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
-    folder = command.output or workspace.export_dir
-    exporter = Exporter(workspace, command.options, georeference, folder)
-    for path in export(exporter, terminal.status, overwrite=command.overwrite):
-        print_result(str(path))
+    with opened_on_map(command.workspace, command.georeference, terminal) as (workspace, georeference):
+        folder = command.output or workspace.export_dir
+        exporter = Exporter(workspace, command.options, georeference, folder)
+        for path in export(exporter, terminal.status, overwrite=command.overwrite):
+            print_result(str(path))
     return 0

@@ -41,13 +41,13 @@ def mesh_command(command: MeshCommand, terminal: Terminal) -> int:
     """`colmap_sph mesh`: paths of what was made on the standard output."""
     command.options.check()
     memory = budget(parse_memory(command.memory))
-    workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
-    folder = command.output or workspace.mesh_dir
-    with Display(terminal) as display:
-        request = MeshRequest(
-            workspace, georeference, command.options, folder, memory, num_cores(), command.overwrite
-        )
-        paths, faces = make_mesh(request, display.start, display.advance)
+    with opened_on_map(command.workspace, command.georeference, terminal) as (workspace, georeference):
+        folder = command.output or workspace.mesh_dir
+        with Display(terminal) as display:
+            request = MeshRequest(
+                workspace, georeference, command.options, folder, memory, num_cores(), command.overwrite
+            )
+            paths, faces = make_mesh(request, display.start, display.advance)
     terminal.say(f"{faces:,} triangles", label="Mesh:", style="bold")
     for path in paths:
         print_result(str(path))

@@ -42,11 +42,11 @@ def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
     """`colmap_sph surface`: paths of what was made on the standard output."""
     command.options.check()
     memory = budget(parse_memory(command.memory))
-    workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
-    folder = command.output or workspace.surface_dir
-    with Display(terminal) as display:
-        request = SurfaceRequest(workspace, georeference, command.options, folder, memory, command.overwrite)
-        paths, summary = make_surface(request, display.start, display.advance)
+    with opened_on_map(command.workspace, command.georeference, terminal) as (workspace, georeference):
+        folder = command.output or workspace.surface_dir
+        with Display(terminal) as display:
+            request = SurfaceRequest(workspace, georeference, command.options, folder, memory, command.overwrite)
+            paths, summary = make_surface(request, display.start, display.advance)
     size = f"{summary.width} x {summary.height} cells of {summary.cell:g}"
     filled = f", {summary.filled:.1%} filled" if summary.filled else ""
     terminal.say(f"{size}, {summary.covered:.1%} with a measured height{filled}", label="Surface:", style="bold")
