@@ -224,6 +224,20 @@ def test_outputs_that_cannot_be(finished, tmp_path, capsys):
         assert words in capsys.readouterr().err
 
 
+def test_maps_that_are_not_there(finished, tmp_path, capsys):
+    """What is there is said: the other kind of maps, or an empty list; none of it is for want of a match."""
+    dense = with_maps_of_others(finished, tmp_path / "dense")
+    arguments = ["--workspace_path", dense, "--output_path", tmp_path / "cloud.ply"]
+    assert command("stereo_fusion", *arguments, "--input_type", "photometric") == 2
+    assert "has geometric maps, not photometric ones; fuse those by --input_type" in capsys.readouterr().err
+    (dense / "stereo/fusion.cfg").write_text("\n")
+    assert command("stereo_fusion", *arguments) == 2
+    assert "fusion.cfg lists no image; list them" in capsys.readouterr().err
+    shutil.rmtree(dense / "stereo")
+    assert command("stereo_fusion", *arguments) == 2
+    assert "has no geometric maps; make them by" in capsys.readouterr().err
+
+
 def test_a_list_of_pairs_that_is_missing(finished, tmp_path, capsys):
     dense = undistorted(finished, tmp_path / "dense")
     assert command("patch_match_stereo", "--workspace_path", dense, "--config_path", tmp_path / "no.cfg") == 1

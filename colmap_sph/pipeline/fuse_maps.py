@@ -144,9 +144,24 @@ def _with_maps(workspace: Workspace, scene: Scene, views: Sequence[View], kind: 
     if missing and (mapped or empty):
         logger.warning("%s or the normals of it are missing: fused without", named(missing))
     if not mapped:
-        lack = f"no {kind} maps" if missing or not views else f"no depth in any of its {kind} maps"
-        raise InputError(f"The workspace {workspace.root} has {lack}; make them by patch_match_stereo first.")
+        raise InputError(_why_no_maps(workspace, views, kind, are_missing=bool(missing)))
     return mapped
+
+
+def _why_no_maps(workspace: Workspace, views: Sequence[View], kind: MapKind, *, are_missing: bool) -> str:
+    if not views:
+        return f"{workspace.fusion_cfg_path} lists no image; list them in it, one a line, or delete it."
+    if not are_missing:
+        lack = f"no depth in any of its {kind} maps"
+    else:
+        other: MapKind = "photometric" if kind == "geometric" else "geometric"
+        if all(path.is_file() for path in map_place(workspace, views[0].name, other).files):
+            return (
+                f"The workspace {workspace.root} has {other} maps, not {kind} ones; fuse those by --input_type "
+                f"{other}, or make these by patch_match_stereo."
+            )
+        lack = f"no {kind} maps"
+    return f"The workspace {workspace.root} has {lack}; make them by patch_match_stereo first."
 
 
 def _map_view(view: View, depth: Path, normals: Path) -> View:
