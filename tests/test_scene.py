@@ -254,6 +254,17 @@ def test_a_model_in_an_impossible_unit_is_told_as_one(tmp_path: Path, scale: flo
         read_scene(tmp_path)
 
 
+def test_images_in_one_place_are_no_impossible_unit(tmp_path: Path) -> None:
+    """Rounding sets them apart by next to nothing; how large the model is, its points say."""
+    model = make_model()
+    for frame in model.frames.values():
+        frame.rig_from_world = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(), np.array([1e-17 * frame.frame_id, 0.0, 0.0])
+        )
+    model.write_binary(tmp_path)
+    assert len(read_scene(tmp_path).views) == len(model.frames)
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [

@@ -33,7 +33,7 @@ def is_plausible(places: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def check_size(model: pycolmap.Reconstruction, sparse_dir: Path) -> None:
-    """Raise `InputError` where the places of a model's images are in a unit in which nothing can be computed.
+    """Raise `InputError` where images and points of a model are in a unit in which nothing can be computed.
 
     Parameters
     ----------
@@ -41,22 +41,25 @@ def check_size(model: pycolmap.Reconstruction, sparse_dir: Path) -> None:
     sparse_dir : Path
         Where it was read from, for the message.
     """
-    places = np.array([model.image(image_id).projection_center() for image_id in model.reg_image_ids()])
-    places = places[np.isfinite(places).all(axis=1)] if len(places) else np.zeros((0, 3))
-    if not len(places):
-        return
-    farthest = float(np.median(np.abs(places).max(axis=1)))
-    apart = float(np.abs(places - places.mean(axis=0)).max())
+    centres, places = _places(model)
+    centres = centres[(np.abs(centres) < 1e300).all(axis=1)]  # the others are told of one by one
+    places = places[is_plausible(places)]
+    farthest = float(np.median(np.abs(centres).max(axis=1))) if len(centres) else 0.0
+    apart = float(np.ptp(places, axis=0).max()) if len(places) else 0.0
     if farthest >= _MAX_COORDINATE:
-        what = f"lie some {farthest:.0e} units from its origin"
+        what = f"images of the model in {sparse_dir} lie some {farthest:.0e} units from its origin"
     elif 0.0 < apart < _MIN_SIZE:
-        what = f"lie only {apart:.0e} units apart"
+        what = f"images and points of the model in {sparse_dir} lie only {apart:.0e} units apart"
     else:
         return
-    raise InputError(
-        f"The images of the model in {sparse_dir} {what}; bring it to metres or the like, by COLMAP's "
-        "model_transformer."
-    )
+    raise InputError(f"The {what}; bring it to metres or the like, by COLMAP's model_transformer.")
+
+
+def _places(model: pycolmap.Reconstruction) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(N, 3) centres of the images of a model, and (M, 3) of these and some of its points."""
+    centres = [model.image(image_id).projection_center() for image_id in model.reg_image_ids()]
+    points = [point.xyz for point in islice(model.points3D.values(), _SAMPLED_POINTS)]
+    return np.array(centres).reshape(-1, 3), np.array(centres + points).reshape(-1, 3)
 
 
 def local_origin(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
@@ -72,9 +75,7 @@ def local_origin(model: pycolmap.Reconstruction) -> NDArray[np.float64]:
         World coordinates: round numbers near the median of cameras and points where these are far from the
         world's origin, else exactly zero.
     """
-    places = [model.image(image_id).projection_center() for image_id in model.reg_image_ids()]
-    places += [point.xyz for point in islice(model.points3D.values(), _SAMPLED_POINTS)]
-    known = np.array(places).reshape(-1, 3)
+    known = _places(model)[1]
     known = known[is_plausible(known)]
     if not len(known):
         return np.zeros(3)
