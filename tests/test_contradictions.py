@@ -16,7 +16,7 @@ from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
-from colmap_sph.pipeline.stages import match
+from colmap_sph.pipeline.stages import photo
 from colmap_sph.project.project import Project
 from colmap_sph.scene import View
 from colmap_sph.stereo.confirm import ConfirmOptions
@@ -103,7 +103,7 @@ def test_masks_of_everything_are_not_blamed_on_confirmation(project):
 
 def test_a_pair_lost_for_a_moment_makes_the_run_incomplete(project, monkeypatch):
     """The disk fails once while a pair is read: said of both images, and done by the next run."""
-    original = match.read_view_mask
+    original = photo.read_view_mask
     calls = []
 
     def fails_once(path: Path, view: View):
@@ -113,7 +113,7 @@ def test_a_pair_lost_for_a_moment_makes_the_run_incomplete(project, monkeypatch)
         return original(path, view)
 
     shutil.rmtree(project / "dense/colmap_sph/pairs")
-    monkeypatch.setattr(match, "read_view_mask", fails_once)
+    monkeypatch.setattr(photo, "read_view_mask", fails_once)
     report = colmap_sph.run(workspace=project / "dense", options=OPTIONS)
     assert report.skipped_images == {}
     assert len(report.skipped_pairs) == 1 and len(report.incomplete) == 2

@@ -23,7 +23,7 @@ from colmap_sph.pipeline.input.good_images import with_good_images
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import check_input
-from colmap_sph.pipeline.stages.match import PhotoFile
+from colmap_sph.pipeline.stages.photo import PhotoFile
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.given.poses import check_points_in_front
 from colmap_sph.project.images.reading import image_problem

@@ -288,6 +288,8 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     _print_causes(by_originals(report.incomplete, report.views), "incomplete:", terminal)
     if report.imprecision:
         terminal.say(report.imprecision, label="imprecise:", style="yellow")
+    if report.still:
+        terminal.say(report.still, label="ignored:", style="yellow")
     if report.doubts:
         terminal.say(report.doubts, label="disagreement:", style="yellow")
     if report.advice:

@@ -70,6 +70,7 @@ class RunFacts(msgspec.Struct, frozen=True):
     overall_agreement: Share | None = None
     doubts: str = ""
     imprecision: str = ""
+    still: str = ""
     refusal: str = ""
     points: Count = 0
     points_of: dict[str, Count] = {}
@@ -98,6 +99,7 @@ class RunFacts(msgspec.Struct, frozen=True):
             ("refused", self.refusal),
             ("disagreement", self.doubts),
             ("imprecise", self.imprecision),
+            ("ignored", self.still),
             ("few points", self.advice),
         ]
         return [(word, sentences) for word, sentences in told if sentences]

@@ -56,6 +56,8 @@ class Context:
     report : RunReport
     details : mapping of str to float
         Of each image that is there, see `image_detail`.
+    still : mapping of str to tuple of str
+        Image in which something stands still while the camera turns → those that tell, see `still_pixels`.
     focus : Focus or None
         The region that is asked for; None: all.
     """
@@ -67,6 +69,7 @@ class Context:
     progress: Progress = field(default_factory=Silent)
     report: RunReport = field(default_factory=RunReport)
     details: Mapping[str, float] = field(default_factory=dict)
+    still: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     focus: Focus | None = None
 
     @cached_property
@@ -80,6 +83,7 @@ class Context:
             self.scene.points,
             self.focus,
             [self.details.get(view.name) for view in views],
+            sorted(self.still.items()),
             self.keys.contents([view.name for view in views]),
         )
 

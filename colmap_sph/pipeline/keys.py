@@ -127,7 +127,13 @@ class Keys:
         return self._key("undistorted", image, camera, values, mask_digest, size)
 
     def pair(
-        self, left: Photograph, right: Photograph, geometry: RectifiedPair, seeds: Seeds, trial: float
+        self,
+        left: Photograph,
+        right: Photograph,
+        geometry: RectifiedPair,
+        seeds: Seeds,
+        trial: float,
+        still: Mapping[str, Sequence[str]],
     ) -> str:
         """Of a disparity map.
 
@@ -140,12 +146,15 @@ class Keys:
             Where its sparse points are expected to match.
         trial : float
             Share of its rows and columns that the pair is matched at first, see `MatchTask`; 1 without.
+        still : mapping of str to sequence of str
+            See `Context`.
         """
         views = [list(photograph.views) for photograph in (left, right)]
         images = [[self._image(view.name) for view in cut] for cut in views]
         masks = [[self._mask(view.name) for view in cut] for cut in views]
         cameras = [[self._camera(view) for view in cut] for cut in views]
-        return self._key("pair", images, masks, cameras, geometry, seeds, trial, self._matching)
+        compared = [[self._image(name) for view in cut for name in still.get(view.name, ())] for cut in views]
+        return self._key("pair", images, masks, cameras, geometry, seeds, trial, self._matching, compared)
 
     def both_ways(self, keys: Sequence[str]) -> str:
         """Of the disparity maps of a pair that is matched both ways, from the keys of each."""

@@ -97,6 +97,8 @@ class RunReport:
         Samples per pixel that hold what the images show, on average, see `image_detail`.
     sampling : float or None
         Rectified pixels per pixel at which pairs are therefore matched.
+    still : str
+        Where parts of images stand still while the camera turns: how much, and what that means.
     pair_source : str
         Where the pairs come from.
     pairs : int
@@ -174,6 +176,7 @@ class RunReport:
     within: str = ""
     detail: float | None = None
     sampling: float | None = None
+    still: str = ""
     pair_source: str = ""
     pairs: int = 0
     matched_pairs: list[tuple[str, str, float | None]] = field(default_factory=list)

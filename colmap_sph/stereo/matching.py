@@ -80,8 +80,9 @@ class MatchingOptions:
     min_segment: int = 200
     """Connected regions of fewer pixels than this are removed at full resolution."""
     keep_blank: bool = False
-    """Match also what varies by no more than the image's noise, such as clear sky and blown-out walls; else it is
-    ignored, as if under a mask, and in places such as clouds depths are dropped that stand alone."""
+    """Match also what varies by no more than the image's noise, such as clear sky and blown-out walls, and what
+    stands still while the camera turns, such as a backdrop; else it is ignored, as if under a mask, and in places
+    such as clouds depths are dropped that stand alone."""
     median_filter: bool = False
     """Take the median of 5 x 5 disparities at full resolution, as is done above it. Depth from many pairs is
     better without: how rough a disparity map is tells the vote how far to trust it."""

@@ -7,6 +7,7 @@ from statistics import mean
 from typing import TYPE_CHECKING
 
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.self_check import misplaced_views
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
@@ -57,7 +58,8 @@ def with_good_images(
     if details:
         _report_detail(context, details)
     keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
-    return replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
+    good = replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
+    return with_still_pixels(good, images)
 
 
 def without_misplaced(context: Context) -> Context:

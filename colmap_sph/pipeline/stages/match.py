@@ -16,17 +16,14 @@ from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
-from colmap_sph.pipeline.stages.photo import Grey, Photo
+from colmap_sph.pipeline.stages.photo import Photo, PhotoFile, kept_masks
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
-from colmap_sph.project.masks import read_view_mask
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
 from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs, undistorted_place
-from colmap_sph.project.undistortion.rounding import coarsest_jpeg_step
 from colmap_sph.project.workspace import Known
 from colmap_sph.scene import Photograph, View
-from colmap_sph.stereo.blank import blank_pixels
 from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.matching import MatchingOptions, Scratch, match_pair, scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair, as_pair
@@ -66,23 +63,7 @@ _SCRATCH_BYTES = 256 << 20
 _CACHE_BYTES = 512 << 20
 
 _photos: LoadCache[Photo] = LoadCache(lambda photo: photo.nbytes)
-_masks: LoadCache[NDArray[np.uint8] | None] = LoadCache(lambda mask: 0 if mask is None else mask.nbytes)
 _thread = threading.local()
-
-
-@dataclass(frozen=True, eq=False)
-class PhotoFile:
-    """A view without its sparse points, its image, where its mask would be, and what tells how that was made."""
-
-    view: View
-    image: Path
-    mask: Path
-    record: Path
-
-    @property
-    def jpeg_step(self) -> int:
-        """How coarsely the image was rounded, or the original that it was made of; see `blank_pixels`."""
-        return coarsest_jpeg_step(self.image, self.record)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,26 +161,11 @@ def _rectified(task: MatchTask, geometry: RectifiedPair, side: Side) -> Rectifie
     files = task.left if side == "left" else task.right
     views = [file.view for file in files]
     images = [_photo(file).image for file in files]
-    masks = [_kept_mask(file, image, task.options.keep_blank) for file, image in zip(files, images, strict=True)]
+    keep_blank = task.options.keep_blank
+    masks = [file.kept_pixels(image, keep_blank=keep_blank) for file, image in zip(files, images, strict=True)]
     if len(views) == 1:
         return RectifiedImage(*resample(images[0], views[0], geometry, side, mask=masks[0]))
     return RectifiedImage(*resample_photograph(images, views, geometry, side, masks))
-
-
-def _kept_mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
-    view = photo.view
-    key = f"{file_stamp(photo.mask)} {view.width} {view.height} {file_stamp(photo.image)} {keep_blank}"
-    return _masks.get(key, lambda: _mask(photo, image, keep_blank))
-
-
-def _mask(photo: PhotoFile, image: Grey, keep_blank: bool) -> NDArray[np.uint8] | None:
-    """255 where an image takes part in matching, else 0; None where all of it does."""
-    mask = read_view_mask(photo.mask, photo.view)
-    blank = None if keep_blank else blank_pixels(image, photo.jpeg_step)
-    if blank is None or not blank.any():
-        return mask
-    counts = np.where(blank, np.uint8(0), np.uint8(255))
-    return counts if mask is None else np.minimum(counts, mask)
 
 
 def match_seconds(pixels: float) -> float:
@@ -213,7 +179,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
     name = "match pairs"
     remembered_as: ClassVar[Known | None] = "pairs"
     make = staticmethod(make_disparity_maps)
-    caches = (_photos, _masks)
+    caches = (_photos, kept_masks)
 
     @staticmethod
     def found(task: MatchTask) -> Facts | None:
@@ -276,7 +242,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         geometry = self._geometry(left, right)
         seeds = seeds_of_points(left.lead, right.lead, geometry, points)
         trial = self._trial(left, right, geometry) if is_first else 1.0
-        key = context.keys.pair(left, right, geometry, seeds, trial)
+        key = context.keys.pair(left, right, geometry, seeds, trial, context.still)
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)
         reading = max(_READ_BYTES * pixels, bytes_to_reduce(*left.views, *right.views))
@@ -336,6 +302,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
                 workspace.image_path(view.name),
                 workspace.mask_path(view.name),
                 undistorted_place(workspace, view.name).record,
+                tuple(map(workspace.image_path, self.context.still.get(view.name, ()))),
             )
         return self._photos[view.name]
 

@@ -1,15 +1,28 @@
-"""A grey image with its corners: what pairs are matched in and ties are measured in."""
+"""A grey image with its corners: what pairs are matched in and ties measured in, and which pixels take part."""
 
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.project.images.reading import read_grey
+from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
+from colmap_sph.project.images.reading import read_grey, read_small_colours
+from colmap_sph.project.masks import read_view_mask
+from colmap_sph.project.undistortion.rounding import coarsest_jpeg_step
+from colmap_sph.scene import View
+from colmap_sph.stereo.blank import blank_pixels
+from colmap_sph.stereo.poses.standstill import still_pixels
 from colmap_sph.stereo.poses.ties import find_corners
 
 Grey = NDArray[np.uint8] | NDArray[np.float32]
+Mask = NDArray[np.uint8]
+
+# What stands still is looked for with so many pixels along an image's longest side.
+_STILL_SIDE = 960
+
+kept_masks: LoadCache[Mask | None] = LoadCache(lambda mask: 0 if mask is None else mask.nbytes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,3 +49,52 @@ class Photo:
     def nbytes(self) -> int:
         """Bytes of the arrays."""
         return self.image.nbytes + self.corners.nbytes
+
+
+@dataclass(frozen=True, eq=False)
+class PhotoFile:
+    """A view without its sparse points, its image, where its mask would be, and what tells how that was made.
+
+    `turned` are images that it is compared with, where something stands still in it, see `still_pixels`.
+    """
+
+    view: View
+    image: Path
+    mask: Path
+    record: Path
+    turned: tuple[Path, ...] = ()
+
+    @property
+    def jpeg_step(self) -> int:
+        """How coarsely the image was rounded, or the original that it was made of; see `blank_pixels`."""
+        return coarsest_jpeg_step(self.image, self.record)
+
+    def kept_pixels(self, image: Grey, *, keep_blank: bool) -> Mask | None:
+        """255 where its image takes part in matching, else 0; None where all of it does."""
+        view = self.view
+        stamps = " ".join(map(file_stamp, (self.mask, self.image, *self.turned)))
+        key = f"{stamps} {view.width} {view.height} {keep_blank}"
+        return kept_masks.get(key, lambda: self._kept_pixels(image, keep_blank=keep_blank))
+
+    def _kept_pixels(self, image: Grey, *, keep_blank: bool) -> Mask | None:
+        mask = read_view_mask(self.mask, self.view)
+        if keep_blank:
+            return mask
+        ignored = blank_pixels(image, self.jpeg_step)
+        if self.turned:
+            ignored |= self._still_pixels()
+        if not ignored.any():
+            return mask
+        counts = np.where(ignored, np.uint8(0), np.uint8(255))
+        return counts if mask is None else np.minimum(counts, mask)
+
+    def _still_pixels(self) -> Mask:
+        others = (read_small(path, _STILL_SIDE) for path in self.turned)
+        still = still_pixels(read_small(self.image, _STILL_SIDE), others)
+        size = (self.view.width, self.view.height)
+        return np.asarray(cv2.resize(still, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def read_small(path: Path, longest: int) -> Mask:
+    """Read the grey values of an image, small: (h, w) uint8, its longest side at most `longest` pixels."""
+    return np.asarray(cv2.cvtColor(read_small_colours(path, longest), cv2.COLOR_BGR2GRAY), np.uint8)

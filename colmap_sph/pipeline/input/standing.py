@@ -1,0 +1,83 @@
+"""Do parts of the images stand still while the camera turns? They are not of the scene, and are not matched."""
+
+import logging
+from collections.abc import Collection, Mapping
+from contextlib import suppress
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from colmap_sph.errors import InputError
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.stages.photo import read_small
+from colmap_sph.project.masks import read_view_mask
+from colmap_sph.stereo.poses.standstill import still_pixels, turned_views
+
+logger = logging.getLogger(__name__)
+
+# Images are looked at with so many pixels along their longest side.
+_LOOKED_AT = 320
+# A smaller share of a camera's images may look alike by chance.
+_LEAST_STILL = 0.015
+
+
+def with_still_pixels(context: Context, names: Collection[str]) -> Context:
+    """Look which cameras show something that stands still: reported, and known to the context that is returned.
+
+    Of each camera the images that are turned most are compared with each other. Where these have next to nothing
+    in common, the others are not looked at.
+
+    Parameters
+    ----------
+    context : Context
+    names : collection of str
+        Images that are there.
+    """
+    if context.options.matching.keep_blank:
+        return context
+    turned = turned_views([context.scene.view(name) for name in sorted(names)])
+    shares = _still_shares(context, turned)
+    still = {}
+    for name, others in turned.items():
+        known = [shares[other] for other in others if other in shares]
+        if known and np.mean(known) >= _LEAST_STILL:
+            still[name] = others
+    if still:
+        looked_at = [shares[name] for name in still if name in shares]
+        context.report.still = _words(len(still), float(np.mean(looked_at)))
+        logger.warning("%s", context.report.still)
+    return replace(context, still=still)
+
+
+def _still_shares(context: Context, turned: Mapping[str, tuple[str, ...]]) -> dict[str, float]:
+    """Share of what is not masked that stands still, in images that others are compared with."""
+    compared = sorted({other for others in turned.values() for other in others})
+    small: dict[str, NDArray[np.uint8]] = {}
+    for name in compared:
+        with suppress(InputError):  # told by the stage that needs it
+            small[name] = read_small(context.workspace.image_path(name), _LOOKED_AT)
+    shares = {}
+    for name in small.keys() & turned.keys():
+        still = still_pixels(small[name], [small[other] for other in turned[name] if other in small])
+        with suppress(InputError):
+            wanted = _wanted(context, name, still.shape)
+            if wanted.any():
+                shares[name] = float(still[wanted].mean())
+    return shares
+
+
+def _wanted(context: Context, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    mask = read_view_mask(context.workspace.mask_path(name), context.scene.view(name))
+    if mask is None:
+        return np.ones(shape, bool)
+    return np.asarray(cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST)) > 0
+
+
+def _words(images: int, share: float) -> str:
+    return (
+        f"{share:.0%} of the pixels of {images} images stand still while the camera turns, as a backdrop, a time "
+        "stamp or a part of the vehicle would: they are not of the scene, and are ignored. Masks (--masks) are "
+        "more exact; --matching.keep-blank True matches these pixels all the same."
+    )
