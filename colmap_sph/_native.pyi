@@ -1046,6 +1046,29 @@ def source_pixels(
     inside : (H, W) uint8, written
     """
 
+def resample(
+    backend: str,
+    ray_rows: NDArray[np.float32],
+    ray_columns: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    image: NDArray[np.float32],
+    mask: NDArray[np.uint8],
+    grey: NDArray[np.float32],
+    valid: NDArray[np.uint8],
+    /,
+) -> None:
+    """Grey values of rectified pixels, linear between an image's, and 255 where all of them count.
+
+    backend : str
+    ray_rows : (3, H) float32
+    ray_columns : (3, W) float32
+    weights : (W) float32
+    image : (SOURCE_H, SOURCE_W) float32
+    mask : (MASK_H, SOURCE_W) uint8
+    grey : (H, W) float32, written
+    valid : (H, W) uint8, written
+    """
+
 def sharpen(
     backend: str,
     image: NDArray[np.float32],

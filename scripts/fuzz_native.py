@@ -448,6 +448,15 @@ def source_pixels(rng: Random) -> Arguments:
     return [backend(rng), *tables, int(rng.integers(0, 100)), int(rng.integers(0, 100)), *places]
 
 
+def resample(rng: Random) -> Arguments:
+    h, w = size(rng)
+    tables = [filled(rng, shape, np.float32) for shape in ((3, h), (3, w), (w,))]
+    source = tuple(int(side) for side in rng.integers(2, 30, 2))
+    mask = filled(rng, source, np.uint8)[: source[0] * int(rng.integers(0, 2))]
+    places = [np.zeros((h, w), kind) for kind in (np.float32, np.uint8)]
+    return [backend(rng), *tables, filled(rng, source, np.float32), mask, *places]
+
+
 def sharpen(rng: Random) -> Arguments:
     h, w = size(rng)
     return [backend(rng), filled(rng, (h, w), np.float32), number(rng), np.zeros((h + 6, w + 8), np.int16)]
@@ -529,6 +538,7 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         count_fractions,
         unwarp_torn,
         source_pixels,
+        resample,
         sharpen,
         first_offsets,
         target_bases,

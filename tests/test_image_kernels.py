@@ -61,6 +61,54 @@ def test_a_pinhole_sees_itself():
     assert (inside == 255).all()
 
 
+def resampled(tables, image, mask):
+    """Grey values and validity of rectified pixels."""
+
+    rows, columns, weights = tables
+
+    def run(backend):
+        shape = (rows.shape[1], len(weights))
+        grey, valid = np.empty(shape, np.float32), np.empty(shape, np.uint8)
+        _native.resample(backend, rows, columns, weights, image, mask, grey, valid)
+        return grey, valid
+
+    return of_every_backend(run)
+
+
+def whole_pixels(columns, rows):
+    """Tables of rays, of depth 1, that meet an image at these pixels' centres."""
+    nothing = np.zeros(len(columns))
+    ray_rows = np.stack([np.zeros(len(rows)), rows + 0.5, np.ones(len(rows))])
+    ray_columns = np.stack([columns + 0.5, nothing, nothing])
+    return [table.astype(np.float32) for table in (ray_rows, ray_columns, np.ones(len(columns)))]
+
+
+@property_test
+@given(shape=sizes, source=st.tuples(st.integers(2, 9), st.integers(2, 9)), masked=st.booleans(), seed=seeds)
+def test_resampled_pixels_lie_between_four(shape, source, masked, seed):
+    """At places in eighths of a pixel, whose weights 32 bits hold: inside, on the border, and far outside."""
+    rng = np.random.default_rng(seed)
+    rows, columns = (rng.integers(-60, 130, size) / 8 for size in shape)
+    image = rng.integers(0, 256, source).astype(np.float32)
+    mask = np.where(rng.random(source) < 0.2, 254, 255).astype(np.uint8)
+    grey, valid = resampled(whole_pixels(columns, rows), image, mask if masked else mask[:0])
+    for y, x in np.ndindex(shape):
+        weights = np.zeros(source)
+        v, u = (np.clip(place, 0, size - 1) for place, size in zip((rows[y], columns[x]), source, strict=True))
+        for i, j in np.ndindex(source):
+            weights[i, j] = max(1 - abs(v - i), 0) * max(1 - abs(u - j), 0)
+        assert grey[y, x] == (weights * image).sum()
+        inside = -0.5 <= rows[y] <= source[0] - 0.5 and -0.5 <= columns[x] <= source[1] - 0.5
+        assert valid[y, x] == 255 * (inside and not (masked and (mask < 255)[weights > 0].any()))
+
+
+def test_rays_that_are_no_numbers_read_nothing_outside():
+    tables = whole_pixels(np.array([np.nan, np.inf, -np.inf, 3e38, 1]), np.array([np.nan, np.inf, -3e38, 1]))
+    grey, valid = resampled(tables, np.full((3, 4), 7, np.float32), np.empty((0, 4), np.uint8))
+    assert (grey == 7).all()
+    assert [tuple(place) for place in np.argwhere(valid)] == [(3, 4)]
+
+
 def sharpened(image, sharpening):
     def run(backend):
         padded = np.full((image.shape[0] + 6, image.shape[1] + 8), 5, np.int16)

@@ -307,6 +307,16 @@ def arguments(function):
             "out rows": np.zeros((H, W), f32),
             "out inside": np.zeros((H, W), u8),
         },
+        "resample": {
+            "backend": "scalar",
+            "ray_rows": np.ones((3, H), f32),
+            "ray_columns": np.ones((3, W), f32),
+            "weights": np.ones(W, f32),
+            "image": np.ones((20, 30), f32),
+            "mask": np.ones((20, 30), u8),
+            "out grey": np.zeros((H, W), f32),
+            "out valid": np.zeros((H, W), u8),
+        },
         "sharpen": {
             "backend": "scalar",
             "image": np.zeros((H, W), f32),
@@ -492,6 +502,7 @@ FUNCTIONS = [
     "maps_of_planes",
     "refine_planes",
     "source_pixels",
+    "resample",
     "sharpen",
     *offsets_arguments(),
     *ties_arguments(),
@@ -514,6 +525,7 @@ FREE = {
     ("matching_cost", "target"): {1},
     ("fit_offsets", "target"): {1},
     ("census", "out census"): {1},
+    ("resample", "mask"): {0},  # none has no rows
     ("warp", "prediction"): {1},
     ("warp", "out columns"): {1},
     ("upsample_offsets", "out fine"): {0, 1},  # one less than twice as many will do, see below

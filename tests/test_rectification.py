@@ -308,7 +308,7 @@ def test_resampling_reads_the_right_place(name, surface):
             inner &= place < 255
             error = rectified_picture[inner].astype(float) - (place[inner] - 0.5)
             assert inner.sum() > 1000
-            assert np.abs(error).max() < 0.04  # not rounded to grey values; old OpenCV rounds to 1/32 pixel
+            assert np.abs(error).max() < 0.001  # not rounded to grey values, nor to parts of pixels
             assert abs(error.mean()) < 0.02
 
 

@@ -40,6 +40,7 @@
      mean_offsets_##version, \
      upsample_offsets_##version, \
      source_pixels_##version, \
+     resample_##version, \
      sharpen_##version, \
      depth_candidates_##version, \
      vote_depth_##version, \
@@ -66,6 +67,7 @@ static const kernel_table avx512_kernels = TABLE(avx512);
 #define mean_offsets_neon mean_offsets_scalar
 #define upsample_offsets_neon upsample_offsets_scalar
 #define source_pixels_neon source_pixels_scalar
+#define resample_neon resample_scalar
 #define sharpen_neon sharpen_scalar
 #define depth_candidates_neon depth_candidates_scalar
 #define vote_depth_neon vote_depth_scalar

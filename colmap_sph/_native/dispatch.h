@@ -17,6 +17,7 @@ typedef struct {
     mean_offsets_fn *mean_offsets;
     upsample_offsets_fn *upsample_offsets;
     source_pixels_fn *source_pixels;
+    resample_fn *resample;
     sharpen_fn *sharpen;
     depth_candidates_fn *depth_candidates;
     vote_depth_fn *vote_depth;

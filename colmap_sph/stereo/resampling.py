@@ -11,9 +11,6 @@ from colmap_sph.scene import View
 from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.rectified_pair import RectifiedPair, Side, angles_of_columns, pixel_from_rectified_ray
 
-# Images are resampled in bands of this many rows, which bounds the memory for their maps.
-_BAND_ROWS = 128
-
 
 def resample(
     image: NDArray[np.uint8] | NDArray[np.float32],
@@ -44,17 +41,12 @@ def resample(
         255 where the rectified pixel lies inside the image and no ignored pixel has a part in it, else 0.
     """
     shape = (pair.height, pair.width(side))
-    image = image.astype(np.float32, copy=False)
     rectified = np.empty(shape, dtype=np.float32)
     valid = np.empty(shape, dtype=np.uint8)
     tables = ray_tables(view, pair, side)
-    for first in range(0, pair.height, _BAND_ROWS):
-        band = slice(first, first + _BAND_ROWS)
-        columns, rows, inside = tables.source_pixels(view, band)
-        if mask is not None:
-            inside[cv2.remap(mask, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) < 255] = 0
-        valid[band] = inside
-        rectified[band] = cv2.remap(image, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    counts = np.empty((0, view.width), np.uint8) if mask is None else np.ascontiguousarray(mask)
+    source = np.ascontiguousarray(image, dtype=np.float32)
+    _native.resample(backend(), tables.rows, tables.columns, tables.weights, source, counts, rectified, valid)
     return rectified, valid
 
 

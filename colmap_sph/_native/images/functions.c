@@ -26,6 +26,38 @@ FUNCTION(
     source_pixels, SOURCE_PIXELS, any,
     "Where rectified pixels, of rays ray_rows * weights + ray_columns, lie in an image, and 255 inside of it.");
 
+#define RESAMPLE(X) \
+    X(VALUE, backend, backend) \
+    X(IN, float32, ray_rows, 3, H) \
+    X(IN, float32, ray_columns, 3, W) \
+    X(IN, float32, weights, W) \
+    X(IN, float32, image, SOURCE_H, SOURCE_W) \
+    X(IN, uint8, mask, MASK_H, SOURCE_W) \
+    X(OUT, float32, grey, H, W) \
+    X(OUT, uint8, valid, H, W)
+ARGUMENTS(resample, RESAMPLE);
+
+static int check_resample(const void *arguments) {
+    const resample_arguments *a = arguments;
+    return check(a->size.SOURCE_H >= 2 && a->size.SOURCE_W >= 2,
+                 "an image must have a size of 2 x 2 pixels or more") &&
+           check(a->size.SOURCE_H <= INT32_MAX / a->size.SOURCE_W,
+                 "an image must have a size of fewer than 2^31 pixels") &&
+           check(a->size.MASK_H == 0 || a->size.MASK_H == a->size.SOURCE_H,
+                 "a mask must have the size of its image, or no rows");
+}
+
+static int run_resample(void *arguments) {
+    const resample_arguments *a = arguments;
+    const ray_tables tables = {a->ray_rows, a->ray_columns, a->weights, a->size.H, a->size.W};
+    const uint8_t *mask = a->size.MASK_H > 0 ? a->mask : NULL;
+    const source_image source = {a->image, mask, a->size.SOURCE_H, a->size.SOURCE_W};
+    return a->backend->resample(tables, source, a->grey, a->valid);
+}
+
+FUNCTION(resample, RESAMPLE, check_resample,
+         "Grey values of rectified pixels, linear between an image's, and 255 where all of them count.");
+
 #define SHARPEN(X) \
     X(VALUE, backend, backend) \
     X(IN, float32, image, H, W) \
@@ -42,4 +74,4 @@ FUNCTION(
     sharpen, SHARPEN, any,
     "An image plus so many times what it differs by from its mean nearby, in 1/64 grey value, with a border.");
 
-native_function *const images_functions[] = {&source_pixels_function, &sharpen_function, NULL};
+native_function *const images_functions[] = {&source_pixels_function, &resample_function, &sharpen_function, NULL};

@@ -17,12 +17,24 @@ typedef struct {
 typedef void source_pixels_fn(ray_tables tables, float source_width, float source_height, float *columns,
                               float *rows, uint8_t *inside);
 
+/* Grey values, and where they count, 255 (NULL: everywhere); no fewer than 2 x 2 pixels, and fewer than 2^31. */
+typedef struct {
+    const float *pixels;
+    const uint8_t *mask;
+    ptrdiff_t height, width;
+} source_image;
+
+/* Grey values of rectified pixels, linear between those of the source, beyond which its outermost ones go on; and
+ * 255 where they lie inside and no pixel that does not count has a part in them, else 0. -1 without memory. */
+typedef int resample_fn(ray_tables tables, source_image source, float *grey, uint8_t *valid);
+
 /* An image plus `sharpening` times its difference from the binomial mean of 3 x 3 pixels, in 1/CENSUS_STEPS grey
  * value, cut to whole ones, with a border of CENSUS_RADIUS_{Y,X}: there, and beside it, the outermost pixels of
  * the image go on. -1 without memory. */
 typedef int sharpen_fn(const float *image, ptrdiff_t height, ptrdiff_t width, float sharpening, int16_t *padded);
 
 source_pixels_fn source_pixels_scalar, source_pixels_avx2, source_pixels_avx512;
+resample_fn resample_scalar, resample_avx2, resample_avx512;
 sharpen_fn sharpen_scalar, sharpen_avx2, sharpen_avx512;
 
 #endif

@@ -1,8 +1,6 @@
 #include "images/images.h"
+#include "images/ray_place.h"
 #include "version.h"
-
-/* Rays of length about 1 whose depth is less lie beside the camera. */
-static const float LEAST_DEPTH = 1e-6f;
 
 /* A row of rectified pixels, whose rays are `row` times their weights, and what their columns add. */
 static void source_row(const float *row, const float *restrict across, const float *restrict down,
@@ -11,13 +9,11 @@ static void source_row(const float *row, const float *restrict across, const flo
                        uint8_t *restrict inside) {
     const float row_x = row[0], row_y = row[1], row_z = row[2], source_width = size[0], source_height = size[1];
     for (ptrdiff_t x = 0; x < width; x++) {
-        const float z = row_z * weights[x] + away[x], scale = z > LEAST_DEPTH ? 1 / z : z;
-        const float u = (row_x * weights[x] + across[x]) * scale, v = (row_y * weights[x] + down[x]) * scale;
-        const int32_t in = (z > LEAST_DEPTH) & (u >= 0) & (u <= source_width) & (v >= 0) & (v <= source_height);
-        /* COLMAP counts from the pixel's corner. */
-        columns[x] = u - 0.5f;
-        rows[x] = v - 0.5f;
-        inside[x] = (uint8_t)-in;
+        const ray_place place = place_of_ray(row_x, row_y, row_z, weights[x], across[x], down[x], away[x],
+                                             source_width, source_height);
+        columns[x] = place.column;
+        rows[x] = place.row;
+        inside[x] = (uint8_t)-place.inside;
     }
 }
 
