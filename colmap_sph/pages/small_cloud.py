@@ -74,9 +74,12 @@ def thin_out(
     """
     if not len(points):
         return None
-    low, high = np.percentile(points, (50 - _INSIDE / 2, 50 + _INSIDE / 2), axis=0)
+    # Along rows as long as the cloud: three times as fast as along columns.
+    low, high = np.percentile(np.ascontiguousarray(points.T), (50 - _INSIDE / 2, 50 + _INSIDE / 2), axis=1)
     margin = 1e-9 + 0.01 * (high - low).max()
-    inside = ((points >= low - margin) & (points <= high + margin)).all(axis=1)
+    inside = np.ones(len(points), bool)
+    for along, least, most_along in zip(points.T, low - margin, high + margin, strict=True):
+        inside &= (along >= least) & (along <= most_along)
     points = points[inside]
     colours = colours[inside]
     corner = points.min(axis=0)
@@ -95,15 +98,27 @@ def _one_per_cell(points: NDArray[np.float64], extent: float, most: int) -> NDAr
     # points than the coarsest one has cells.
     coarse = most ** (1 / 3) / 2
     fine = float(STEPS)
-    best = np.empty(0, np.int64)
+    best = 0.0
+    number = 0
     cells = math.sqrt(most)
-    while len(best) < _ENOUGH * most and fine > _CLOSE * coarse:
-        keys = np.floor(points * (cells / max(extent, 1e-12))).astype(np.int64)
-        first = np.unique(keys @ np.array([1, 1 << 20, 1 << 40]), return_index=True)[1]
-        if len(first) <= most:
-            best = first
-            coarse = cells
+    while number < _ENOUGH * most and fine > _CLOSE * coarse:
+        keys = np.sort(_cells(points, extent, cells))
+        filled = 1 + np.count_nonzero(keys[1:] != keys[:-1])
+        if filled <= most:
+            number = filled
+            best = coarse = cells
         else:
             fine = cells
         cells = math.sqrt(coarse * fine)
-    return np.sort(best)
+    if not best:
+        return np.empty(0, np.int64)
+    # Which point is the first of its cell takes much longer than how many cells there are.
+    return np.sort(np.unique(_cells(points, extent, best), return_index=True)[1])
+
+
+def _cells(points: NDArray[np.float64], extent: float, cells: float) -> NDArray[np.int64]:
+    """Number of each point's cell, of so many along the extent."""
+    number = np.zeros(len(points), np.int64)
+    for axis in range(3):
+        number += np.floor(points[:, axis] * (cells / max(extent, 1e-12))).astype(np.int64) << (20 * axis)
+    return number
