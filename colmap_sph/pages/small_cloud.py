@@ -1,6 +1,7 @@
 """A sample of a cloud → few points that stand for it, in 16-bit coordinates, for a browser to turn."""
 
 import base64
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ _INSIDE = 99.6
 # So much of what is allowed will do; finer and coarser grids as near to each other as this are not told apart.
 _ENOUGH = 0.85
 _CLOSE = 1.02
+_GUESSES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,15 +103,20 @@ def _one_per_cell(points: NDArray[np.float64], extent: float, most: int) -> NDAr
     best = 0.0
     number = 0
     cells = math.sqrt(most)
-    while number < _ENOUGH * most and fine > _CLOSE * coarse:
+    for attempt in itertools.count(1):
         keys = np.sort(_cells(points, extent, cells))
-        filled = 1 + np.count_nonzero(keys[1:] != keys[:-1])
+        filled = 1 + int(np.count_nonzero(keys[1:] != keys[:-1]))
         if filled <= most:
             number = filled
             best = coarse = cells
         else:
             fine = cells
-        cells = math.sqrt(coarse * fine)
+        if number >= _ENOUGH * most or fine <= _CLOSE * coarse:
+            break
+        # Cells of a surface grow with the square of the fineness; of what is none the grid is found by halving.
+        cells *= math.sqrt((1 + _ENOUGH) / 2 * most / filled)
+        if attempt > _GUESSES or not coarse < cells < fine:
+            cells = math.sqrt(coarse * fine)
     if not best:
         return np.empty(0, np.int64)
     # Which point is the first of its cell takes much longer than how many cells there are.
