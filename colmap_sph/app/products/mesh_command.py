@@ -12,7 +12,6 @@ from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.pipeline.options import num_cores
 from colmap_sph.products.georeferencing import GeoreferenceOptions
-from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.options import MeshOptions
 
 
@@ -44,6 +43,8 @@ def mesh_command(command: MeshCommand, terminal: Terminal) -> int:
     workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
     folder = command.output or workspace.mesh_dir
     with Display(terminal) as display:
+        from colmap_sph.products.mesh.make import MeshRequest, make_mesh  # which no other command needs
+
         request = MeshRequest(
             workspace, georeference, command.options, folder, memory, num_cores(), command.overwrite
         )

@@ -11,7 +11,6 @@ from colmap_sph.app.products.opening import opened_on_map
 from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.products.georeferencing import GeoreferenceOptions
-from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
 
 
@@ -45,6 +44,8 @@ def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
     workspace, georeference = opened_on_map(command.workspace, command.georeference, terminal)
     folder = command.output or workspace.surface_dir
     with Display(terminal) as display:
+        from colmap_sph.products.surface.make import SurfaceRequest, make_surface  # which no other command needs
+
         request = SurfaceRequest(workspace, georeference, command.options, folder, memory, command.overwrite)
         paths, summary = make_surface(request, display.start, display.advance)
     size = f"{summary.width} x {summary.height} cells of {summary.cell:g}"
