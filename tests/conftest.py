@@ -19,6 +19,7 @@ SMALL_BLOCK = BlockOptions(
 
 
 _CALL = ChildProcess.call
+_START_FOR = ChildProcess.start_for
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
 
 
@@ -35,6 +36,7 @@ def without_child_processes() -> Iterator[None]:
     """COLMAP works in the tests' own process: a process of its own takes longer to start than most of its work."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ChildProcess, "call", lambda _, function, argument, what: function(argument))
+        patch.setattr(ChildProcess, "start_for", lambda _, function: None)
         yield
 
 
@@ -42,6 +44,7 @@ def without_child_processes() -> Iterator[None]:
 def with_child_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """COLMAP works in a process of its own, as it does for users."""
     monkeypatch.setattr(ChildProcess, "call", _CALL)
+    monkeypatch.setattr(ChildProcess, "start_for", _START_FOR)
 
 
 @pytest.fixture

@@ -170,6 +170,7 @@ def main(project: Path, first: int, last: int) -> None:
     logging.captureWarnings(False)
     # A process of its own for COLMAP takes longer to start than most of its work.
     ChildProcess.call = lambda _, function, argument, what: function(argument)  # type: ignore[assignment, method-assign]
+    ChildProcess.start_for = lambda _, function: None  # type: ignore[assignment, method-assign]
     resource.setrlimit(resource.RLIMIT_AS, (_BYTES, _BYTES))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     for seed in range(first, last):

@@ -71,6 +71,7 @@ def copy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def digests() -> dict[str, str]:
     program.program_digest.cache_clear()
+    program._looked_at.cache_clear()
     return {name: program.program_digest(module) for name, module in MAKERS.items()}
 
 
@@ -105,3 +106,4 @@ def test_an_edit_changes_the_keys_of_what_it_makes(edited: str, redone: set[str]
     after = digests()
     assert {name for name in before if before[name] != after[name]} == redone
     program.program_digest.cache_clear()
+    program._looked_at.cache_clear()

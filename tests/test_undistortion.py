@@ -532,6 +532,18 @@ def test_colmaps_end_is_that_of_one_image(tmp_path: Path) -> None:
     child.close()
 
 
+@pytest.mark.usefixtures("with_child_processes")
+def test_colmaps_process_may_start_before_its_folder_is_there(tmp_path: Path) -> None:
+    child = ChildProcess(tmp_path / "scratch")
+    child.start_for(Path.touch)
+    (tmp_path / "scratch").mkdir()
+    with pytest.raises(InputError, match="what it says itself"):
+        child.call(raise_error, InputError("what it says itself"), "x.jpg")
+    with pytest.raises(InputError, match=r"COLMAP ended with exit code 7 at x\.jpg \(so it ends\)"):
+        child.call(end_process, "so it ends", "x.jpg")
+    child.close()
+
+
 def end_process(words: str) -> None:
     print(words, file=sys.stderr)
     os._exit(7)

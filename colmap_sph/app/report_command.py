@@ -12,7 +12,6 @@ from colmap_sph.app.display import Display
 from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pages import write_page
-from colmap_sph.pages.whole_cloud import CloudServer
 from colmap_sph.platforms.surroundings import has_screen
 from colmap_sph.project.claim import check_links
 from colmap_sph.project.sparse_model import has_model
@@ -86,6 +85,8 @@ def _serve_cloud(workspace: Workspace, port: int, terminal: Terminal) -> int:
                 display.start("look at the cloud", blocks)
                 is_begun = True
             display.advance()
+
+        from colmap_sph.pages.whole_cloud import CloudServer  # which no other command needs
 
         server = CloudServer(workspace, port=port, looked_at=looked_at)
     try:

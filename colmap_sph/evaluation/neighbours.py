@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
 from colmap_sph.errors import OptionError
 
@@ -17,6 +16,8 @@ class PointIndex:
     """Nearest-neighbour search in a cloud of (N, 3) points."""
 
     def __init__(self, points: Points) -> None:
+        from scipy.spatial import cKDTree  # which takes long to load
+
         # Neighbours in space next to each other in memory make building and searching three times faster;
         # for such points the balanced tree is slower to build and no faster to search.
         self._order = spatial_order(points)

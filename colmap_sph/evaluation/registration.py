@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
 from colmap_sph.errors import InputError
 from colmap_sph.evaluation.geometry_io import require
@@ -102,6 +101,8 @@ def register(cloud: Points, reference: Points, *, max_distance: float, threads: 
     applied = bool(np.isfinite(motion).all() and after <= before)
     if not applied:
         logger.warning("registration made the residual larger (%.4g to %.4g m): it is not applied", before, after)
+    from scipy.spatial.transform import Rotation  # which takes long to load
+
     rotation = float(np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude()))
     if applied and rotation > _MOST_DEGREES:
         logger.warning(

@@ -97,10 +97,12 @@ def seen_from_above(
     longest = int(np.clip(np.sqrt(len(points) / _POINTS_PER_CELL / area), _FEWEST_CELLS, _MOST_CELLS))
     shape = frame.cells(longest)
     up = points @ frame.axes[2]
-    order = np.argsort(up, kind="stable")
-    cells, inside = _cells(frame, points[order], shape)
-    top = np.full(shape[0] * shape[1], -1, np.int64)
-    top[cells] = order[inside]  # of several the last counts: the highest
+    cells, inside = _cells(frame, points, shape)
+    highest = np.full(shape[0] * shape[1], -np.inf)
+    np.maximum.at(highest, cells, up[inside])
+    is_highest = up[inside] == highest[cells]
+    top = np.full(len(highest), -1, np.int64)
+    top[cells[is_highest]] = np.flatnonzero(inside)[is_highest]  # of several the last counts
     there = (top >= 0).reshape(shape)
     picture = np.zeros((*shape, 4), np.uint8)
     if there.any():
@@ -114,10 +116,9 @@ def _cells(
     frame: Frame, points: NDArray[np.float64], shape: tuple[int, int]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Numbers of the cells of those points that lie in the frame, and which these are."""
-    place = frame.place(points) * [shape[1], shape[0]]
-    inside = np.asarray(((place >= 0) & (place < [shape[1], shape[0]])).all(axis=1))
-    column, row = place[inside].astype(np.int64).T
-    return np.asarray(row * shape[1] + column), inside
+    x, y = (frame.place(points) * [shape[1], shape[0]]).T
+    inside = np.asarray((x >= 0) & (x < shape[1]) & (y >= 0) & (y < shape[0]))
+    return np.asarray(y[inside].astype(np.int64) * shape[1] + x[inside].astype(np.int64)), inside
 
 
 @dataclass(eq=False)

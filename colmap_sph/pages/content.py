@@ -10,6 +10,7 @@ from colmap_sph.pages.image_facts import ImageFacts
 from colmap_sph.pages.pair_facts import PairFacts
 from colmap_sph.pages.products import ProductFile, ProductPicture
 from colmap_sph.pages.run_facts import RunFacts
+from colmap_sph.pages.small_cloud import SmallCloud
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Photograph, Scene
 
@@ -42,6 +43,26 @@ class CloudSample:
 
 
 @dataclass(frozen=True, eq=False)
+class CloudDrawing:
+    """What a cloud with points looks like.
+
+    Attributes
+    ----------
+    small : SmallCloud
+        Along the axes of the map.
+    colours, heights : str
+        Pictures of it from above, as URIs.
+    height_ends : (float, float)
+        Least and largest height of the scale, relative to the least.
+    """
+
+    small: SmallCloud
+    colours: str
+    heights: str
+    height_ends: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
 class Content:
     """What a page tells.
 
@@ -57,6 +78,8 @@ class Content:
         Of the photographs, in their order.
     pairs : list of PairFacts
     cloud : CloudSample
+    drawing : CloudDrawing or None
+        Of the cloud; None where that has no points.
     frame : Frame
     ground : Ground
     missing : str
@@ -72,6 +95,7 @@ class Content:
     images: list[ImageFacts]
     pairs: list[PairFacts]
     cloud: CloudSample
+    drawing: CloudDrawing | None
     frame: Frame
     ground: Ground
     missing: str

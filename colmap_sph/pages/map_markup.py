@@ -6,19 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.pages.block_map import Frame, looks_towards, seen_from_above
+from colmap_sph.pages.block_map import Frame, looks_towards
 from colmap_sph.pages.content import Content
 from colmap_sph.pages.image_facts import ImageFacts
-from colmap_sph.pages.pictures import colour_of, picture_uri
+from colmap_sph.pages.pictures import colour_of, layer_uri
 from colmap_sph.pages.reasons import WORDS, Reason
-from colmap_sph.pages.small_cloud import STEPS, thin_out
+from colmap_sph.pages.small_cloud import STEPS
 from colmap_sph.pages.words import percent
 from colmap_sph.scene import Photograph, View
 
-# Of the map: units of its drawing along the longer side, a camera's size, and bytes of a layer at most.
+# Of the map: units of its drawing along the longer side, and a camera's size.
 _MAP_UNITS = 1000
 _CAMERA_UNITS = 22.0
-_LAYER_BYTES = 150_000
 # More cameras than these are drawn smaller.
 _FULL_SIZE = 150
 # Sine of the angle from straight down below which a camera has no direction on the map.
@@ -30,9 +29,9 @@ _MOST_FOOTPRINTS = 80
 def cloud_values(content: Content) -> dict[str, Any]:
     """Values of the template for the cloud."""
     sample = content.cloud
-    small = thin_out(sample.points @ content.frame.axes.T, sample.colours)
-    if small is None:
+    if content.drawing is None:
         return {"cloud": None, "no_cloud": sample.lack, "data": {"cloud": None}}
+    small = content.drawing.small
     data = {
         "count": len(small.places),
         "middle": (small.middle / STEPS).round(5).tolist(),
@@ -69,17 +68,22 @@ def map_values(content: Content) -> dict[str, Any]:
 
 
 def _layers(content: Content) -> list[dict[str, Any]]:
-    frame, ground, cloud = content.frame, content.ground, content.cloud
+    ground, drawing = content.ground, content.drawing
     layers = []
-    if len(cloud.points):
-        coloured, heights, ends = seen_from_above(frame, cloud.points, cloud.colours)
-        layers.append(_layer("colours", coloured, "The cloud from above."))
-        layers.append(_layer("height", heights, "Height of the cloud, units:", ends))
+    if drawing is not None:
+        layers.append(_layer("colours", drawing.colours, "The cloud from above."))
+        layers.append(_layer("height", drawing.heights, "Height of the cloud, units:", drawing.height_ends))
     counts, ends = ground.count_layer()
-    layers.append(_layer("images", counts, "Images with a confirmed depth of each place:", ends))
+    layers.append(_layer("images", layer_uri(counts), "Images with a confirmed depth of each place:", ends))
     gsds, gsd_ends = ground.gsd_layer()
     layers.append(
-        _layer("GSD", gsds, "What a pixel of the finest image covers, units:", gsd_ends, is_reversed=True)
+        _layer(
+            "GSD",
+            layer_uri(gsds),
+            "What a pixel of the finest image covers, units:",
+            gsd_ends,
+            is_reversed=True,
+        )
     )
     weak, shares = ground.weak_layer()
     named = ", ".join(f"{WORDS[reason][0]} {percent(share)}" for reason, share in shares.items())
@@ -88,13 +92,13 @@ def _layers(content: Content) -> list[dict[str, Any]]:
         if named
         else ("There is no place of which more pixels were lost than confirmed.")
     )
-    layers.append(_layer("weak areas", weak, words, on_colours=True))
+    layers.append(_layer("weak areas", layer_uri(weak, exact=True), words, on_colours=True))
     return layers
 
 
 def _layer(
     name: str,
-    picture: NDArray[np.uint8],
+    uri: str,
     text: str,
     ends: tuple[float, float] | None = None,
     *,
@@ -103,7 +107,7 @@ def _layer(
 ) -> dict[str, Any]:
     return {
         "name": name,
-        "uri": picture_uri(picture, _LAYER_BYTES, exact=on_colours),
+        "uri": uri,
         "text": text,
         "ends": None if ends is None else [f"{end:.4g}" for end in ends],
         "reversed": is_reversed,

@@ -1,17 +1,19 @@
 """A dense workspace → its page ``colmap_sph/report.html``, one file that shows what came out and loads nothing."""
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.pages.block_map import Frame, Ground, footprint, frame_around, surface_points
-from colmap_sph.pages.cloud_sample import read_cloud
+from colmap_sph.pages.cloud_drawing import draw_cloud
+from colmap_sph.pages.cloud_sample import cloud_of_maps, find_cloud
 from colmap_sph.pages.content import CloudSample, Content
 from colmap_sph.pages.image_facts import (
     ImageFacts,
@@ -39,8 +41,6 @@ from colmap_sph.stereo.partners.pairs import overlapping_views
 from colmap_sph.stereo.region.map_axes import map_axes
 
 Bytes = NDArray[np.uint8]
-Item = TypeVar("Item")
-Fact = TypeVar("Fact")
 
 # Points of an image's surface, to stand for it where there is no cloud; of the cloud, to frame the map.
 _SURFACE_SAMPLE = 300
@@ -113,41 +113,46 @@ def gather(workspace: Workspace, progress: Progress, threads: int) -> Content:
     def sample(view: View) -> MapSamples:
         return read_samples(workspace, view, side, told.kinds_of(view.name))
 
-    for view, its_samples in _in_threads(sample, scene.views, threads):
-        samples[view.name] = its_samples
-        progress.advance()
-    cloud = read_cloud(workspace, scene, samples)
-    if not cloud.total and not any(each.has_maps for each in samples.values()):
-        raise InputError(
-            f"There is nothing to show of {workspace.root} yet: it has neither depth maps nor a cloud; "
-            "run colmap_sph run first."
-        )
-    block = _Block(workspace, scene, told, samples, cloud)
-    images = []
-    for photograph, image in _in_threads(block.look_at, block.photographs, threads):
-        images.append(image)
-        for _ in photograph.views:
+    with _pool(threads) as pool:
+        found = pool.submit(find_cloud, workspace)  # first, as it takes longest
+        for view, its_samples in zip(scene.views, pool.map(sample, scene.views), strict=True):
+            samples[view.name] = its_samples
             progress.advance()
-    return Content(
-        workspace,
-        scene,
-        facts,
-        block.photographs,
-        images,
-        block.pairs,
-        cloud,
-        block.frame,
-        block.ground,
-        _missing(block, facts),
-        *products_of(workspace),
-    )
+        cloud = cloud_of_maps(workspace, scene, samples, found.result())
+        if not cloud.total and not any(each.has_maps for each in samples.values()):
+            raise InputError(
+                f"There is nothing to show of {workspace.root} yet: it has neither depth maps nor a cloud; "
+                "run colmap_sph run first."
+            )
+        block = _Block(workspace, scene, told, samples, cloud)
+        drawing = pool.submit(draw_cloud, cloud, block.frame)
+        images = []
+        for photograph, image in zip(block.photographs, pool.map(block.look_at, block.photographs), strict=True):
+            images.append(image)
+            for _ in photograph.views:
+                progress.advance()
+        return Content(
+            workspace,
+            scene,
+            facts,
+            block.photographs,
+            images,
+            block.pairs,
+            cloud,
+            drawing.result(),
+            block.frame,
+            block.ground,
+            _missing(block, facts),
+            *products_of(workspace),
+        )
 
 
-def _in_threads(look: Callable[[Item], Fact], items: Sequence[Item], threads: int) -> Iterator[tuple[Item, Fact]]:
-    """Items in their order, each with what a worker thread makes of it."""
+@contextmanager
+def _pool(threads: int) -> Iterator[ThreadPoolExecutor]:
+    """Worker threads; what they have not begun when this ends is left."""
     with ThreadPoolExecutor(threads) as pool:
         try:
-            yield from zip(items, pool.map(look, items), strict=True)
+            yield pool
         finally:
             pool.shutdown(cancel_futures=True)
 

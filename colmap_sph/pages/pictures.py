@@ -24,9 +24,16 @@ COLOURS: dict[Reason, tuple[int, int, int]] = {
 }
 # Where a map has nothing.
 _NOTHING = (44, 46, 52)
+# Of a layer of the map at most.
+_LAYER_BYTES = 150_000
 _QUALITIES = (80, 60, 40, 20)
 _SMALLEST = 16
 _LOSSLESS = 101
+
+
+def layer_uri(picture: Bytes, *, exact: bool = False) -> str:
+    """A layer of the map as a URI, see `picture_uri`."""
+    return picture_uri(picture, _LAYER_BYTES, exact=exact)
 
 
 def picture_uri(picture: Bytes, most_bytes: int, *, exact: bool = False) -> str:

@@ -120,6 +120,8 @@ class Preparation:
         self._overwrite = overwrite
         self._verify = verify
         self._marker = Marker(self._originals.model_digest(), options.undistortion.of_marker(self._originals.cuts))
+        # Scratch of its own for each run, as the process of one that was killed may still be at work.
+        self._child = ChildProcess(self.workspace.undistortion_scratch_dir / str(os.getpid()))
         self._found = check_ours(self.workspace) if overwrite else check_made_from(self.workspace, self._marker)
         self.names = self._names()
         originals = self._originals
@@ -159,6 +161,17 @@ class Preparation:
         executor : callable
             What is done with each stage, see `Executor`.
         """
+        if self.is_finished and not self._overwrite:
+            self._make(executor)
+            return
+        # COLMAP is likely to be asked for the model: its process loads while images are looked at.
+        self._child.start_for(undistort_model)
+        try:
+            self._make(executor)
+        finally:
+            self._child.close()
+
+    def _make(self, executor: "Executor") -> None:
         images = self.check(executor)
         self.begin(images)
         self.finish(self.undistort(executor, images))
@@ -220,8 +233,7 @@ class Preparation:
         self.workspace.create_stereo_dirs(names)
         scratch = self.workspace.undistortion_scratch_dir
         with scratch_folder(scratch):
-            # Of its own for each run, as the process of one that was killed may still be at work.
-            folder = scratch / str(os.getpid())
+            folder = self._child.folder
             make_dir(folder)
             made = self._undistort_model(folder, names)
             if self._found is not None:
@@ -288,9 +300,8 @@ class Preparation:
     def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
         """Undistort the model in a process of its own; return the folder where it is."""
         task = ModelToUndistort(self._originals.model_dir, tuple(names), self.options.undistortion, scratch)
-        child = ChildProcess(scratch)
         try:
-            child.call(undistort_model, task, f"the model in {self.workspace.root}")
+            self._child.call(undistort_model, task, f"the model in {self.workspace.root}")
         except InputError as error:
             # The model was read before: what can go wrong is that the disk does not take the new one.
             raise OutputError(
@@ -298,7 +309,7 @@ class Preparation:
                 "permissions."
             ) from error
         finally:
-            child.close()
+            self._child.close()
         return task.final_dir
 
     def _adopt_images(self, *, has_masks: bool) -> None:

@@ -17,7 +17,7 @@ import simplejpeg
 
 import colmap_sph
 from colmap_sph import _native
-from colmap_sph.pipeline.digests import digest, file_digest
+from colmap_sph.pipeline.digests import digest, file_digest, new_digest
 from colmap_sph.project.colmap_library import COLMAP_VERSION
 
 _ROOT = Path(__file__).parents[1]
@@ -37,7 +37,7 @@ def program_digest(module: str) -> str:
     module : str
         Such as "colmap_sph.stereo.matching".
     """
-    files = {name: file_digest(_source_of(name)) for name in reached_modules(module)}
+    files = {name: _looked_at(_source_of(_ROOT, name))[0] for name in reached_modules(module)}
     return digest(files, file_digest(Path(_native.__file__)), list(_libraries().values()))
 
 
@@ -67,15 +67,20 @@ def reached_modules(module: str) -> list[str]:
         name = waiting.pop()
         if name not in reached:
             reached.add(name)
-            waiting += _imported_by(_source_of(name))
+            waiting += _looked_at(_source_of(_ROOT, name))[1]
             package, _, _ = name.rpartition(".")
             waiting += [package] if package else []
     return sorted(reached)
 
 
 @cache
-def _imported_by(source: Path) -> tuple[str, ...]:
-    return tuple(name for name in _ours_imported(source.read_bytes()) if _source_of(name).is_file())
+def _looked_at(source: Path) -> tuple[str, tuple[str, ...]]:
+    """Digest of a module's code, and the names of this package's modules that it imports."""
+    code = source.read_bytes()
+    state = new_digest()
+    state.update(code)
+    names = dict.fromkeys(_ours_imported(code))
+    return state.hexdigest(), tuple(name for name in names if _source_of(_ROOT, name).is_file())
 
 
 def _ours_imported(source: bytes) -> tuple[str, ...]:
@@ -87,6 +92,7 @@ def _ours_imported(source: bytes) -> tuple[str, ...]:
     return tuple(name for name in names if name.partition(".")[0] == _ROOT.name)
 
 
-def _source_of(module: str) -> Path:
-    path = _ROOT.joinpath(*module.split(".")[1:])
+@cache
+def _source_of(root: Path, module: str) -> Path:
+    path = root.joinpath(*module.split(".")[1:])
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")

@@ -95,7 +95,7 @@ def points_of(points: NDArray[np.void]) -> tuple[NDArray[np.float64], NDArray[np
     if all(name in (kind.names or ()) and kind[name] == np.uint8 for name in _COLOURS):
         rgb = np.column_stack([points[name] for name in _COLOURS])
     likely = is_plausible(xyz)
-    return xyz[likely], rgb[likely]
+    return (xyz, rgb) if likely.all() else (xyz[likely], rgb[likely])
 
 
 def read_layout(path: Path, file: BufferedReader) -> PlyLayout:

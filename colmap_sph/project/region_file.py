@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from colmap_sph.errors import InputError, OptionError, reason_of
 from colmap_sph.project.files import read_small
@@ -125,6 +124,8 @@ def _turned_box(
     is_box = np.isfinite(middle).all() and (sides > 0).all()
     if not is_box or not abs(np.linalg.norm(quaternion) - 1) < _NEARLY_UNIT:
         return None
+    from scipy.spatial.transform import Rotation  # which takes long to load
+
     axes = Rotation.from_quat(np.roll(quaternion, -1)).as_matrix()
     return Region(axes @ middle + np.array([-0.5, 0.5])[:, None] * sides, axes=axes)
 
@@ -143,6 +144,8 @@ def as_given(region: Region) -> str:
     step = 10.0 ** (math.floor(math.log10(sides.min())) - 2)
     if region.axes is None:
         return _numbers([*np.floor(region.box[0] / step) * step, *np.ceil(region.box[1] / step) * step], step)
+    from scipy.spatial.transform import Rotation
+
     middle = region.axes.T @ region.box.mean(axis=0)
     quaternion = np.roll(Rotation.from_matrix(region.axes).as_quat(canonical=True), 1)
     turn = _numbers(quaternion, 1e-7)

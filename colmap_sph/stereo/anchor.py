@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from colmap_sph.scene import Scene, View
 
@@ -64,6 +63,8 @@ def _grid_step(scene: Scene, centers: NDArray[np.float64], points: NDArray[np.fl
     sizes = [_pixel_size(view, center, points) for view, center in zip(scene.views, centers, strict=True)]
     known = [size for size in sizes if size > 0]
     if not known:
+        from scipy.spatial import cKDTree  # which takes long to load, and is seldom needed
+
         # Cameras stand nearer to each other than to what they look at.
         nearest = cKDTree(centers).query(centers, k=min(2, len(centers)))[0].reshape(len(centers), -1)[:, -1]
         apart = nearest > 10 * exact

@@ -12,7 +12,6 @@ from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.pipeline.options import num_cores
 from colmap_sph.products.georeferencing import GeoreferenceOptions
-from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.options import MeshOptions
 
 
@@ -39,6 +38,8 @@ class MeshCommand:
 
 def mesh_command(command: MeshCommand, terminal: Terminal) -> int:
     """`colmap_sph mesh`: paths of what was made on the standard output."""
+    from colmap_sph.products.mesh.make import MeshRequest, make_mesh  # which no other command needs
+
     command.options.check()
     memory = budget(parse_memory(command.memory))
     with opened_on_map(command.workspace, command.georeference, terminal) as (workspace, georeference):

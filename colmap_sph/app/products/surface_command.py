@@ -11,7 +11,6 @@ from colmap_sph.app.products.opening import opened_on_map
 from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.products.georeferencing import GeoreferenceOptions
-from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
 
 
@@ -40,6 +39,8 @@ class SurfaceCommand:
 
 def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
     """`colmap_sph surface`: paths of what was made on the standard output."""
+    from colmap_sph.products.surface.make import SurfaceRequest, make_surface  # which no other command needs
+
     command.options.check()
     memory = budget(parse_memory(command.memory))
     with opened_on_map(command.workspace, command.georeference, terminal) as (workspace, georeference):

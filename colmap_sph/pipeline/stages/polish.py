@@ -13,7 +13,6 @@ import numpy as np
 
 from colmap_sph.pipeline.stages.facts import Facts, Polish
 from colmap_sph.pipeline.stages.fine_ties import CACHE_BYTES, fine_ties
-from colmap_sph.pipeline.stages.refine_cameras import CamerasToRefine, refine_cameras
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
 from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
@@ -155,6 +154,9 @@ def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement
 
 def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
     """Refine the cameras of the original model, and leave it in the workspace where it is better."""
+    # Not before: what it is solved with takes its time to load.
+    from colmap_sph.pipeline.stages.refine_cameras import CamerasToRefine, refine_cameras
+
     used, held_out = _divided(tracks)
     to_refine = CamerasToRefine(
         task.given.model_dir, task.given.image_dir, task.undistortion, scene, _observations(used, scene), held_out

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.products.clouds.spread import measured_cloud
@@ -172,6 +171,8 @@ def _simplified(mesh: Triangles, request: MeshRequest, scratch: Path) -> Triangl
     full, fewer = scratch / "full.ply", scratch / "fewer.ply"
     write_ply(full, mesh, mesh.points)
     simplify(full, fewer, ratio=request.options.simplify, threads=request.threads)
+    from scipy.spatial import cKDTree  # which takes long to load
+
     found = read_ply(fewer)
     # COLMAP drops colours.
     _, nearest = cKDTree(mesh.points).query(found.points)

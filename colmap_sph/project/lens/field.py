@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 if TYPE_CHECKING:
     from scipy.interpolate import RectBivariateSpline
+    from scipy.sparse import csr_array
 
 Float = NDArray[np.float64]
 
@@ -49,8 +49,11 @@ class LensField:
         rows, columns = cells
         return cls(low, high, np.zeros((2, rows + _ORDER - 1, columns + _ORDER - 1)))
 
-    def basis(self, rays: Float) -> csr_array:
+    def basis(self, rays: Float) -> "csr_array":
         """(n, coefficients of x) sparse matrix: what each coefficient adds at (n, 2) rays."""
+        # Not before, here and below: they take their time to load, and few runs have a field.
+        from scipy.sparse import csr_array
+
         rows, columns = self.coefficients.shape[1:]
         place = np.clip((rays - self.low) / (self.high - self.low), 0, 1)
         column, along = _weights(place[:, 0], columns - _ORDER + 1)
@@ -99,7 +102,6 @@ class LensField:
     @cached_property
     def _inverse(self) -> "list[RectBivariateSpline]":
         """Displacements from true rays to those of the camera model, x and y."""
-        # Not before: it takes its time to load, and few runs have a field.
         from scipy.interpolate import RectBivariateSpline
 
         rays = self.nodes(_NODES)

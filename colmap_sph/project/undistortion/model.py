@@ -124,7 +124,9 @@ def undistort_model(task: ModelToUndistort) -> None:
         raise_if_disk_is_full(task.folder)
         raise InputError(f"COLMAP cannot undistort {task.model_dir}: {reason_of(error)}") from error
     undistorted = _load_written_model(task.folder / "sparse")
-    _straighten(undistorted, load_model(task.model_dir), read_lens_fields(task.model_dir), task.options)
+    fields = read_lens_fields(task.model_dir)
+    if fields:
+        _straighten(undistorted, load_model(task.model_dir), fields, task.options)
     _write_final_model(undistorted, task.final_dir, task.names)
 
 

@@ -12,6 +12,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import IO, Any
 
@@ -30,18 +31,25 @@ _TEMPORARY = ("TMPDIR", "TEMP", "TMP")
 class ChildProcess:
     """Calls functions in a process of its own, one after the other.
 
-    It is started with the first call, and again after it was lost.
+    It is started with the first call, or before, and again after it was lost.
 
     Parameters
     ----------
     folder : Path
-        Exists, and is thrown away later: there the process leaves what it has to say, and its library what else.
+        Exists at the first call, and is thrown away later: there the process leaves what it has to say, and its
+        library what else.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._process: subprocess.Popen[bytes] | None = None
         self._words: IO[bytes] | None = None
+
+    def start_for(self, function: Callable[[Any], None]) -> None:
+        """Start the process now that a function will be called later: meanwhile it loads what that needs."""
+        if self._process is None:
+            with suppress(OutputError, OSError):  # the call will say it
+                self._start(function.__module__)
 
     def call(self, function: Callable[[Any], None], argument: object, what: str) -> None:
         """Call a function of a module with one argument that can be pickled.
@@ -59,7 +67,7 @@ class ChildProcess:
             What the function raises; `InputError` where it ended the process, `OutputError` where it said that it
             cannot write.
         """
-        process = self._process or self._start()
+        process = self._process or self._start(function.__module__)
         try:
             assert process.stdin is not None and process.stdout is not None
             pickle.dump((function, argument), process.stdin)
@@ -83,10 +91,11 @@ class ChildProcess:
             self._words.close()
             self._words = None
 
-    def _start(self) -> subprocess.Popen[bytes]:
+    def _start(self, module: str) -> subprocess.Popen[bytes]:
         # By name, not by a module of the folder that the user happens to be in.
-        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve()"
-        self._words = tempfile.TemporaryFile(dir=self.folder)  # noqa: SIM115 (closed with the process)
+        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import serve; serve({module!r})"
+        folder = self.folder if self.folder.is_dir() else None
+        self._words = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115 (closed with the process)
         try:
             self._process = subprocess.Popen(
                 [sys.executable, "-c", program],
@@ -120,17 +129,19 @@ def _last_words(text: str) -> str:
     return (fatal.group(1) if fatal else lines[-1] if lines else "")[:_MAX_WORDS]
 
 
-def serve() -> None:
-    """Do what the other process asks for, until it asks no more."""
+def serve(module: str) -> None:
+    """Load a module, and do what the other process asks for, until it asks no more."""
     # What libraries print must not come between the answers.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     requests = sys.stdin.buffer
+    import_module(module)
     while True:
         try:
             function, argument = pickle.load(requests)
         except EOFError:
-            return
+            sys.stderr.flush()
+            os._exit(0)  # the other process waits: Python would take a while to unload COLMAP's library
         error: Exception | None = None
         try:
             function(argument)

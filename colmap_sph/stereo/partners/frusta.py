@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from colmap_sph.scene import Photograph, Scene, View
 
@@ -114,7 +113,7 @@ def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
         block = np.array(samples)
         points = points + samples
         targets = centers + depth * distances[:, None] * directions
-        nearest = cKDTree(targets).query(targets, k=min(_NUM_TESTED, len(views)))[1]
+        nearest = _nearest(targets, _NUM_TESTED)[1]
         for k, i in enumerate(posed):
             tested = np.sort(nearest[k])
             rows = (tested[:, None] * count + np.arange(count)).ravel()
@@ -125,7 +124,7 @@ def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
 def _neighbour_distances(centers: NDArray[np.float64], directions: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return every view's typical distance to its neighbours that look the same way, as a (V,) array."""
     extent = float(np.linalg.norm(np.ptp(centers, axis=0)))
-    distances, nearest = cKDTree(centers).query(centers, k=min(_NUM_NEAREST, len(centers)))
+    distances, nearest = _nearest(centers, _NUM_NEAREST)
     same_way = np.einsum("ij,ikj->ik", directions, directions[nearest]) > _COS_SAME_WAY
     # Cameras of one rig, or images of one tripod, have no distance that tells anything.
     apart = distances > 1e-3 * extent
@@ -136,6 +135,14 @@ def _neighbour_distances(centers: NDArray[np.float64], directions: NDArray[np.fl
                 typical[i] = np.median(distances[i][usable][:_NUM_NEIGHBOURS])
                 break
     return np.asarray(np.nan_to_num(typical, nan=max(extent, 1.0)), dtype=np.float64)
+
+
+def _nearest(points: NDArray[np.float64], most: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Distances and rows of up to so many points nearest to each of (n, 3) points, itself first."""
+    from scipy.spatial import cKDTree  # which takes long to load, and models with tracks do not need it
+
+    distances, rows = cKDTree(points).query(points, k=min(most, len(points)))
+    return distances, rows
 
 
 def _sample(view: View, depth: float) -> NDArray[np.float64]:

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from colmap_sph.scene import View
 from colmap_sph.stereo.rectified_pair import Float
@@ -145,6 +143,10 @@ def parallax_angles(tracks: Tracks, points: Float, views: Sequence[View]) -> Flo
 
 def views_together(tracks: Tracks, num_views: int, least: int) -> NDArray[np.bool_]:
     """(num_views,) bool: views of the largest group that hangs together by pairs with so many ties or more."""
+    # Not before: it takes its time to load, and few runs polish their poses.
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     first = np.searchsorted(tracks.track, np.arange(len(tracks)))
     corner_view = tracks.view[first][tracks.track]
     ones = np.ones(len(tracks.view))
