@@ -63,6 +63,7 @@ typedef struct {
     int32_t to_right[BLOCK], to_below[BLOCK]; /* ... on which sides: -1 or 1 */
     int32_t inside[BLOCK];                    /* 1 or 0 */
     int64_t at[BLOCK];                        /* its place among all of the map's */
+    int64_t across_at[BLOCK];                 /* that of the pixel beyond (u, v), from there */
     int32_t amid[BLOCK];                      /* whether it has neighbours on all sides */
     float centre[BLOCK];                      /* disparity of the nearest pixel, and of those ... */
     float left[BLOCK], right[BLOCK], above[BLOCK], below[BLOCK]; /* ... around it, NaN beyond the rim ... */
@@ -180,6 +181,7 @@ static inline int find_nearest(const disparity_map *map, block *k) {
     const int32_t last_column = (int32_t)map->width - 1, last_row = (int32_t)map->height - 1;
     for (int i = 0; i < BLOCK; i++) {
         k->at[i] = k->row[i] * (int64_t)map->width + k->column[i];
+        k->across_at[i] = k->to_below[i] * (int64_t)map->width + k->to_right[i];
         k->amid[i] = (k->column[i] > 0) & (k->column[i] < last_column) & (k->row[i] > 0) & (k->row[i] < last_row);
     }
     int any = 0;
@@ -208,33 +210,43 @@ static inline void keep_found(const disparity_map *map, ptrdiff_t count, block *
     k->count = n;
 }
 
+/* Reads the disparities around a nearest pixel, some of which may lie beyond the map's rim. */
+static inline void read_at_rim(const disparity_map *map, ptrdiff_t i, ptrdiff_t n, block *k) {
+    const ptrdiff_t width = map->width, x = k->column[i], y = k->row[i];
+    const float *centre = map->values + k->at[i];
+    const int has_left = x > 0, has_right = x < width - 1, has_above = y > 0, has_below = y < map->height - 1;
+    const int has_beside = k->to_right[i] > 0 ? has_right : has_left;
+    const int has_beyond = k->to_below[i] > 0 ? has_below : has_above;
+    k->left[n] = has_left ? centre[-1] : NAN;
+    k->right[n] = has_right ? centre[1] : NAN;
+    k->above[n] = has_above ? centre[-width] : NAN;
+    k->below[n] = has_below ? centre[width] : NAN;
+    k->across[n] = has_beside && has_beyond ? centre[k->across_at[i]] : NAN;
+}
+
 /* Reads the disparities around the nearest pixels. */
 static inline void read_around(const disparity_map *map, block *k) {
-    const ptrdiff_t width = map->width, last_row = map->height - 1, last_column = width - 1;
+    const ptrdiff_t width = map->width;
     for (ptrdiff_t n = 0; n < k->count; n++) {
         const ptrdiff_t i = k->place[n];
-        const float *centre = map->values + k->at[i];
-        const int32_t to_right = k->to_right[i], to_below = k->to_below[i];
         if (k->amid[i]) {
+            const float *centre = map->values + k->at[i];
             k->left[n] = centre[-1];
             k->right[n] = centre[1];
             k->above[n] = centre[-width];
             k->below[n] = centre[width];
-            k->across[n] = centre[to_below * width + to_right];
+            k->across[n] = centre[k->across_at[i]];
         } else {
-            const ptrdiff_t x = k->column[i], y = k->row[i];
-            const int has_left = x > 0, has_right = x < last_column, has_above = y > 0, has_below = y < last_row;
-            const int has_beside = to_right > 0 ? has_right : has_left;
-            const int has_beyond = to_below > 0 ? has_below : has_above;
-            k->left[n] = has_left ? centre[-1] : NAN;
-            k->right[n] = has_right ? centre[1] : NAN;
-            k->above[n] = has_above ? centre[-width] : NAN;
-            k->below[n] = has_below ? centre[width] : NAN;
-            k->across[n] = has_beside && has_beyond ? centre[to_below * width + to_right] : NAN;
+            read_at_rim(map, i, n, k);
         }
-        k->du[n] = k->du[i];
-        k->dv[n] = k->dv[i];
-        k->u[n] = k->u[i];
+    }
+    if (k->count < BLOCK) { /* else all stay where they are */
+        for (ptrdiff_t n = 0; n < k->count; n++) {
+            const ptrdiff_t i = k->place[n];
+            k->du[n] = k->du[i];
+            k->dv[n] = k->dv[i];
+            k->u[n] = k->u[i];
+        }
     }
 }
 
