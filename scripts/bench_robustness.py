@@ -142,6 +142,34 @@ def sky_of_a_phone(size: float, strength: float) -> Block:
     return street(size, effects, noise=strength / 2, quality=80)
 
 
+def phone_video(size: float, strength: float) -> Block:
+    """Frames of a film: a shutter that rolls, blur, exposure that follows the light, noise and coarse JPEG."""
+    effects = syn.Imperfections(
+        rolling_shutter=3 * strength,
+        motion_blur=3 * strength,
+        exposure=0.5 * strength,
+        photon_noise=3 * strength,
+        bundle_adjusted=True,
+    )
+    return village(size, effects, noise=1.5 * strength, quality=int(90 - 25 * strength))
+
+
+def cheap_drone(size: float, strength: float) -> Block:
+    """A lens that no camera model knows, which darkens and blurs."""
+    effects = syn.Imperfections(
+        lens=0.6 * strength, vignetting=0.4 * strength, blur=0.8 * strength, bundle_adjusted=True
+    )
+    return village(size, effects, noise=2 * strength, quality=int(95 - 10 * strength))
+
+
+def poor_light(size: float, strength: float) -> Block:
+    """Noise, long exposures, and highlights."""
+    effects = syn.Imperfections(
+        photon_noise=8 * strength, motion_blur=3 * strength, exposure=0.5 * strength, specular=0.5 * strength
+    )
+    return village(size, effects, noise=5 * strength, quality=85)
+
+
 @dataclass(frozen=True)
 class Case:
     """What a block's maker takes for strengths, and their unit."""
@@ -169,6 +197,9 @@ CASES: dict[str, Case] = {
     "highlights": Case(partial(effect, "specular"), (0.2, 0.5, 1.0), "of white"),
     "moving things": Case(lambda size, count: effect("moving", size, int(count)), (10, 40, 120), "per image"),
     "clouds": Case(cloudy, (0.2, 0.5, 1.0), "of the blue"),
+    "phone's film": Case(phone_video, (0.5, 1, 2), "times"),
+    "cheap drone": Case(cheap_drone, (0.5, 1, 2), "times"),
+    "poor light": Case(poor_light, (0.5, 1, 2), "times"),
     "sky, noise, JPEG 80": Case(sky_of_a_phone, (2, 5, 10), "grey values"),
 }
 

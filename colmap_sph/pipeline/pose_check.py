@@ -1,23 +1,35 @@
-"""Matched pairs of a model without points → are its poses those of the images?
+"""Matched pairs of a model without points → are its poses and cameras those of the images?
 
-Of other models sparse points tell, see `self_check`. Without them ties do: with wrong poses most pairs have hardly
-any. So have some with right poses; where most pairs have few, features of the images decide.
+Of other models sparse points tell, see `self_check`. Without them features of the images do: they are matched by
+what they look like, and so show how far poses and focal lengths are off, where ties are but what fits them.
 """
 
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import cache
 from statistics import median
 
+import numpy as np
+from numpy.typing import NDArray
+
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.self_check import add_doubt
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.images.reading import read_whole_grey
 from colmap_sph.project.masks import read_view_mask
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.partners.pairing import Pair
-from colmap_sph.stereo.poses.features import Features, Shown, epipolar_share, find_features, match_features
+from colmap_sph.stereo.poses.features import (
+    Features,
+    Shown,
+    epipolar_distances,
+    find_features,
+    match_features,
+    with_focal_length,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -35,10 +47,45 @@ _ENOUGH = 60
 # Where images have so many features, but none of so many pairs shares any, they do not show the same.
 _MANY_FEATURES = 300
 _MANY_PAIRS = 8
+# Focal lengths that are tried, as factors of what is given. What is given fits best where it is right; where it is
+# a tenth too long or too short, the factor that undoes it does, and brings features nearer, to .2 to .6 of their
+# distance (four scenes). Where poses are off by half a degree no factor does to less than .67.
+_FACTORS = np.exp(np.linspace(-0.4, 0.4, 33))
+_LEAST_CHANGE = 0.05
+_NEARER = 0.65
+_LEAST_DISTANCE = 1e-6
+_NEARER_PAIRS = 0.55
+_FEWEST_PAIRS = 5
+# Features lie no farther from their epipolar planes (in the median, see `epipolar_distances`) with poses as
+# structure from motion leaves them: up to .24. Poses off by a quarter or half a degree make it .4 to .7.
+_USUAL_DISTANCE = 0.35
+
+
+@dataclass(frozen=True, eq=False)
+class _Compared:
+    """A pair whose features tell something."""
+
+    photographs: tuple[Photograph, Photograph]
+    features: tuple[Features, Features]
+    matches: NDArray[np.int64]
+
+    def distances(self, factor: float = 1.0) -> NDArray[np.float64]:
+        """See `epipolar_distances`; with so many times the focal length, of photographs that are one view."""
+        features = self.features
+        left, right = self.photographs
+        if factor != 1.0:
+            first, second = features
+            features = (
+                with_focal_length(first, left.views[0], factor),
+                with_focal_length(second, right.views[0], factor),
+            )
+        return epipolar_distances(*features, self.matches, right.center - left.center)
 
 
 def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
-    """Raise `NoResultError` where a model has no points, and images and their pairs contradict its poses.
+    """Judge the poses and cameras of a model without points by features of its images.
+
+    Raises `NoResultError` where they are contradicted; the report tells where they are less exact than usual.
 
     Parameters
     ----------
@@ -46,43 +93,94 @@ def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
     matched : mapping of (str, str) to Result
         Matched pairs.
     """
-    if context.scene.has_tracks:
+    if context.scene.has_tracks or not matched:
         return
     sound = sum(result.facts.row_residual is not None for result in matched.values())
-    if sound >= _SOUND_SHARE * len(matched):
-        return
     logger.info("%d of %d pairs have enough ties: features of images are compared", sound, len(matched))
-    pairs = sorted(matched)
-    _judge(context, pairs[:: -(-len(pairs) // _MOST_ASKED)])
+    asked = sorted(matched)[:: -(-len(matched) // _MOST_ASKED)]
+    compared, usual_features = _compare(context, asked)
+    _refuse_focal_length(compared)
+    if sound < _SOUND_SHARE * len(matched):
+        _refuse_poses(compared, asked, usual_features)
+    _doubt_poses(context, compared)
 
 
-def _judge(context: Context, pairs: Sequence[Pair]) -> None:
+def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[_Compared], float]:
+    """Pairs that tell something, and how many features the images of such pairs have."""
+
     @cache
     def features_of(lead: str) -> Features | None:
         with suppress(InputError):  # cannot be read for a moment, and so tells nothing
             return find_features([_shown(context, view) for view in context.scene.photograph(lead).views])
         return None
 
-    fitting: list[int] = []
-    contradicting: list[int] = []
+    compared = []
     for left, right in pairs:
         first, second = features_of(left), features_of(right)
         if first is None or second is None:
             continue
         matches = match_features(first, second)
-        if len(matches) < _TELLING:
-            continue
-        baseline = context.scene.view(right).center - context.scene.view(left).center
-        share = epipolar_share(first, second, matches, baseline)
-        (fitting if share > _FITTING else contradicting).append(len(matches))
-    told = len(fitting) + len(contradicting)
-    logger.info("Features fit the poses in %d of %d pairs, of %d asked", len(fitting), told, len(pairs))
-    if len(contradicting) > len(fitting) and sum(contradicting) >= _ENOUGH:
-        finding = f"lie on each other's epipolar lines in only {len(fitting)} of {told} pairs"
+        if len(matches) >= _TELLING:
+            photographs = (context.scene.photograph(left), context.scene.photograph(right))
+            compared.append(_Compared(photographs, (first, second), matches))
+    return compared, median(len(features_of(name) or ()) for pair in pairs for name in pair)
+
+
+def _refuse_focal_length(compared: Sequence[_Compared]) -> None:
+    """Raise `NoResultError` where features fit other focal lengths far better.
+
+    It would pass else: depth is wrong by as much as the focal length, in all images alike.
+    """
+    whole = [pair for pair in compared if all(len(photograph.views) == 1 for photograph in pair.photographs)]
+    if len(whole) < _FEWEST_PAIRS:
+        return
+    now = np.array([np.median(pair.distances()) for pair in whole])
+    there = np.array([[np.median(pair.distances(factor)) for pair in whole] for factor in _FACTORS])
+    best = int(np.median(there, axis=1).argmin())
+    factor = float(_FACTORS[best])
+    nearer = float(np.median(there[best]) / max(np.median(now), _LEAST_DISTANCE))
+    of_pairs = float((there[best] < now).mean())
+    logger.info(
+        "Features fit focal length x %.3f best: %.2f of their distance, less in %.2f of the pairs",
+        factor,
+        nearer,
+        of_pairs,
+    )
+    if abs(factor - 1) >= _LEAST_CHANGE and nearer < _NEARER and of_pairs >= _NEARER_PAIRS:
+        raise NoResultError(
+            f"The model has no points to compare with, and features of its images fit {factor:.2f} times its "
+            "focal length far better: its cameras are not those of these images (of another size, cropped, of "
+            "another lens), and depth would be wrong by as much; check --model and --images. What was made is "
+            "left on disk."
+        )
+
+
+def _refuse_poses(compared: Sequence[_Compared], asked: Sequence[Pair], usual_features: float) -> None:
+    """Raise `NoResultError` where most features do not lie in common epipolar planes."""
+    fits = [bool((pair.distances() <= 1).mean() > _FITTING) for pair in compared]
+    contradicting = sum(len(pair.matches) for pair, does in zip(compared, fits, strict=True) if not does)
+    logger.info("Features fit the poses in %d of %d pairs, of %d asked", sum(fits), len(fits), len(asked))
+    if 2 * sum(fits) < len(fits) and contradicting >= _ENOUGH:
+        finding = f"lie on each other's epipolar lines in only {sum(fits)} of {len(fits)} pairs"
         raise NoResultError(_refusal(finding))
-    usual = median(len(features_of(name) or ()) for pair in pairs for name in pair)
-    if not told and usual >= _MANY_FEATURES and len(pairs) >= _MANY_PAIRS:
-        raise NoResultError(_refusal(f"match in none of {len(pairs)} pairs that should show the same"))
+    if not compared and usual_features >= _MANY_FEATURES and len(asked) >= _MANY_PAIRS:
+        raise NoResultError(_refusal(f"match in none of {len(asked)} pairs that should show the same"))
+
+
+def _doubt_poses(context: Context, compared: Sequence[_Compared]) -> None:
+    """Put into the report where features lie farther from their epipolar planes than usual."""
+    if len(compared) < _FEWEST_PAIRS:
+        return
+    distance = median(float(np.median(pair.distances())) for pair in compared)
+    logger.info("Features lie %.2f %% of an image from their epipolar planes", distance)
+    if distance > _USUAL_DISTANCE:
+        add_doubt(
+            context.report,
+            f"Features of the images lie {distance:.1f} % of an image's longer side from each other's epipolar "
+            "lines (0.2 % at most are usual): the poses of this model without points are off by as much, "
+            "and depth by more. Triangulate points and adjust the model (COLMAP: point_triangulator, "
+            "bundle_adjuster).",
+        )
 
 
 def _shown(context: Context, view: View) -> Shown:

@@ -71,11 +71,11 @@ def judge_agreement(report: RunReport, *, misplaced: float, in_sight: float = 1.
     elif is_enough and total.agreeing < _REFUSED_SHARE * total.tested:
         is_right = total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found
         if is_right and total.agreeing >= _LEAST_SHARE * total.tested:
-            _doubt(report, _hardly_matched(total))
+            add_doubt(report, _hardly_matched(total))
         else:
             report.refusal = _refusal(total)
     elif doubted:
-        _doubt(report, _doubts(doubted))
+        add_doubt(report, _doubts(doubted))
 
 
 def misplaced_views(scene: Scene) -> dict[str, float]:
@@ -109,7 +109,7 @@ def judge_reprojection(report: RunReport, scene: Scene) -> float:
             "points were changed apart from each other, and depth is wrong where cameras or poses are; "
             "or the model's image coordinates are those of images of another size."
         )
-        _doubt(report, words)
+        add_doubt(report, words)
     return len(far) / max(len(scene.views), 1)
 
 
@@ -164,7 +164,8 @@ def refuse_disagreement(report: RunReport) -> None:
         raise NoResultError(report.refusal)
 
 
-def _doubt(report: RunReport, words: str) -> None:
+def add_doubt(report: RunReport, words: str) -> None:
+    """Put one more sentence into what the report doubts."""
     report.doubts = f"{report.doubts} {words}".strip()
     logger.warning("%s", words)
 

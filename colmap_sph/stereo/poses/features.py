@@ -1,11 +1,11 @@
-"""Features of two photographs → how many of their matches lie in common epipolar planes.
+"""Features of two photographs → how far their matches lie from common epipolar planes.
 
 Features (SIFT; Lowe, 2004) are matched by what they look like, without poses. So they tell whether poses are right
 where nothing else does: of a model without points.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -101,8 +101,16 @@ def match_features(first: Features, second: Features) -> NDArray[np.int64]:
     return np.array(rows, np.int64).reshape(-1, 2)
 
 
-def epipolar_share(first: Features, second: Features, matches: NDArray[np.int64], baseline: Float) -> float:
-    """Share of the matches that lie in one epipolar plane; NaN of none.
+def with_focal_length(features: Features, view: View, factor: float) -> Features:
+    """The features of a photograph that is one view, if its focal length were `factor` times what it is."""
+    rays = features.rays @ view.R.T
+    rays[:, 2] *= factor
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    return replace(features, rays=rays @ view.R)
+
+
+def epipolar_distances(first: Features, second: Features, matches: NDArray[np.int64], baseline: Float) -> Float:
+    """How far matches lie from one epipolar plane, as a share of how far poses may be off.
 
     Parameters
     ----------
@@ -113,7 +121,8 @@ def epipolar_share(first: Features, second: Features, matches: NDArray[np.int64]
 
     Returns
     -------
-    float
+    (n,) float64 ndarray
+        1: by 2 pixels or, where that is more, a hundredth of the longer side of the image.
 
     Examples
     --------
@@ -126,15 +135,13 @@ def epipolar_share(first: Features, second: Features, matches: NDArray[np.int64]
     ...     Features(rays / np.linalg.norm(rays, axis=1)[:, None], np.empty((2, 128)), np.full(2, 0.01))
     ...     for rays in (np.array([point, point]), np.array([point - baseline, up]))
     ... )
-    >>> epipolar_share(first, second, np.array([[0, 0], [1, 1]]), baseline)
-    0.5
+    >>> epipolar_distances(first, second, np.array([[0, 0], [1, 1]]), baseline).round(1).tolist()
+    [0.0, 8.7]
     """
-    if not len(matches):
-        return np.nan
     there, here = first.rays[matches[:, 0]], second.rays[matches[:, 1]]
     tolerance = np.maximum(first.tolerance[matches[:, 0]], second.tolerance[matches[:, 1]])
     off = np.maximum(_angle_off(here, there, baseline), _angle_off(there, here, baseline))
-    return float((off <= tolerance).mean())
+    return np.asarray(off / tolerance)
 
 
 def _angle_off(rays: Float, others: Float, baseline: Float) -> Float:
