@@ -103,6 +103,8 @@ MODELS: dict[str, tuple[bool, int, _Radius]] = {
     "SIMPLE_DIVISION": (True, 1, _division),
     "DIVISION": (False, 1, _division),
 }
+# Those that shift points beside that.
+_SHIFTED = ("THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE")
 
 
 def number_of_parameters(model: str) -> int:
@@ -235,13 +237,14 @@ def camera_rays(lens: Lens, points: Float) -> Float:
 
 
 def _undistorted(lens: Lens, points: Float) -> Float:
-    """The inverse of `_distorted`, by Newton's method from what the radius alone says."""
+    """The inverse of `_distorted`: what the radius says, and Newton's method from there where that is not all."""
     focal, principal, _ = _intrinsics(lens)
-    angle, radius = _table(lens)
     place = (points - principal) / focal
     distance = np.hypot(place[:, 0], place[:, 1])
-    start = np.interp(distance, radius, angle)
+    start = _angle_at(lens, distance)
     found = place * (start / np.maximum(distance, _TINY))[:, None]
+    if lens.model not in _SHIFTED:
+        return found
     left = np.arange(len(points))
     with np.errstate(all="ignore"):
         for _ in range(_STEPS):
@@ -260,6 +263,19 @@ def _undistorted(lens: Lens, points: Float) -> Float:
             change = np.column_stack([d * miss[:, 0] - b * miss[:, 1], a * miss[:, 1] - c * miss[:, 0]])
             found[left] -= np.clip(change / determinant[:, None], -0.2, 0.2)
     return np.nan_to_num(found, nan=np.inf)
+
+
+def _angle_at(lens: Lens, distance: Float) -> Float:
+    """(n,) angles of radii in focal lengths: all there is to most models, as exact as numbers are."""
+    _, _, extra = _intrinsics(lens)
+    radius_at = MODELS[lens.model][2]
+    angle, radius = _table(lens)
+    start = np.interp(distance, radius, angle)
+    with np.errstate(all="ignore"):
+        slope = (radius_at(start + _DELTA, extra) - radius_at(start - _DELTA, extra)) / (2 * _DELTA)
+        better = start - (radius_at(start, extra) - distance) / slope
+    # Where the radius ends, it may turn back.
+    return np.where(np.abs(better - start) < np.pi / (_NODES - 1), better, start)
 
 
 def _panorama_points(lens: Lens, rays: Float) -> Float:
