@@ -3,10 +3,10 @@
     python scripts/measure_wide.py SCENE [--width 480] [--panoramas] [-- options of colmap_sph run]
 
 SCENE is a folder: where it does not exist, a courtyard is rendered into it. The program runs on it, and of the
-pixels of the original images that show a surface, these shares are printed: covered; within 2 % of the exact
-range; of those that are covered, off by more than 5 %. Covered is what any of the views cut from an image covers;
-the range is that of the view nearest to its axis there. The last numbers are the coverage within 2 degrees of the
-border of any of these views over that 12 degrees away from all; processor seconds of the command.
+pixels of the original images that show a surface, these shares are printed: covered by their range maps; within
+2 % of the exact range; of those that are covered, off by more than 5 %. The last numbers are the coverage within 2
+degrees of the border of any of the views cut from an image over that 12 degrees away from all; processor seconds
+of the command.
 """
 
 import argparse
@@ -19,6 +19,8 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from colmap_sph.project.wide.range_maps import read_range_map
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.synthetic.wide.courtyard import CourtyardOptions, make_courtyard
 
 Float = NDArray[np.float64]
@@ -33,50 +35,34 @@ def margins(K: Float, width: int, height: int, rays: Float) -> Float:
     return np.asarray(np.arcsin(np.clip(rays @ sides.T, -1, 1)).min(axis=1))
 
 
-def read_depth(path: Path) -> Float:
-    """A map of COLMAP's, or one without any depth."""
-    if not path.exists():
-        return np.zeros((1, 1))
-    depth = pycolmap.DepthMap()
-    depth.read(str(path))
-    return np.asarray(depth.to_array(), np.float64)
-
-
 def measure_image(
-    workspace: Path, views: pycolmap.Reconstruction, original: pycolmap.Image, truth: Path, kind: str
+    workspace: Path, views: pycolmap.Reconstruction, original: pycolmap.Image, truth: Path
 ) -> tuple[Float, Float, Float]:
     """Range, exact range, and margin to the nearest border of any view, of the pixels that show a surface."""
     with np.load(truth) as arrays:
         exact, rays = arrays["range"].astype(np.float64), arrays["rays"].astype(np.float64)
     seen = exact > 0
     exact, rays = exact[seen], rays[seen]
+    path = Workspace(workspace).range_map_path(original.name)
+    found = read_range_map(path)[0][seen].astype(np.float64) if path.exists() else np.zeros(len(rays))
     world = rays @ original.cam_from_world().rotation.matrix()
-    found, best, border = np.zeros(len(rays)), np.full(len(rays), -2.0), np.full(len(rays), 9.0)
+    border = np.full(len(rays), 9.0)
     for image in views.images.values():
         if np.linalg.norm(image.projection_center() - original.projection_center()) > 1e-5:
             continue
         camera = views.camera(image.camera_id)
-        K = camera.calibration_matrix()
-        depth = read_depth(workspace / "stereo" / "depth_maps" / f"{image.name}.{kind}.bin")
         local = world @ image.cam_from_world().rotation.matrix().T
-        margin = margins(K, camera.width, camera.height, local)
+        margin = margins(camera.calibration_matrix(), camera.width, camera.height, local)
         border = np.minimum(border, np.where(local[:, 2] > 0, np.abs(margin), 9.0))
-        place = np.rint((local @ K.T)[:, :2] / local[:, 2:]).clip(-1, 1 << 20).astype(np.int64)
-        inside = (margin > 0) & (place >= 0).all(axis=1) & (place < depth.shape[::-1]).all(axis=1)
-        z = np.zeros(len(rays))
-        z[inside] = depth[place[inside, 1], place[inside, 0]]
-        better = (z > 0) & (local[:, 2] > best)
-        found[better] = (z / local[:, 2])[better]
-        best[better] = local[better, 2]
     return found, exact, border
 
 
-def measure(scene: Path, workspace: Path, kind: str = "geometric") -> str:
+def measure(scene: Path, workspace: Path) -> str:
     """One row of numbers."""
     originals = pycolmap.Reconstruction(scene / "sparse" / "0")
     views = pycolmap.Reconstruction(workspace / "sparse")
     parts = [
-        measure_image(workspace, views, image, scene / "truth" / f"{image.name}.npz", kind)
+        measure_image(workspace, views, image, scene / "truth" / f"{image.name}.npz")
         for image in originals.images.values()
     ]
     found, exact, border = (np.concatenate(column) for column in zip(*parts, strict=True))

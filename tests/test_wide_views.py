@@ -16,6 +16,8 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.wide import layout
 from colmap_sph.project.wide.cuts import cuts_of
+from colmap_sph.project.wide.layout import faces_of
+from colmap_sph.project.wide.projection import Lens, camera_rays
 from colmap_sph.project.wide.range_maps import CHANNELS, ViewMaps, range_and_normals, read_range_map
 from colmap_sph.project.wide.table import TABLE_NAME, read_cuts
 from colmap_sph.project.workspace import Workspace
@@ -435,6 +437,31 @@ def test_range_of_exact_maps_is_exact(kind: str) -> None:
     agree = np.einsum("ni,ni->n", joined[both], exact_normals[both])
     assert np.median(agree) > 1 - 1e-6
     assert (agree > 0.999).mean() > 0.9
+
+
+def test_range_is_the_mean_of_the_views_that_agree() -> None:
+    """Views that see spheres around the camera → of each pixel the mean of those like its own view's."""
+    lens = Lens("EQUIRECTANGULAR", (360.0, 180.0), 360, 180)
+    radii = np.array([1.0, 1.01, 1.02, 1.1, 1.12, 1.03])
+    x, y = np.meshgrid(np.arange(360) + 0.5, np.arange(180) + 0.5)
+    rays = camera_rays(lens, np.column_stack([x.ravel(), y.ravel()]))
+    maps, cosines = [], []
+    for face, radius in zip(faces_of(lens), radii, strict=True):
+        K = np.array([[face.focal, 0, face.x], [0, face.focal, face.y], [0, 0, 1]])
+        columns, rows = np.meshgrid(np.arange(face.width), np.arange(face.height))
+        own = np.stack([columns, rows, np.ones_like(rows)], axis=2) @ np.linalg.inv(K).T
+        own = own / np.linalg.norm(own, axis=2, keepdims=True)
+        maps.append(ViewMaps(face.R, K, (radius * own[:, :, 2]).astype(np.float32), -own.astype(np.float32)))
+        _, is_shown = face.points(rays)
+        cosines.append(np.where(is_shown, rays @ face.R[2], -1.0))
+    owner = np.argmax(cosines, axis=0)
+    is_same = (np.array(cosines) > 0) & (np.abs(radii[:, None] - radii[owner]) < 0.05 * radii[owner])
+    expected = (radii[:, None] * is_same).sum(axis=0) / is_same.sum(axis=0)
+    distance, normals = range_and_normals(lens, maps)
+    assert len(np.unique(expected)) > 10
+    error = np.abs(distance.ravel() - expected)
+    assert (error < 1e-3).mean() > 0.97  # but for the outermost half of a pixel of a view
+    assert np.einsum("ni,ni->n", normals.reshape(-1, 3), rays).max() < -0.999
 
 
 @pytest.mark.parametrize("courtyard", ["fisheye", "panorama"], indirect=True)

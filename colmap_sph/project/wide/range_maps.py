@@ -27,6 +27,8 @@ _BAND_PIXELS = 1 << 18
 _GRAZING = 0.05
 # By which a plane may change the range within a pixel, relative to it.
 _MOST_CHANGE = 0.1
+# Views whose ranges differ by less show the same surface.
+_SAME = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,11 @@ class ViewMaps:
 
 
 def range_and_normals(lens: Lens, views: Sequence[ViewMaps]) -> tuple[Pixels, Pixels]:
-    """What the views of an image know of its pixels: of each pixel the view with the axis nearest to its ray.
+    """What the views of an image know of its pixels.
+
+    Of those with a depth there, the view whose axis is nearest to a pixel's ray says what surface it shows, and
+    gives the normal. The range is the mean of all that see the same: they are refined one by one, so that errors
+    even out.
 
     Parameters
     ----------
@@ -70,17 +76,36 @@ def range_and_normals(lens: Lens, views: Sequence[ViewMaps]) -> tuple[Pixels, Pi
     normals = np.zeros((lens.height, lens.width, 3), np.float32)
     for rows in _bands(lens):
         rays = np.ascontiguousarray(_rays(lens)[rows].reshape(-1, 3).T, np.float64)
-        distance = found[rows].reshape(-1)
+        distance = np.zeros(rays.shape[1])
         normal = normals[rows].reshape(-1, 3)
         nearest = np.zeros(rays.shape[1])
+        known = []
         for view in views:
             cosine = _along(view.R[2], rays)
-            nearer = np.flatnonzero(cosine > nearest)
-            seen, here, normal_here = _looked_up(view, rays, nearer)
-            distance[seen] = here
-            normal[seen] = normal_here @ view.R
-            nearest[seen] = cosine[seen]
+            seen, here, normal_here = _looked_up(view, rays, np.flatnonzero(cosine > 0))
+            known.append((seen, here))
+            nearer = cosine[seen] > nearest[seen]
+            own = seen[nearer]
+            distance[own] = here[nearer]
+            normal[own] = normal_here[nearer] @ view.R
+            nearest[own] = cosine[own]
+        found[rows] = _mean_of_same(distance, known).reshape(-1, lens.width)
     return found, normals
+
+
+def _mean_of_same(
+    distance: NDArray[np.float64], known: Sequence[tuple[NDArray[np.int64], NDArray[np.float64]]]
+) -> NDArray[np.float64]:
+    """Of each pixel of `distance` (n,), the mean of the ranges that are of its surface.
+
+    `known` has of each view the numbers (m,) of pixels and their ranges (m,).
+    """
+    total, count = np.zeros_like(distance), np.zeros_like(distance)
+    for seen, here in known:
+        is_same = np.abs(here - distance[seen]) < _SAME * distance[seen]
+        total[seen[is_same]] += here[is_same]
+        count[seen[is_same]] += 1
+    return total / np.maximum(count, 1)
 
 
 def _along(row: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
