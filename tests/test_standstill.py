@@ -4,6 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 import colmap_sph
@@ -132,6 +133,19 @@ def test_an_object_in_the_hand_is_free_of_the_room_behind_it(model, tmp_path):
     assert report.still.startswith(("8", "9"))  # per cent
     assert "--masks" in report.still
     assert share_off(Workspace(tmp_path / "dense")) < 0.01
+    assert report.points > 20_000
+
+
+def test_the_room_does_not_tell_of_poses(model, tmp_path):
+    """Its features lie far from their epipolar planes, as those of a model whose images were exchanged."""
+    without_points = pycolmap.Reconstruction(model)
+    for point in list(without_points.points3D):
+        without_points.delete_point3D(point)
+    (tmp_path / "sparse").mkdir()
+    without_points.write(tmp_path / "sparse")
+    report = colmap_sph.run(tmp_path / "sparse", images=model.parents[1] / "images", output=tmp_path / "dense")
+    assert report.still
+    assert not report.doubts
     assert report.points > 20_000
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.self_check import add_doubt
+from colmap_sph.pipeline.stages.photo import still_mask
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.images.reading import read_whole_grey
 from colmap_sph.project.masks import read_view_mask
@@ -184,8 +185,15 @@ def _doubt_poses(context: Context, compared: Sequence[_Compared]) -> None:
 
 
 def _shown(context: Context, view: View) -> Shown:
-    image = read_whole_grey(context.workspace.image_path(view.name), (view.width, view.height))
-    return view, image, read_view_mask(context.workspace.mask_path(view.name), view)
+    """What stands still while the camera turns does not tell of its poses."""
+    place = context.workspace.image_path
+    image = read_whole_grey(place(view.name), (view.width, view.height))
+    mask = read_view_mask(context.workspace.mask_path(view.name), view)
+    turned = context.still.get(view.name)
+    if turned:
+        moves = 255 * (1 - still_mask(view, place(view.name), [place(name) for name in turned]))
+        mask = moves if mask is None else np.minimum(mask, moves)
+    return view, image, mask
 
 
 def _refusal(finding: str) -> str:
