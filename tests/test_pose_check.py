@@ -15,9 +15,10 @@ from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline import pose_check
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
+from colmap_sph.pipeline.pose_check import Compared, fitting_factor
 from colmap_sph.pipeline.reconstruct import run
 from colmap_sph.project.project import Project
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.poses.features import (
     Features,
     epipolar_distances,
@@ -72,6 +73,31 @@ def test_another_focal_length_moves_features_from_the_middle(
     expected = middle + (as_given[:2] / as_given[2] - middle) / 1.25
     assert np.allclose(pixels[:2] / pixels[2], expected)
     assert np.allclose(np.linalg.norm(longer.rays, axis=1), 1)
+
+
+def test_any_focal_length_fits_cameras_that_do_not_turn() -> None:
+    """In pixels it is as near with each of them; in angles the longer the nearer."""
+    rng = np.random.default_rng(3)
+    K = np.array([[900.0, 0, 320], [0, 900.0, 240], [0, 0, 1]])
+    compared = []
+    for k in range(6):
+        views = [
+            View(i, f"{i}", 640, 480, K, np.eye(3), np.array([-step, 0.2 * k, 0.0]), np.empty(0, np.int64))
+            for i, step in enumerate((0.0, 1.0 + k))
+        ]
+        points = rng.uniform((-5, -5, 18), (5, 5, 22), (200, 3))
+        found = []
+        for view in views:
+            rays = points - view.center
+            rays[:, :2] += rays[:, 2:] * rng.normal(0, 0.3 / 900, (200, 2))
+            rays /= np.linalg.norm(rays, axis=1)[:, None]
+            found.append(Features(rays, np.empty((200, 128), np.float32), np.full(200, 6.4 / 900)))
+        every = np.repeat(np.arange(200)[:, None], 2, axis=1)
+        left, right = (Photograph(view.name, (view,)) for view in views)
+        compared.append(Compared((left, right), (found[0], found[1]), every))
+    factor, nearer, _ = fitting_factor(compared)
+    assert factor < 1.05
+    assert nearer > 0.9
 
 
 def test_views_of_one_photograph_have_their_features_together() -> None:

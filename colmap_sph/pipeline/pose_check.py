@@ -63,7 +63,7 @@ _USUAL_DISTANCE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
-class _Compared:
+class Compared:
     """A pair whose features tell something."""
 
     photographs: tuple[Photograph, Photograph]
@@ -106,7 +106,7 @@ def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
     _doubt_poses(context, compared)
 
 
-def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[_Compared], float]:
+def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[Compared], float]:
     """Pairs that tell something, and how many features the images of such pairs have."""
 
     @cache
@@ -123,11 +123,11 @@ def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[_Compared], 
         matches = match_features(first, second)
         if len(matches) >= _TELLING:
             photographs = (context.scene.photograph(left), context.scene.photograph(right))
-            compared.append(_Compared(photographs, (first, second), matches))
+            compared.append(Compared(photographs, (first, second), matches))
     return compared, median(len(features_of(name) or ()) for pair in pairs for name in pair)
 
 
-def _refuse_focal_length(compared: Sequence[_Compared]) -> None:
+def _refuse_focal_length(compared: Sequence[Compared]) -> None:
     """Raise `NoResultError` where features fit other focal lengths far better.
 
     It would pass else: depth is wrong by as much as the focal length, in all images alike.
@@ -135,12 +135,7 @@ def _refuse_focal_length(compared: Sequence[_Compared]) -> None:
     whole = [pair for pair in compared if all(len(photograph.views) == 1 for photograph in pair.photographs)]
     if len(whole) < _FEWEST_PAIRS:
         return
-    now = np.array([np.median(pair.distances()) for pair in whole])
-    there = np.array([[np.median(pair.distances(factor)) for pair in whole] for factor in _FACTORS])
-    best = int(np.median(there, axis=1).argmin())
-    factor = float(_FACTORS[best])
-    nearer = float(np.median(there[best]) / max(np.median(now), _LEAST_DISTANCE))
-    of_pairs = float((there[best] < now).mean())
+    factor, nearer, of_pairs = fitting_factor(whole)
     logger.info(
         "Features fit focal length x %.3f best: %.2f of their distance, less in %.2f of the pairs",
         factor,
@@ -156,7 +151,32 @@ def _refuse_focal_length(compared: Sequence[_Compared]) -> None:
         )
 
 
-def _refuse_poses(compared: Sequence[_Compared], asked: Sequence[Pair], usual_features: float) -> None:
+def fitting_factor(compared: Sequence[Compared]) -> tuple[float, float, float]:
+    """Find by how much focal lengths are to be multiplied for features to lie nearest to their epipolar planes.
+
+    Parameters
+    ----------
+    compared : sequence of Compared
+        Of photographs that are one view.
+
+    Returns
+    -------
+    factor : float
+    nearer : float
+        Distance of the features then, as a share of what it is.
+    of_pairs : float
+        Share of the pairs in which it is less.
+    """
+    now = np.array([np.median(pair.distances()) for pair in compared])
+    there = np.array([[np.median(pair.distances(factor)) for pair in compared] for factor in _FACTORS])
+    # Where cameras do not turn, any focal length fits, and with a longer one a pixel is a smaller angle.
+    there *= np.maximum(_FACTORS, 1)[:, None]
+    best = int(np.median(there, axis=1).argmin())
+    nearer = float(np.median(there[best]) / max(np.median(now), _LEAST_DISTANCE))
+    return float(_FACTORS[best]), nearer, float((there[best] < now).mean())
+
+
+def _refuse_poses(compared: Sequence[Compared], asked: Sequence[Pair], usual_features: float) -> None:
     """Raise `NoResultError` where most features do not lie in common epipolar planes."""
     fits = [bool((pair.distances() <= 1).mean() > _FITTING) for pair in compared]
     contradicting = sum(len(pair.matches) for pair, does in zip(compared, fits, strict=True) if not does)
@@ -168,7 +188,7 @@ def _refuse_poses(compared: Sequence[_Compared], asked: Sequence[Pair], usual_fe
         raise NoResultError(_refusal(f"match in none of {len(asked)} pairs that should show the same"))
 
 
-def _doubt_poses(context: Context, compared: Sequence[_Compared]) -> None:
+def _doubt_poses(context: Context, compared: Sequence[Compared]) -> None:
     """Put into the report where features lie farther from their epipolar planes than usual."""
     if len(compared) < _FEWEST_PAIRS:
         return
