@@ -9,10 +9,13 @@ import pytest
 
 import colmap_sph
 from colmap_sph import synthetic as syn
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.input.standing import with_still_pixels
+from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import View
+from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.poses.standstill import still_pixels, turned_views
 
@@ -91,6 +94,26 @@ def test_a_tower_of_four_equal_sides_does_not_stand_still():
     of_scene, of_sky = still_shares(tower, ring(16, 2.4, 0.6, (0, 0, 0.3)))
     assert of_scene < 0.01
     assert of_sky < 0.02  # what is left is beside the mast, whose windows show its outlines
+
+
+def test_an_object_with_eight_equal_sides_is_matched(tmp_path):
+    """Of 16 images around it every other one shows the same."""
+    cameras = ring(16, 2, 0.7)
+    views = views_of(cameras)
+    pictures = [
+        photograph([syn.Ellipsoid(np.zeros(3), RADII, texture(seed))], cameras[0], 0)[0] for seed in (1, 2)
+    ]
+    workspace = Workspace(tmp_path)
+    workspace.images_dir.mkdir()
+    for k, view in enumerate(views):
+        cv2.imwrite(str(workspace.image_path(view.name)), pictures[k % 2][..., ::-1])
+    scene = Scene(tuple(views), np.empty((0, 3)))
+    options = RunOptions()
+    context = Context(workspace, scene, options, Keys(workspace, options, {}))
+    assert not with_still_pixels(context, [view.name for view in views]).still
+    for view in views:
+        cv2.imwrite(str(workspace.image_path(view.name)), pictures[0][..., ::-1])
+    assert len(with_still_pixels(context, [view.name for view in views]).still) == 16
 
 
 def test_only_images_of_one_camera_that_are_turned_are_compared():
