@@ -96,24 +96,37 @@ def test_a_tower_of_four_equal_sides_does_not_stand_still():
     assert of_sky < 0.02  # what is left is beside the mast, whose windows show its outlines
 
 
+def context_of(root: Path, pictures, views, masks=()) -> Context:
+    """Of a workspace with these images."""
+    workspace = Workspace(root)
+    for folder, images in ((workspace.image_path, pictures), (workspace.mask_path, masks)):
+        for view, image in zip(views, images, strict=False):
+            folder(view.name).parent.mkdir(exist_ok=True)
+            cv2.imwrite(str(folder(view.name)), image[..., ::-1] if image.ndim == 3 else image)
+    options = RunOptions()
+    return Context(workspace, Scene(tuple(views), np.empty((0, 3))), options, Keys(workspace, options, {}))
+
+
+def still_images(context: Context) -> int:
+    return len(with_still_pixels(context, [view.name for view in context.scene.views]).still)
+
+
 def test_an_object_with_eight_equal_sides_is_matched(tmp_path):
     """Of 16 images around it every other one shows the same."""
     cameras = ring(16, 2, 0.7)
-    views = views_of(cameras)
-    pictures = [
-        photograph([syn.Ellipsoid(np.zeros(3), RADII, texture(seed))], cameras[0], 0)[0] for seed in (1, 2)
-    ]
-    workspace = Workspace(tmp_path)
-    workspace.images_dir.mkdir()
-    for k, view in enumerate(views):
-        cv2.imwrite(str(workspace.image_path(view.name)), pictures[k % 2][..., ::-1])
-    scene = Scene(tuple(views), np.empty((0, 3)))
-    options = RunOptions()
-    context = Context(workspace, scene, options, Keys(workspace, options, {}))
-    assert not with_still_pixels(context, [view.name for view in views]).still
-    for view in views:
-        cv2.imwrite(str(workspace.image_path(view.name)), pictures[0][..., ::-1])
-    assert len(with_still_pixels(context, [view.name for view in views]).still) == 16
+    eggs = [[syn.Ellipsoid(np.zeros(3), RADII, texture(seed))] for seed in (1, 2)]
+    pictures = [photograph(each, cameras[0], 0)[0] for each in eggs]
+    assert not still_images(context_of(tmp_path, pictures * 8, views_of(cameras)))
+    assert still_images(context_of(tmp_path, pictures[:1] * 16, views_of(cameras))) == 16
+
+
+def test_a_masked_backdrop_is_not_told_again(tmp_path):
+    """Some pixels at the rim of masks may show it."""
+    cameras, room = ring(IMAGES, 2, 0.7), backdrop()
+    photographs = [photograph(egg(), camera, k, room) for k, camera in enumerate(cameras)]
+    pictures = [picture for picture, _ in photographs]
+    masks = [cv2.dilate(there.astype(np.uint8) * 255, np.ones((5, 5), np.uint8)) for _, there in photographs]
+    assert not still_images(context_of(tmp_path, pictures, views_of(cameras), masks))
 
 
 def test_only_images_of_one_camera_that_are_turned_are_compared():

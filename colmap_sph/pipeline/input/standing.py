@@ -20,6 +20,8 @@ logger = logging.getLogger(__name__)
 
 # Images are looked at with so many pixels along their longest side.
 _LOOKED_AT = 320
+# Side of what is left out around masked pixels: windows there show these, too.
+_SIDE = 9
 # A smaller share of a camera's images may look alike by chance.
 _LEAST_STILL = 0.015
 
@@ -80,7 +82,8 @@ def _wanted(context: Context, name: str, shape: tuple[int, ...]) -> NDArray[np.b
     mask = read_view_mask(context.workspace.mask_path(name), context.scene.view(name))
     if mask is None:
         return np.ones(shape, bool)
-    return np.asarray(cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST)) > 0
+    small = cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.erode(small, np.ones((_SIDE, _SIDE), np.uint8))) > 0
 
 
 def _words(images: int, share: float) -> str:
