@@ -82,6 +82,11 @@ class Compared:
             )
         return epipolar_distances(*features, self.matches, right.center - left.center)
 
+    @property
+    def fits(self) -> bool:
+        """Whether most of the features lie in common epipolar planes."""
+        return bool((self.distances() <= 1).mean() > _FITTING)
+
 
 def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
     """Judge the poses and cameras of a model without points by features of its images.
@@ -178,11 +183,11 @@ def fitting_factor(compared: Sequence[Compared]) -> tuple[float, float, float]:
 
 def _refuse_poses(compared: Sequence[Compared], asked: Sequence[Pair], usual_features: float) -> None:
     """Raise `NoResultError` where most features do not lie in common epipolar planes."""
-    fits = [bool((pair.distances() <= 1).mean() > _FITTING) for pair in compared]
-    contradicting = sum(len(pair.matches) for pair, does in zip(compared, fits, strict=True) if not does)
-    logger.info("Features fit the poses in %d of %d pairs, of %d asked", sum(fits), len(fits), len(asked))
-    if 2 * sum(fits) < len(fits) and contradicting >= _ENOUGH:
-        finding = f"lie on each other's epipolar lines in only {sum(fits)} of {len(fits)} pairs"
+    others = [pair for pair in compared if not pair.fits]
+    fitting = len(compared) - len(others)
+    logger.info("Features fit the poses in %d of %d pairs, of %d asked", fitting, len(compared), len(asked))
+    if fitting < len(others) and sum(len(pair.matches) for pair in others) >= _ENOUGH:
+        finding = f"lie on each other's epipolar lines in only {fitting} of {len(compared)} pairs"
         raise NoResultError(_refusal(finding))
     if not compared and usual_features >= _MANY_FEATURES and len(asked) >= _MANY_PAIRS:
         raise NoResultError(_refusal(f"match in none of {len(asked)} pairs that should show the same"))
@@ -192,7 +197,7 @@ def _doubt_poses(context: Context, compared: Sequence[Compared]) -> None:
     """Put into the report where features lie farther from their epipolar planes than usual."""
     if len(compared) < _FEWEST_PAIRS:
         return
-    distance = median(float(np.median(pair.distances())) for pair in compared)
+    distance = distance_of_pairs(compared)
     logger.info("Features lie %.2f %% of an image from their epipolar planes", distance)
     if distance > _USUAL_DISTANCE:
         add_doubt(
@@ -202,6 +207,17 @@ def _doubt_poses(context: Context, compared: Sequence[Compared]) -> None:
             "and depth by more. Triangulate points and adjust the model (COLMAP: point_triangulator, "
             "bundle_adjuster).",
         )
+
+
+def distance_of_pairs(compared: Sequence[Compared]) -> float:
+    """Median distance of features from their epipolar planes, see `epipolar_distances`.
+
+    Of the pairs in which most fit, if that is half of them: in the others features are mistaken for each other, as
+    those of equal windows are.
+    """
+    fitting = [pair for pair in compared if pair.fits]
+    told = fitting if 2 * len(fitting) >= len(compared) else compared
+    return median(float(np.median(pair.distances())) for pair in told)
 
 
 def _shown(context: Context, view: View) -> Shown:
