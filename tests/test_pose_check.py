@@ -15,9 +15,10 @@ from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline import pose_check
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
+from colmap_sph.pipeline.pose_check import Compared, distance_of_pairs, fitting_factor
 from colmap_sph.pipeline.reconstruct import run
 from colmap_sph.project.project import Project
-from colmap_sph.scene import View
+from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.poses.features import (
     Features,
     epipolar_distances,
@@ -72,6 +73,41 @@ def test_another_focal_length_moves_features_from_the_middle(
     expected = middle + (as_given[:2] / as_given[2] - middle) / 1.25
     assert np.allclose(pixels[:2] / pixels[2], expected)
     assert np.allclose(np.linalg.norm(longer.rays, axis=1), 1)
+
+
+def pair_of_cameras(rng: np.random.Generator, mistaken: int = 0) -> Compared:
+    """Two cameras side by side that do not turn, and 200 features, so many of which are mistaken for others."""
+    K = np.array([[900.0, 0, 320], [0, 900.0, 240], [0, 0, 1]])
+    points = rng.uniform((-5, -5, 18), (5, 5, 22), (200, 3))
+    pair = []
+    for i in range(2):
+        place = np.array([-i * rng.uniform(1, 5), rng.uniform(0, 1), 0.0])
+        view = View(i, f"{i}", 640, 480, K, np.eye(3), place, np.empty(0, np.int64))
+        rays = points - view.center
+        rays[:, :2] += rays[:, 2:] * rng.normal(0, 0.3 / 900, (200, 2))
+        rays /= np.linalg.norm(rays, axis=1)[:, None]
+        pair.append((view, Features(rays, np.empty((200, 128), np.float32), np.full(200, 6.4 / 900))))
+    (left, first), (right, second) = pair
+    matches = np.repeat(np.arange(200)[:, None], 2, axis=1)
+    matches[:mistaken, 1] = np.roll(matches[:mistaken, 1], 1)
+    photographs = (Photograph(left.name, (left,)), Photograph(right.name, (right,)))
+    return Compared(photographs, (first, second), matches)
+
+
+def test_any_focal_length_fits_cameras_that_do_not_turn() -> None:
+    """In pixels it is as near with each of them; in angles the longer the nearer."""
+    rng = np.random.default_rng(3)
+    factor, nearer, _ = fitting_factor([pair_of_cameras(rng) for _ in range(6)])
+    assert factor < 1.05
+    assert nearer > 0.9
+
+
+@pytest.mark.parametrize(("mistaken", "is_far"), [(5, False), (6, True)])
+def test_features_that_are_mistaken_for_each_other_tell_of_no_poses(mistaken: int, is_far: bool) -> None:
+    """As long as they are so in half of the pairs at most."""
+    rng = np.random.default_rng(4)
+    compared = [pair_of_cameras(rng, 160 if k < mistaken else 0) for k in range(10)]
+    assert (distance_of_pairs(compared) > 0.35) == is_far
 
 
 def test_views_of_one_photograph_have_their_features_together() -> None:

@@ -265,6 +265,17 @@ def test_images_in_one_place_are_no_impossible_unit(tmp_path: Path) -> None:
     assert len(read_scene(tmp_path).views) == len(model.frames)
 
 
+def test_a_tripod_without_points_is_no_impossible_unit(tmp_path: Path) -> None:
+    model = make_model()
+    for point in list(model.points3D):
+        model.delete_point3D(point)
+    for frame in model.frames.values():
+        turn = pycolmap.Rotation3d(np.array([0.0, 0.1 * frame.frame_id, 0.0]))
+        frame.rig_from_world = pycolmap.Rigid3d(turn, -(turn.matrix() @ np.array([0.1, 0.2, 0.3])))
+    model.write_binary(tmp_path)
+    assert len(read_scene(tmp_path).views) == len(model.frames)
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [

@@ -4,14 +4,18 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 import colmap_sph
 from colmap_sph import synthetic as syn
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.input.standing import with_still_pixels
+from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.workspace import Workspace
-from colmap_sph.scene import View
+from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.poses.standstill import still_pixels, turned_views
 
@@ -92,6 +96,39 @@ def test_a_tower_of_four_equal_sides_does_not_stand_still():
     assert of_sky < 0.02  # what is left is beside the mast, whose windows show its outlines
 
 
+def context_of(root: Path, pictures, views, masks=()) -> Context:
+    """Of a workspace with these images."""
+    workspace = Workspace(root)
+    for folder, images in ((workspace.image_path, pictures), (workspace.mask_path, masks)):
+        for view, image in zip(views, images, strict=False):
+            folder(view.name).parent.mkdir(exist_ok=True)
+            cv2.imwrite(str(folder(view.name)), image[..., ::-1] if image.ndim == 3 else image)
+    options = RunOptions()
+    return Context(workspace, Scene(tuple(views), np.empty((0, 3))), options, Keys(workspace, options, {}))
+
+
+def still_images(context: Context) -> int:
+    return len(with_still_pixels(context, [view.name for view in context.scene.views]).still)
+
+
+def test_an_object_with_eight_equal_sides_is_matched(tmp_path):
+    """Of 16 images around it every other one shows the same."""
+    cameras = ring(16, 2, 0.7)
+    eggs = [[syn.Ellipsoid(np.zeros(3), RADII, texture(seed))] for seed in (1, 2)]
+    pictures = [photograph(each, cameras[0], 0)[0] for each in eggs]
+    assert not still_images(context_of(tmp_path, pictures * 8, views_of(cameras)))
+    assert still_images(context_of(tmp_path, pictures[:1] * 16, views_of(cameras))) == 16
+
+
+def test_a_masked_backdrop_is_not_told_again(tmp_path):
+    """Some pixels at the rim of masks may show it."""
+    cameras, room = ring(IMAGES, 2, 0.7), backdrop()
+    photographs = [photograph(egg(), camera, k, room) for k, camera in enumerate(cameras)]
+    pictures = [picture for picture, _ in photographs]
+    masks = [cv2.dilate(there.astype(np.uint8) * 255, np.ones((5, 5), np.uint8)) for _, there in photographs]
+    assert not still_images(context_of(tmp_path, pictures, views_of(cameras), masks))
+
+
 def test_only_images_of_one_camera_that_are_turned_are_compared():
     views = views_of(ring(16, 2, 0.7))
     turned = turned_views(views)
@@ -132,6 +169,19 @@ def test_an_object_in_the_hand_is_free_of_the_room_behind_it(model, tmp_path):
     assert report.still.startswith(("8", "9"))  # per cent
     assert "--masks" in report.still
     assert share_off(Workspace(tmp_path / "dense")) < 0.01
+    assert report.points > 20_000
+
+
+def test_the_room_does_not_tell_of_poses(model, tmp_path):
+    """Its features lie far from their epipolar planes, as those of a model whose images were exchanged."""
+    without_points = pycolmap.Reconstruction(model)
+    for point in list(without_points.points3D):
+        without_points.delete_point3D(point)
+    (tmp_path / "sparse").mkdir()
+    without_points.write(tmp_path / "sparse")
+    report = colmap_sph.run(tmp_path / "sparse", images=model.parents[1] / "images", output=tmp_path / "dense")
+    assert report.still
+    assert not report.doubts
     assert report.points > 20_000
 
 

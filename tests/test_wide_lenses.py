@@ -157,6 +157,25 @@ def test_panorama_is_colmaps() -> None:
     np.testing.assert_allclose(found, np.asarray(camera.cam_ray_from_img(points), np.float64), atol=1e-9)
 
 
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("EUCM", (1000.0, 1000.0, 2000.0, 1500.0, 0.9995, 1.2)),
+        ("SIMPLE_DIVISION", (1000.0, 2000.0, 1500.0, 0.25)),
+        ("RADIAL_FISHEYE", (1000.0, 2000.0, 1500.0, -0.12, 0.002)),
+    ],
+)
+def test_rays_are_found_up_to_where_a_lens_ends(model: str, params: tuple[float, ...]) -> None:
+    """There radii hardly grow with the angle, or ever faster."""
+    of = Lens(model, params, 4000, 3000)
+    angle = turning_angle(of) * np.linspace(0, 0.9995, 3000)
+    rays = np.column_stack([np.sin(angle), np.zeros(len(angle)), np.cos(angle)])
+    points = image_points(of, rays)
+    is_near = np.abs(points[:, 0]) < 1e5
+    found = camera_rays(of, points[is_near])
+    np.testing.assert_allclose(found, rays[is_near], atol=1e-6)
+
+
 def test_nothing_beyond_where_the_polynomial_turns() -> None:
     folded = Lens("SIMPLE_RADIAL_FISHEYE", (130.0, 240.0, 240.0, -0.15), 480, 480)
     turn = math.degrees(turning_angle(folded))

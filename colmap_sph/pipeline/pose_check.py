@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.self_check import add_doubt
+from colmap_sph.pipeline.stages.photo import still_mask
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.images.reading import read_whole_grey
 from colmap_sph.project.masks import read_view_mask
@@ -62,7 +63,7 @@ _USUAL_DISTANCE = 0.35
 
 
 @dataclass(frozen=True, eq=False)
-class _Compared:
+class Compared:
     """A pair whose features tell something."""
 
     photographs: tuple[Photograph, Photograph]
@@ -80,6 +81,11 @@ class _Compared:
                 with_focal_length(second, right.views[0], factor),
             )
         return epipolar_distances(*features, self.matches, right.center - left.center)
+
+    @property
+    def fits(self) -> bool:
+        """Whether most of the features lie in common epipolar planes."""
+        return bool((self.distances() <= 1).mean() > _FITTING)
 
 
 def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
@@ -105,7 +111,7 @@ def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
     _doubt_poses(context, compared)
 
 
-def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[_Compared], float]:
+def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[Compared], float]:
     """Pairs that tell something, and how many features the images of such pairs have."""
 
     @cache
@@ -122,11 +128,11 @@ def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[_Compared], 
         matches = match_features(first, second)
         if len(matches) >= _TELLING:
             photographs = (context.scene.photograph(left), context.scene.photograph(right))
-            compared.append(_Compared(photographs, (first, second), matches))
+            compared.append(Compared(photographs, (first, second), matches))
     return compared, median(len(features_of(name) or ()) for pair in pairs for name in pair)
 
 
-def _refuse_focal_length(compared: Sequence[_Compared]) -> None:
+def _refuse_focal_length(compared: Sequence[Compared]) -> None:
     """Raise `NoResultError` where features fit other focal lengths far better.
 
     It would pass else: depth is wrong by as much as the focal length, in all images alike.
@@ -134,12 +140,7 @@ def _refuse_focal_length(compared: Sequence[_Compared]) -> None:
     whole = [pair for pair in compared if all(len(photograph.views) == 1 for photograph in pair.photographs)]
     if len(whole) < _FEWEST_PAIRS:
         return
-    now = np.array([np.median(pair.distances()) for pair in whole])
-    there = np.array([[np.median(pair.distances(factor)) for pair in whole] for factor in _FACTORS])
-    best = int(np.median(there, axis=1).argmin())
-    factor = float(_FACTORS[best])
-    nearer = float(np.median(there[best]) / max(np.median(now), _LEAST_DISTANCE))
-    of_pairs = float((there[best] < now).mean())
+    factor, nearer, of_pairs = fitting_factor(whole)
     logger.info(
         "Features fit focal length x %.3f best: %.2f of their distance, less in %.2f of the pairs",
         factor,
@@ -155,23 +156,48 @@ def _refuse_focal_length(compared: Sequence[_Compared]) -> None:
         )
 
 
-def _refuse_poses(compared: Sequence[_Compared], asked: Sequence[Pair], usual_features: float) -> None:
+def fitting_factor(compared: Sequence[Compared]) -> tuple[float, float, float]:
+    """Find by how much focal lengths are to be multiplied for features to lie nearest to their epipolar planes.
+
+    Parameters
+    ----------
+    compared : sequence of Compared
+        Of photographs that are one view.
+
+    Returns
+    -------
+    factor : float
+    nearer : float
+        Distance of the features then, as a share of what it is.
+    of_pairs : float
+        Share of the pairs in which it is less.
+    """
+    now = np.array([np.median(pair.distances()) for pair in compared])
+    there = np.array([[np.median(pair.distances(factor)) for pair in compared] for factor in _FACTORS])
+    # Where cameras do not turn, any focal length fits, and with a longer one a pixel is a smaller angle.
+    there *= np.maximum(_FACTORS, 1)[:, None]
+    best = int(np.median(there, axis=1).argmin())
+    nearer = float(np.median(there[best]) / max(np.median(now), _LEAST_DISTANCE))
+    return float(_FACTORS[best]), nearer, float((there[best] < now).mean())
+
+
+def _refuse_poses(compared: Sequence[Compared], asked: Sequence[Pair], usual_features: float) -> None:
     """Raise `NoResultError` where most features do not lie in common epipolar planes."""
-    fits = [bool((pair.distances() <= 1).mean() > _FITTING) for pair in compared]
-    contradicting = sum(len(pair.matches) for pair, does in zip(compared, fits, strict=True) if not does)
-    logger.info("Features fit the poses in %d of %d pairs, of %d asked", sum(fits), len(fits), len(asked))
-    if 2 * sum(fits) < len(fits) and contradicting >= _ENOUGH:
-        finding = f"lie on each other's epipolar lines in only {sum(fits)} of {len(fits)} pairs"
+    others = [pair for pair in compared if not pair.fits]
+    fitting = len(compared) - len(others)
+    logger.info("Features fit the poses in %d of %d pairs, of %d asked", fitting, len(compared), len(asked))
+    if fitting < len(others) and sum(len(pair.matches) for pair in others) >= _ENOUGH:
+        finding = f"lie on each other's epipolar lines in only {fitting} of {len(compared)} pairs"
         raise NoResultError(_refusal(finding))
     if not compared and usual_features >= _MANY_FEATURES and len(asked) >= _MANY_PAIRS:
         raise NoResultError(_refusal(f"match in none of {len(asked)} pairs that should show the same"))
 
 
-def _doubt_poses(context: Context, compared: Sequence[_Compared]) -> None:
+def _doubt_poses(context: Context, compared: Sequence[Compared]) -> None:
     """Put into the report where features lie farther from their epipolar planes than usual."""
     if len(compared) < _FEWEST_PAIRS:
         return
-    distance = median(float(np.median(pair.distances())) for pair in compared)
+    distance = distance_of_pairs(compared)
     logger.info("Features lie %.2f %% of an image from their epipolar planes", distance)
     if distance > _USUAL_DISTANCE:
         add_doubt(
@@ -183,9 +209,27 @@ def _doubt_poses(context: Context, compared: Sequence[_Compared]) -> None:
         )
 
 
+def distance_of_pairs(compared: Sequence[Compared]) -> float:
+    """Median distance of features from their epipolar planes, see `epipolar_distances`.
+
+    Of the pairs in which most fit, if that is half of them: in the others features are mistaken for each other, as
+    those of equal windows are.
+    """
+    fitting = [pair for pair in compared if pair.fits]
+    told = fitting if 2 * len(fitting) >= len(compared) else compared
+    return median(float(np.median(pair.distances())) for pair in told)
+
+
 def _shown(context: Context, view: View) -> Shown:
-    image = read_whole_grey(context.workspace.image_path(view.name), (view.width, view.height))
-    return view, image, read_view_mask(context.workspace.mask_path(view.name), view)
+    """What stands still while the camera turns does not tell of its poses."""
+    place = context.workspace.image_path
+    image = read_whole_grey(place(view.name), (view.width, view.height))
+    mask = read_view_mask(context.workspace.mask_path(view.name), view)
+    turned = context.still.get(view.name)
+    if turned:
+        moves = 255 * (1 - still_mask(view, place(view.name), [place(name) for name in turned]))
+        mask = moves if mask is None else np.minimum(mask, moves)
+    return view, image, mask
 
 
 def _refusal(finding: str) -> str:

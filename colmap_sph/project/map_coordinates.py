@@ -23,6 +23,8 @@ _SAMPLED_POINTS = 1000
 _MAX_COORDINATE = 1e12
 # Depth maps are of 32-bit floats, which lose their digits, and whose squares vanish, far below.
 _MIN_SIZE = 1e-15
+# As a share of how far they are: places nearer to each other are the same, of images of one tripod without points.
+_ROUNDING = 1e-12
 _CHUNK_POINTS = 1_000_000
 _PLY_TYPES = {"float": "<f4", "double": "<f8", "uchar": "u1"}
 
@@ -48,7 +50,7 @@ def check_size(model: pycolmap.Reconstruction, sparse_dir: Path) -> None:
     apart = float(np.ptp(places, axis=0).max()) if len(places) else 0.0
     if farthest >= _MAX_COORDINATE:
         what = f"images of the model in {sparse_dir} lie some {farthest:.0e} units from its origin"
-    elif 0.0 < apart < _MIN_SIZE:
+    elif _ROUNDING * np.abs(places).max(initial=0.0) < apart < _MIN_SIZE:
         what = f"images and points of the model in {sparse_dir} lie only {apart:.0e} units apart"
     else:
         return

@@ -1,7 +1,7 @@
 """Do parts of the images stand still while the camera turns? They are not of the scene, and are not matched."""
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -13,12 +13,15 @@ from colmap_sph.errors import InputError
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.stages.photo import read_small
 from colmap_sph.project.masks import read_view_mask
-from colmap_sph.stereo.poses.standstill import still_pixels, turned_views
+from colmap_sph.scene import View
+from colmap_sph.stereo.poses.standstill import slightly_turned_views, still_pixels, turned_views
 
 logger = logging.getLogger(__name__)
 
 # Images are looked at with so many pixels along their longest side.
 _LOOKED_AT = 320
+# Side of what is left out around masked pixels: windows there show these, too.
+_SIDE = 9
 # A smaller share of a camera's images may look alike by chance.
 _LEAST_STILL = 0.015
 
@@ -27,7 +30,8 @@ def with_still_pixels(context: Context, names: Collection[str]) -> Context:
     """Look which cameras show something that stands still: reported, and known to the context that is returned.
 
     Of each camera the images that are turned most are compared with each other. Where these have next to nothing
-    in common, the others are not looked at.
+    in common, the others are not looked at. Nor are they where this is not in images that are turned a little: an
+    object with eight equal sides looks alike at eight turns.
 
     Parameters
     ----------
@@ -37,8 +41,9 @@ def with_still_pixels(context: Context, names: Collection[str]) -> Context:
     """
     if context.options.matching.keep_blank:
         return context
-    turned = turned_views([context.scene.view(name) for name in sorted(names)])
-    shares = _still_shares(context, turned)
+    views = [context.scene.view(name) for name in sorted(names)]
+    turned = turned_views(views)
+    shares = _still_shares(context, views, turned)
     still = {}
     for name, others in turned.items():
         known = [shares[other] for other in others if other in shares]
@@ -51,16 +56,21 @@ def with_still_pixels(context: Context, names: Collection[str]) -> Context:
     return replace(context, still=still)
 
 
-def _still_shares(context: Context, turned: Mapping[str, tuple[str, ...]]) -> dict[str, float]:
+def _still_shares(
+    context: Context, views: Sequence[View], turned: Mapping[str, tuple[str, ...]]
+) -> dict[str, float]:
     """Share of what is not masked that stands still, in images that others are compared with."""
-    compared = sorted({other for others in turned.values() for other in others})
+    compared = {other for others in turned.values() for other in others}
+    beside = slightly_turned_views(views, compared)
     small: dict[str, NDArray[np.uint8]] = {}
-    for name in compared:
+    for name in sorted({*compared, *beside.values()}):
         with suppress(InputError):  # told by the stage that needs it
             small[name] = read_small(context.workspace.image_path(name), _LOOKED_AT)
     shares = {}
-    for name in small.keys() & turned.keys():
+    for name in sorted(compared & turned.keys() & small.keys()):
         still = still_pixels(small[name], [small[other] for other in turned[name] if other in small])
+        if beside[name] in small:
+            still &= still_pixels(small[name], [small[beside[name]]])
         with suppress(InputError):
             wanted = _wanted(context, name, still.shape)
             if wanted.any():
@@ -72,7 +82,8 @@ def _wanted(context: Context, name: str, shape: tuple[int, ...]) -> NDArray[np.b
     mask = read_view_mask(context.workspace.mask_path(name), context.scene.view(name))
     if mask is None:
         return np.ones(shape, bool)
-    return np.asarray(cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST)) > 0
+    small = cv2.resize(mask, shape[::-1], interpolation=cv2.INTER_NEAREST)
+    return np.asarray(cv2.erode(small, np.ones((_SIDE, _SIDE), np.uint8))) > 0
 
 
 def _words(images: int, share: float) -> str:

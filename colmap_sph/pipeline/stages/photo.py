@@ -1,5 +1,6 @@
 """A grey image with its corners: what pairs are matched in and ties measured in, and which pixels take part."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -82,17 +83,17 @@ class PhotoFile:
             return mask
         ignored = blank_pixels(image, self.jpeg_step)
         if self.turned:
-            ignored |= self._still_pixels()
+            ignored |= still_mask(self.view, self.image, self.turned)
         if not ignored.any():
             return mask
         counts = np.where(ignored, np.uint8(0), np.uint8(255))
         return counts if mask is None else np.minimum(counts, mask)
 
-    def _still_pixels(self) -> Mask:
-        others = (read_small(path, _STILL_SIDE) for path in self.turned)
-        still = still_pixels(read_small(self.image, _STILL_SIDE), others)
-        size = (self.view.width, self.view.height)
-        return np.asarray(cv2.resize(still, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+
+def still_mask(view: View, image: Path, turned: Sequence[Path]) -> Mask:
+    """1 where an image of a view and those that it is compared with show the same, see `still_pixels`, else 0."""
+    still = still_pixels(read_small(image, _STILL_SIDE), (read_small(path, _STILL_SIDE) for path in turned))
+    return np.asarray(cv2.resize(still, (view.width, view.height), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
 def read_small(path: Path, longest: int) -> Mask:

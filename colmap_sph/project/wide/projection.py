@@ -26,6 +26,8 @@ _DELTA = 1e-6
 # Pixels by which what was found may miss what was asked for.
 _MISS = 1e-6
 _CLOSE = 1e-10
+# Radians: the next step is about as long as this one's square.
+_SMALL_STEP = 1e-7
 _TINY = 1e-12
 
 
@@ -270,12 +272,19 @@ def _angle_at(lens: Lens, distance: Float) -> Float:
     _, _, extra = _intrinsics(lens)
     radius_at = MODELS[lens.model][2]
     angle, radius = _table(lens)
-    start = np.interp(distance, radius, angle)
+    found = np.interp(distance, radius, angle)
+    left = np.arange(len(found))
     with np.errstate(all="ignore"):
-        slope = (radius_at(start + _DELTA, extra) - radius_at(start - _DELTA, extra)) / (2 * _DELTA)
-        better = start - (radius_at(start, extra) - distance) / slope
-    # Where the radius ends, it may turn back.
-    return np.where(np.abs(better - start) < np.pi / (_NODES - 1), better, start)
+        for _ in range(_STEPS):
+            here = found[left]
+            slope = (radius_at(here + _DELTA, extra) - radius_at(here - _DELTA, extra)) / (2 * _DELTA)
+            step = (distance[left] - radius_at(here, extra)) / slope
+            is_near = np.abs(step) < np.pi / (_NODES - 1)  # where the radius ends, it may turn back
+            found[left[is_near]] += step[is_near]
+            left = left[is_near & (np.abs(step) > _SMALL_STEP)]
+            if not len(left):
+                break
+    return found
 
 
 def _panorama_points(lens: Lens, rays: Float) -> Float:

@@ -9,7 +9,7 @@ tower of four equal sides does at some of the turns only, and a mast on the axis
 horizon, has no texture in two directions; neither counts.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import cv2
@@ -23,6 +23,8 @@ Mask = NDArray[np.uint8]
 
 # Images that are turned by so many degrees show no surface alike.
 _TURNED = 45.0
+# An object with equal sides looks alike at some turns, but hardly at this one.
+_TURNED_LITTLE = 20.0
 # So many images of a camera are compared with the others, those that are turned most against each other; fewer
 # than so many turned ones tell nothing.
 _COMPARED = 9
@@ -80,6 +82,19 @@ def turned_views(views: Sequence[View]) -> dict[str, tuple[str, ...]]:
             names = tuple(members[index].name for index in np.array(chosen)[turned])
             if len(names) >= _LEAST_COMPARED:
                 found[view.name] = names
+    return found
+
+
+def slightly_turned_views(views: Sequence[View], names: Collection[str]) -> dict[str, str]:
+    """Find of each of some views another of the same camera, turned by about 20 degrees; names → names."""
+    found = {}
+    for members in _by_camera(views):
+        rotations = np.array([view.R for view in members])
+        for index, view in enumerate(members):
+            if view.name in names and len(members) > 1:
+                off = np.abs(_degrees(view.R, rotations) - _TURNED_LITTLE)
+                off[index] = np.inf
+                found[view.name] = members[int(off.argmin())].name
     return found
 
 
