@@ -1082,6 +1082,28 @@ def resample(
     valid : (H, W) uint8, written
     """
 
+def half_image(
+    image: NDArray[np.float32],
+    half: NDArray[np.float32],
+    /,
+) -> None:
+    """The mean of 2 x 2 pixels each.
+
+    image : (FINE_H, FINE_W) float32
+    half : (H, W) float32, written
+    """
+
+def half_mask(
+    mask: NDArray[np.uint8],
+    half: NDArray[np.uint8],
+    /,
+) -> None:
+    """255 where at least half of 2 x 2 pixels are, else 0.
+
+    mask : (FINE_H, FINE_W) uint8
+    half : (H, W) uint8, written
+    """
+
 def sharpen(
     backend: str,
     image: NDArray[np.float32],

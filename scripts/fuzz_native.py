@@ -462,6 +462,18 @@ def resample(rng: Random) -> Arguments:
     return [backend(rng), *tables, filled(rng, source, np.float32), mask, *places]
 
 
+def half_image(rng: Random) -> Arguments:
+    h, w = size(rng)
+    fine = finer(rng, (h, w))
+    return [filled(rng, fine, np.float32), np.zeros((h, w), np.float32)]
+
+
+def half_mask(rng: Random) -> Arguments:
+    h, w = size(rng)
+    fine = finer(rng, (h, w))
+    return [filled(rng, fine, np.uint8), np.zeros((h, w), np.uint8)]
+
+
 def sharpen(rng: Random) -> Arguments:
     h, w = size(rng)
     return [backend(rng), filled(rng, (h, w), np.float32), number(rng), np.zeros((h + 6, w + 8), np.int16)]
@@ -544,6 +556,8 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         unwarp_torn,
         source_pixels,
         resample,
+        half_image,
+        half_mask,
         sharpen,
         first_offsets,
         target_bases,
