@@ -837,6 +837,19 @@ def remove_small_segments(
     min_segment : int
     """
 
+def fill_nearest(
+    offset: NDArray[np.int32],
+    predicted: NDArray[np.int32],
+    filled: NDArray[np.float32],
+    /,
+) -> None:
+    """Offsets in pixels; where there is none, as far from the predicted one as the nearest is from its own.
+
+    offset : (H, W) int32
+    predicted : (H, W) int32
+    filled : (H, W) float32, written
+    """
+
 def count_fractions(
     offset: NDArray[np.int32],
     counts: NDArray[np.uint32],
@@ -1067,6 +1080,28 @@ def resample(
     mask : (MASK_H, SOURCE_W) uint8
     grey : (H, W) float32, written
     valid : (H, W) uint8, written
+    """
+
+def half_image(
+    image: NDArray[np.float32],
+    half: NDArray[np.float32],
+    /,
+) -> None:
+    """The mean of 2 x 2 pixels each.
+
+    image : (FINE_H, FINE_W) float32
+    half : (H, W) float32, written
+    """
+
+def half_mask(
+    mask: NDArray[np.uint8],
+    half: NDArray[np.uint8],
+    /,
+) -> None:
+    """255 where at least half of 2 x 2 pixels are, else 0.
+
+    mask : (FINE_H, FINE_W) uint8
+    half : (H, W) uint8, written
     """
 
 def sharpen(

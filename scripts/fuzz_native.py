@@ -229,6 +229,11 @@ def join_targets(rng: Random) -> Arguments:
     return [w, source, np.zeros(joined, np.uint64), np.zeros(joined, np.int32)]
 
 
+def fill_nearest(rng: Random) -> Arguments:
+    shape = size(rng)
+    return [filled(rng, shape, np.int32), filled(rng, shape, np.int32), np.zeros(shape, np.float32)]
+
+
 def bases_about(rng: Random) -> Arguments:
     return [filled(rng, size(rng), np.int32), 32, *sorted(rng.integers(-99, 99, 2).tolist())]
 
@@ -457,6 +462,18 @@ def resample(rng: Random) -> Arguments:
     return [backend(rng), *tables, filled(rng, source, np.float32), mask, *places]
 
 
+def half_image(rng: Random) -> Arguments:
+    h, w = size(rng)
+    fine = finer(rng, (h, w))
+    return [filled(rng, fine, np.float32), np.zeros((h, w), np.float32)]
+
+
+def half_mask(rng: Random) -> Arguments:
+    h, w = size(rng)
+    fine = finer(rng, (h, w))
+    return [filled(rng, fine, np.uint8), np.zeros((h, w), np.uint8)]
+
+
 def sharpen(rng: Random) -> Arguments:
     h, w = size(rng)
     return [backend(rng), filled(rng, (h, w), np.float32), number(rng), np.zeros((h + 6, w + 8), np.int16)]
@@ -539,11 +556,14 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         unwarp_torn,
         source_pixels,
         resample,
+        half_image,
+        half_mask,
         sharpen,
         first_offsets,
         target_bases,
         join_targets,
         bases_about,
+        fill_nearest,
         mark_steps,
         count_slopes,
         disparity_range,

@@ -109,6 +109,25 @@ def test_rays_that_are_no_numbers_read_nothing_outside():
     assert [tuple(place) for place in np.argwhere(valid)] == [(3, 4)]
 
 
+@property_test
+@given(shape=sizes, seed=seeds)
+def test_halves_are_means_of_four(shape, seed):
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, shape).astype(np.float32)
+    mask = rng.choice(np.array([0, 255], np.uint8), shape)
+    odd = [(0, side % 2) for side in shape]
+    grey, content = np.pad(image, odd, mode="edge"), np.pad(mask, odd)
+    means, shares = (
+        np.mean([values[y::2, x::2] for y in (0, 1) for x in (0, 1)], axis=0, dtype=float)
+        for values in (grey, content)
+    )
+    half_image, half_mask = np.empty(means.shape, np.float32), np.empty(means.shape, np.uint8)
+    _native.half_image(image, half_image)
+    _native.half_mask(mask, half_mask)
+    np.testing.assert_array_equal(half_image, means)
+    np.testing.assert_array_equal(half_mask, np.where(shares >= 255 / 2, 255, 0))
+
+
 def sharpened(image, sharpening):
     def run(backend):
         padded = np.full((image.shape[0] + 6, image.shape[1] + 8), 5, np.int16)

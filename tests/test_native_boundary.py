@@ -317,6 +317,14 @@ def arguments(function):
             "out grey": np.zeros((H, W), f32),
             "out valid": np.zeros((H, W), u8),
         },
+        "half_image": {
+            "image": np.ones((2 * H - 1, 2 * W), f32),
+            "out half": np.zeros((H, W), f32),
+        },
+        "half_mask": {
+            "mask": np.ones((2 * H, 2 * W - 1), u8),
+            "out half": np.zeros((H, W), u8),
+        },
         "sharpen": {
             "backend": "scalar",
             "image": np.zeros((H, W), f32),
@@ -360,6 +368,7 @@ def offsets_arguments():
     return {
         "keep_between": {"out offset": ints(), "first": -300, "last": 300},
         "remove_small_segments": {"out offset": ints(), "min_segment": 20},
+        "fill_nearest": {"offset": ints(), "predicted": ints(), "out filled": np.zeros((H, W), np.float32)},
         "count_fractions": {"offset": ints(), "out counts": np.zeros(256, np.uint32)},
         "unwarp_torn": {"offset": ints(), "torn": torn(), "as_it_is": 70, "out unwarped": ints()},
         "first_offsets": {"predicted": ints(), "base": ints(), "torn": torn(), "out first": ints()},
@@ -503,6 +512,8 @@ FUNCTIONS = [
     "refine_planes",
     "source_pixels",
     "resample",
+    "half_image",
+    "half_mask",
     "sharpen",
     *offsets_arguments(),
     *ties_arguments(),
@@ -539,6 +550,8 @@ FREE = {
             ("count_slopes", "offset"),
             ("disparity_range", "disparity"),
             ("seed_planes", "out planes"),
+            ("half_image", "image"),  # one less than twice as many will do, see below
+            ("half_mask", "mask"),
             ("fit_surfaces", "disparity"),
         )
     },
@@ -864,11 +877,12 @@ def test_bounds_of_means_are_kept(name, most):
             call("mean_offsets", {**arguments("mean_offsets"), name: value})
 
 
-@pytest.mark.parametrize("function", ["upsample_offsets", "search_windows"])
+@pytest.mark.parametrize("function", ["upsample_offsets", "search_windows", "half_image", "half_mask"])
 @pytest.mark.parametrize("size", [(2 * H + 1, 2 * W), (2 * H, 2 * W + 1), (2 * H - 2, 2 * W), (H, W), (0, 0)])
 def test_levels_of_other_sizes_are_refused(function, size):
     values = arguments(function)
-    fine = {name: np.zeros(size, np.int32) for name in ("out fine", "predicted", "out base") if name in values}
+    names = {"out fine", "predicted", "out base", "image", "mask"} & set(values)
+    fine = {name: np.zeros(size, values[name].dtype) for name in names}
     with pytest.raises(ValueError, match="twice the size"):
         call(function, {**values, **fine})
 

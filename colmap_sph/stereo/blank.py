@@ -181,10 +181,14 @@ def _silent_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int, levels: int
     scales = [image.astype(np.float32, copy=False)]
     while len(scales) < levels:
         scales.append(half_size(scales[-1]))
-    noise, local = _noise(scales)
+    variance = _variances(scales[_NOISE_LEVEL])
+    noise = _noise(scales, variance)
     rounding = _ROUNDING * jpeg_step
     bounds = [_MARGIN * max(noise * _FALL ** (level - _NOISE_LEVEL), rounding) for level in range(levels)]
-    silent = _quiet(scales[-1], bounds[-1] / noise * local if is_local else bounds[-1])
+    coarsest: float | Float = bounds[-1]
+    if is_local:
+        coarsest = bounds[-1] / noise * _local_noise(noise, variance, scales[-1].shape)
+    silent = _quiet(scales[-1], coarsest)
     for scale, bound in zip(scales[-2::-1], bounds[-2::-1], strict=True):
         if not silent.any():
             return np.zeros(image.shape, np.uint8)
@@ -247,19 +251,11 @@ def _cut_off(image: Float) -> Float:
     return np.asarray(cv2.blur(cut.astype(np.float32), (_SIDE, _SIDE)), dtype=np.float32)
 
 
-def _noise(scales: list[Float]) -> tuple[float, Float]:
-    """Standard deviation of pixels, grey values, at the scale where noise is measured.
+def _noise(scales: list[Float], variance: Float) -> float:
+    """Standard deviation of pixels, grey values, in the quietest windows of the scale where noise is measured.
 
-    Returns
-    -------
-    noise : float
-        In the quietest windows of the image.
-    local : ndarray of the coarsest scale's shape
-        Around each of its pixels, where that is less, as an image without any blank place has no window with noise
-        alone; 0 where it is much more, so that there is texture, too fine for the coarsest scale.
+    `variance` is that scale's.
     """
-    image = scales[_NOISE_LEVEL]
-    variance = _variances(image)
     some = (slice(_SIDE // 2, None, _SIDE),) * 2
     lit = _cut_off(scales[0])[some] <= _CUT_SHARE
     quietest = float(np.percentile(variance[some][lit], _QUIETEST)) if lit.any() else 0.0
@@ -268,10 +264,19 @@ def _noise(scales: list[Float]) -> tuple[float, Float]:
         there = lit & (variance[some] <= quietest)
         lost = float(np.median(_variances(scales[0], 2)[some][there])) - quietest
         noise = min(noise, max(math.sqrt(max(lost, 0.0)), _USUAL_NOISE), _MOST_NOISE)
-    mean = cv2.resize(variance, scales[-1].shape[::-1], interpolation=cv2.INTER_AREA)
+    return noise
+
+
+def _local_noise(noise: float, variance: Float, shape: tuple[int, ...]) -> Float:
+    """Noise around each pixel of the coarsest scale, of that shape, where it is less than the image's.
+
+    An image without any blank place has no window with noise alone. 0 where it is much more, so that there is
+    texture, too fine for the coarsest scale.
+    """
+    mean = cv2.resize(variance, shape[::-1], interpolation=cv2.INTER_AREA)
     local = np.clip(np.sqrt(cv2.erode(mean, np.ones((_LOCAL_SIDE, _LOCAL_SIDE), np.uint8))), _LEAST_NOISE, noise)
     local[cv2.blur(mean, (_SIDE, _SIDE)) > (_MARGIN * noise) ** 2] = 0
-    return noise, local
+    return local
 
 
 def _with_edges(image: Float, blank: Mask, noise: float) -> Mask:

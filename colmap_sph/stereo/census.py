@@ -5,7 +5,6 @@ Census (Zabih and Woodfill 1994, 9 × 7 here) tells what a window shows whatever
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,8 +19,6 @@ _BORDER = (3, 4)  # rows at the top and at the bottom, columns at either side
 # Unsharp masking, which gives back some of what lenses and resampling took away: so much of the difference from
 # the binomial mean of 3 x 3 pixels is added.
 _SHARPENING = 0.6
-_CONTENT = np.uint8(255)  # where an image has content, in masks; a level's pixel has where half of its four have
-_HALF_CONTENT = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,14 +34,9 @@ def pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
     images = [image]
     for _ in range(levels):
         pixels = half_size(images[-1].image)
-        valid = images[-1].valid
-        height, width = valid.shape
-        if height % 2 or width % 2:
-            valid = np.asarray(
-                cv2.copyMakeBorder(valid, 0, height % 2, 0, width % 2, cv2.BORDER_CONSTANT, value=0)
-            )
-        coarse_valid = cv2.resize(valid, pixels.shape[::-1], interpolation=cv2.INTER_AREA)
-        images.append(RectifiedImage(pixels, np.where(coarse_valid >= _HALF_CONTENT, _CONTENT, np.uint8(0))))
+        valid = np.empty(pixels.shape, dtype=np.uint8)
+        _native.half_mask(np.ascontiguousarray(images[-1].valid), valid)
+        images.append(RectifiedImage(pixels, valid))
     return images
 
 

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,11 +51,9 @@ def resample(
 
 def half_size(image: NDArray[np.float32]) -> NDArray[np.float32]:
     """The mean of 2 x 2 pixels each: odd rows and columns are doubled, so that pixel x covers 2x and 2x + 1."""
-    height, width = image.shape
-    if height % 2 or width % 2:
-        image = np.asarray(cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE))
-    half = ((width + 1) // 2, (height + 1) // 2)
-    return np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.float32)
+    half = np.empty([(side + 1) // 2 for side in image.shape], dtype=np.float32)
+    _native.half_image(np.ascontiguousarray(image), half)
+    return half
 
 
 @dataclass(frozen=True, eq=False)

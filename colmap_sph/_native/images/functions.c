@@ -58,6 +58,47 @@ static int run_resample(void *arguments) {
 FUNCTION(resample, RESAMPLE, check_resample,
          "Grey values of rectified pixels, linear between an image's, and 255 where all of them count.");
 
+static int check_half(const sizes *size) {
+    return check(size->H == size->FINE_H / 2 + size->FINE_H % 2 && size->W == size->FINE_W / 2 + size->FINE_W % 2,
+                 "an image must have twice the size of its half, or one less");
+}
+
+#define HALF_IMAGE(X) \
+    X(IN, float32, image, FINE_H, FINE_W) \
+    X(OUT, float32, half, H, W)
+ARGUMENTS(half_image, HALF_IMAGE);
+
+static int check_half_image(const void *arguments) {
+    const half_image_arguments *a = arguments;
+    return check_half(&a->size);
+}
+
+static int run_half_image(void *arguments) {
+    const half_image_arguments *a = arguments;
+    half_image(a->image, a->size.FINE_H, a->size.FINE_W, a->half);
+    return 0;
+}
+
+FUNCTION(half_image, HALF_IMAGE, check_half_image, "The mean of 2 x 2 pixels each.");
+
+#define HALF_MASK(X) \
+    X(IN, uint8, mask, FINE_H, FINE_W) \
+    X(OUT, uint8, half, H, W)
+ARGUMENTS(half_mask, HALF_MASK);
+
+static int check_half_mask(const void *arguments) {
+    const half_mask_arguments *a = arguments;
+    return check_half(&a->size);
+}
+
+static int run_half_mask(void *arguments) {
+    const half_mask_arguments *a = arguments;
+    half_mask(a->mask, a->size.FINE_H, a->size.FINE_W, a->half);
+    return 0;
+}
+
+FUNCTION(half_mask, HALF_MASK, check_half_mask, "255 where at least half of 2 x 2 pixels are, else 0.");
+
 #define SHARPEN(X) \
     X(VALUE, backend, backend) \
     X(IN, float32, image, H, W) \
@@ -74,4 +115,5 @@ FUNCTION(
     sharpen, SHARPEN, any,
     "An image plus so many times what it differs by from its mean nearby, in 1/64 grey value, with a border.");
 
-native_function *const images_functions[] = {&source_pixels_function, &resample_function, &sharpen_function, NULL};
+native_function *const images_functions[] = {&source_pixels_function, &resample_function, &half_image_function,
+                                             &half_mask_function,     &sharpen_function,  NULL};

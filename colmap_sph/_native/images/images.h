@@ -28,6 +28,12 @@ typedef struct {
  * 255 where they lie inside and no pixel that does not count has a part in them, else 0. -1 without memory. */
 typedef int resample_fn(ray_tables tables, source_image source, float *grey, uint8_t *valid);
 
+/* The mean of 2 x 2 pixels each, and 255 where at least half of them are content, 255, else 0. Half the size is
+ * that rounded up: an image's last row or column is doubled, and beyond a mask's there is no content. Plain enough
+ * for compilers to work on many pixels at once, so that one version serves all processors. */
+void half_image(const float *image, ptrdiff_t height, ptrdiff_t width, float *half);
+void half_mask(const uint8_t *mask, ptrdiff_t height, ptrdiff_t width, uint8_t *half);
+
 /* An image plus `sharpening` times its difference from the binomial mean of 3 x 3 pixels, in 1/CENSUS_STEPS grey
  * value, cut to whole ones, with a border of CENSUS_RADIUS_{Y,X}: there, and beside it, the outermost pixels of
  * the image go on. -1 without memory. */
