@@ -346,8 +346,9 @@ class Scene:
         return any(len(view.point_indices) for view in self.views)
 
     def only(self, names: Collection[str]) -> "Scene":
-        """The scene with the views of these images alone."""
-        return replace(self, views=tuple(view for view in self.views if view.name in names))
+        """The scene with the views of these images alone: itself, with what is known of it, where that is all."""
+        views = tuple(view for view in self.views if view.name in names)
+        return self if len(views) == len(self.views) else replace(self, views=views)
 
     def no_larger_than(self, max_size: int) -> "Scene":
         """The scene with views that have at most as many pixels on a side; -1: as they are."""

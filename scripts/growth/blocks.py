@@ -1,10 +1,11 @@
-"""Blocks of any number of small vertical images over flat ground: dense workspaces with exact tracks.
+"""Blocks of any number of small vertical images over flat ground: dense workspaces with exact tracks, few or none.
 
-Their images are crops of one texture, so that they can be matched; poses, points and observations are exact. Names
-are in the order of the flight, there and back, as cameras number them.
+Besides blocks of strips there are one long strip, and images that all see the same. Their images are crops of one
+texture, so that they can be matched; poses, points and observations are exact. Names are in the order of the
+flight, there and back, as cameras number them.
 """
 
-import sys
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+LAYOUTS = ("block", "strip", "place")
 WIDTH = 64
 HEIGHT = 48
 _FOCAL = 55.0
@@ -23,6 +25,8 @@ _FOUND = 0.6
 _SHORTEST = 3
 # Images on either side in which a point may lie.
 _REACH = 3
+# Where all images see the same, so many find a point.
+_LONGEST = 20
 _TEXTURE_SIDE = 2048
 _TEXTURE_METRES = 2400.0
 _POINT2D = np.dtype([("xy", "<f8", 2), ("point", "<i8")])
@@ -56,17 +60,21 @@ class Block:
         return f"DJI_{index + 1:06d}.jpg"
 
 
-def make_block(images: int, observations: int) -> Block:
-    """Lay out a block that is about square.
+def make_block(images: int, observations: int, layout: str = "block") -> Block:
+    """Lay out images.
 
     Parameters
     ----------
     images : int
     observations : int
-        Of sparse points by each image, on average.
+        Of sparse points by each image, on average; the model has no points where that is 0.
+    layout : "block", "strip" or "place"
+        A block that is about square; one long strip; or images from one place, all of which see the same.
     """
     rng = np.random.default_rng(images)
-    columns = max(round((images * _STEP[1] / _STEP[0]) ** 0.5), 1)
+    if layout == "place":
+        return _make_place(images, observations, rng)
+    columns = images if layout == "strip" else max(round((images * _STEP[1] / _STEP[0]) ** 0.5), 1)
     strips = np.arange(images) // columns
     places = np.arange(images) % columns
     places = np.where(strips % 2, columns - 1 - places, places)
@@ -78,7 +86,30 @@ def make_block(images: int, observations: int) -> Block:
     points = np.column_stack([ground, np.zeros(len(ground))])
     index_at = np.full((strips.max() + 1, columns), -1)
     index_at[strips, places] = np.arange(images)
-    image, point, xy = _observed(points, centres, index_at, rng)
+    return _sorted(centres, points, *_observed(points, centres, index_at, rng))
+
+
+def _make_place(images: int, observations: int, rng: np.random.Generator) -> Block:
+    """Each point is found by the images that are nearest to some place."""
+    from scipy.spatial import cKDTree
+
+    centres = np.column_stack([rng.uniform(-_STEP / 2, _STEP / 2, (images, 2)), np.full(images, _ALTITUDE)])
+    longest = min(_LONGEST, images)
+    number = images * observations // longest
+    points = np.column_stack([rng.uniform(-_STEP / 2, _STEP / 2, (number, 2)), np.zeros(number)])
+    found = cKDTree(centres[:, :2]).query(rng.uniform(-_STEP / 2, _STEP / 2, (number, 2)), k=longest)[1]
+    image, point = found.ravel(), np.repeat(np.arange(number), longest)
+    return _sorted(centres, points, image, point, _project(points[point], centres[image]))
+
+
+def _sorted(
+    centres: NDArray[np.float64],
+    points: NDArray[np.float64],
+    image: NDArray[np.int64],
+    point: NDArray[np.int64],
+    xy: NDArray[np.float64],
+) -> Block:
+    """Leave out points that few images find, and sort observations."""
     long_enough = np.bincount(point, minlength=len(points)) >= _SHORTEST
     kept = long_enough[point]
     number = np.cumsum(long_enough) - 1
@@ -196,6 +227,17 @@ def _write_points(block: Block, path: Path) -> None:
             file.write(heads[index].tobytes() + elements[start[index] : start[index + 1]].tobytes())
 
 
+def main() -> None:
+    """Write a workspace."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("images", type=int)
+    parser.add_argument("observations", type=int)
+    parser.add_argument("layout", choices=LAYOUTS, nargs="?", default="block")
+    arguments = parser.parse_args()
+    block = make_block(arguments.images, arguments.observations, arguments.layout)
+    write_workspace(block, arguments.folder)
+
+
 if __name__ == "__main__":
-    _, _target, _images, _observations = sys.argv
-    write_workspace(make_block(int(_images), int(_observations)), Path(_target))
+    main()

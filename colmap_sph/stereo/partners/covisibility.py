@@ -29,12 +29,17 @@ _ANGLE_PERCENTILE = 75
 # the same. Where views have not even so many points in their image, these do not tell who overlaps whom.
 _ENOUGH_POINTS = 25
 _FEW_POINTS = 8
+# Sights of the points of a photograph, by itself and by others, that are counted: more only where there are so few
+# photographs that those of all are no more than the latter.
+_LEAST_SEEN = 1 << 19
+_SEEN_IN_ALL = 1 << 31
 
 
 class Covisibility:
-    """Candidates of every photograph with the weight of each; angles and worth are computed when asked for.
+    """Candidates of every photograph with the weight of each, angles and worth, which are computed when asked for.
 
-    Views that were cut from one photograph are one here. All others are photographs of their own.
+    What it keeps grows with the number of observations, not with the square of that of photographs. Views that
+    were cut from one photograph are one here. All others are photographs of their own.
 
     Parameters
     ----------
@@ -42,44 +47,65 @@ class Covisibility:
         V of them.
     source : "tracks", "database" or "frusta"
         What the weights rest on.
-    weights : (V, V) sparse array of int
-        What two photographs share.
     points : (N, 3) float64 ndarray
         World frame: the scene's, or samples of the frusta.
     observed : list of (n,) int64 ndarray
         For every photograph the ascending rows of `points` that it observes or has in view.
+    least : int
+        What candidates share at least.
+    matches : (V, V) sparse array of int, optional
+        Verified matches, which are then what photographs share; None: the points.
     """
 
     def __init__(
         self,
         photographs: Sequence[Photograph],
         source: CovisibilitySource,
-        weights: sparse.csr_array,
         points: NDArray[np.float64],
         observed: list[NDArray[np.int64]],
+        least: int,
+        matches: sparse.csr_array | None = None,
     ) -> None:
         self.photographs = photographs
         self.source = source
         self.centers = np.array([photograph.center for photograph in photographs])
-        self._weights = weights
+        self._matches = matches
+        self._least = least
+        self._most_seen = max(_LEAST_SEEN, _SEEN_IN_ALL // max(len(photographs), 1))
         self._points = points
         self._observed = observed
         by_point = _incidence(observed, len(points)).T.tocsr()
         by_point.sort_indices()
         self._first, self._observers = by_point.indptr, by_point.indices
         self._place = np.full(len(observed), -1)
+        self._entry = np.full(len(points), -1)
 
     def weight(self, i: int, j: int) -> int:
         """Return what photographs `i` and `j` share."""
-        return int(self._weights[i, j])
+        return int(self._shared(i)[j])
 
     def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the photographs that share something with `i`, most first, and how much it is."""
-        row = slice(self._weights.indptr[i], self._weights.indptr[i + 1])
-        views = self._weights.indices[row]
-        weights = self._weights.data[row]
-        order = np.lexsort((views, -weights))
-        return views[order].astype(np.int64), weights[order].astype(np.int64)
+        shared = self._shared(i)
+        views = np.flatnonzero(shared)
+        views = views[np.argsort(-shared[views], kind="stable")]
+        return views, np.asarray(shared[views])
+
+    def _shared(self, i: int) -> NDArray[np.int64]:
+        """What photograph `i` shares with each, 0 where that is too little.
+
+        Where very many photographs have very many points in view, every n-th point stands for n.
+        """
+        if self._matches is not None:
+            shared = self._matches[[i]].toarray()[0].astype(np.int64)
+        else:
+            rows = self._observed[i]
+            step = -(-int((self._first[rows + 1] - self._first[rows]).sum()) // self._most_seen) or 1
+            _, observers = self._observers_of(rows[::step])
+            shared = step * np.bincount(observers, minlength=len(self._observed))
+        shared[i] = 0
+        shared[shared < self._least] = 0
+        return np.asarray(shared, np.int64)
 
     def angles(self, i: int, others: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return the parallax of photograph `i` with each of (C,) others, degrees; NaN without common points.
@@ -107,8 +133,8 @@ class Covisibility:
         rows = rows[:: -(-len(rows) // _MAX_WORTH_POINTS) or 1]
         believed: NDArray[Any]
         if self.source == "database":
-            most = self._weights[[i]].max()
-            believed = np.array([[self.weight(i, int(j)) / most] for j in others])
+            shared = self._shared(i)
+            believed = (shared[others] / shared.max())[:, None]
         else:
             entry, place = self._seen_too(rows, others)
             believed = np.zeros((len(others), len(rows)), bool)
@@ -119,14 +145,30 @@ class Covisibility:
     def _seen_too(
         self, rows: NDArray[np.int64], others: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Find who else sees some points: entries in `rows`, ascending, and in `others`, one for each sight."""
+        """Find who else sees some points: entries in `rows`, ascending, and in `others`, one for each sight.
+
+        By the observers of each point, or by the points of each other where these are fewer: for each of the
+        others its entries ascend.
+        """
+        counts = np.array([len(self._observed[j]) for j in others], np.int64)
+        if 0 < counts.sum() < (self._first[rows + 1] - self._first[rows]).sum():
+            self._entry[rows] = np.arange(len(rows))
+            entry = self._entry[np.concatenate([self._observed[j] for j in others])]
+            place = np.repeat(np.arange(len(others)), counts)
+            self._entry[rows] = -1
+            return entry[entry >= 0], place[entry >= 0]
         self._place[others] = np.arange(len(others))
+        entry, observers = self._observers_of(rows)
+        place = self._place[observers]
+        self._place[others] = -1
+        return entry[place >= 0], place[place >= 0]
+
+    def _observers_of(self, rows: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Find who sees some points: entries in `rows`, ascending, and photographs, one for each sight."""
         counts = self._first[rows + 1] - self._first[rows]
         entry = np.repeat(np.arange(len(rows)), counts)
         behind = np.arange(len(entry)) - np.repeat(np.cumsum(counts) - counts, counts)
-        place = self._place[self._observers[self._first[rows][entry] + behind]]
-        self._place[others] = -1
-        return entry[place >= 0], place[place >= 0]
+        return entry, self._observers[self._first[rows][entry] + behind]
 
 
 def _percentiles(values: NDArray[np.float64], group: NDArray[np.int64], groups: int) -> NDArray[np.float64]:
@@ -176,14 +218,13 @@ def find_covisibility(
     index_of = scene.index_of
     observed = [_together([of_views[index_of[view.name]] for view in each.views]) for each in photographs]
     if has_tracks:
-        weights = _shared_points(observed, len(points), min_shared_points)
-        return Covisibility(photographs, "tracks", weights, points, observed)
+        return Covisibility(photographs, "tracks", points, observed, min_shared_points)
     if matches is not None:
-        weights = _match_counts(photographs, matches, min_shared_points)
-        if weights.nnz:
-            return Covisibility(photographs, "database", weights, points, observed)
+        counts = _match_counts(photographs, matches)
+        if counts.nnz and counts.max() >= min_shared_points:
+            return Covisibility(photographs, "database", points, observed, min_shared_points, counts)
         logger.warning("the database has no verified matches of the model's images")
-    return Covisibility(photographs, "frusta", _shared_points(observed, len(points), 1), points, observed)
+    return Covisibility(photographs, "frusta", points, observed, 1)
 
 
 def _together(observed: list[NDArray[np.int64]]) -> NDArray[np.int64]:
@@ -191,33 +232,22 @@ def _together(observed: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     return observed[0] if len(observed) == 1 else np.unique(np.concatenate(observed))
 
 
-def _shared_points(observed: list[NDArray[np.int64]], num_points: int, least: int) -> sparse.csr_array:
-    """Count the points that two photographs share, as a (V, V) matrix of counts of at least `least`."""
-    seen = _incidence(observed, num_points)
-    return _without_self_and_few(seen @ seen.T, least)
-
-
 def _incidence(observed: list[NDArray[np.int64]], num_points: int) -> sparse.csr_array:
     """(V, N) matrix of ones where a photograph sees a point."""
     indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
     indices = np.concatenate([*observed, np.empty(0, np.int64)]).astype(np.int32)
-    ones = np.ones(len(indices), dtype=np.int32)
+    ones = np.ones(len(indices), dtype=np.int8)
     return sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
 
 
-def _without_self_and_few(counts: sparse.csr_array, least: int) -> sparse.csr_array:
-    entries = counts.tocoo()
-    keep = (entries.row != entries.col) & (entries.data >= least)
-    kept = (entries.data[keep], (entries.row[keep], entries.col[keep]))
-    return sparse.csr_array(kept, shape=counts.shape)
-
-
-def _match_counts(
-    photographs: Sequence[Photograph], matches: Mapping[tuple[str, str], int], least: int
-) -> sparse.csr_array:
-    """Numbers of verified matches between photographs, as a (V, V) matrix of those of at least `least`."""
+def _match_counts(photographs: Sequence[Photograph], matches: Mapping[tuple[str, str], int]) -> sparse.csr_array:
+    """Numbers of verified matches between photographs, as a (V, V) matrix."""
     index_of = {photograph.name: index for index, photograph in enumerate(photographs)}
-    known = [(index_of[a], index_of[b], n) for (a, b), n in matches.items() if a in index_of and b in index_of]
+    known = [
+        (index_of[a], index_of[b], n)
+        for (a, b), n in matches.items()
+        if a in index_of and b in index_of and a != b
+    ]
     first, second, counts = np.array(known, dtype=np.int64).reshape(-1, 3).T
     both = (np.tile(counts, 2), (np.concatenate([first, second]), np.concatenate([second, first])))
-    return _without_self_and_few(sparse.csr_array(both, shape=(len(photographs),) * 2), least)
+    return sparse.csr_array(both, shape=(len(photographs),) * 2)

@@ -7,7 +7,9 @@ of these distances away. So every view's frustum is sampled at a few multiples o
 and whoever sees most of each other's samples overlaps most. Occlusion is not considered.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,28 @@ _NUM_NEAREST = 64
 # Samples that a view is tested against come from so many views that look nearest to where it looks.
 _NUM_TESTED = 256
 _MAX_POINTS = 20_000
+# Points that a view has in sight, where all see much of the scene: more only where all views together have no more
+# than the latter. So many views tell how many each has.
+_LEAST_IN_VIEW = 512
+_IN_VIEW_OF_ALL = 1 << 24
+_NUM_ASKED = 64
+
+Sights = tuple[NDArray[np.float64], list[NDArray[np.int64]]]
+"""(N, 3) points, world frame, and for every view the ascending rows of those that it has in view."""
+
+
+def _once(find: Callable[[Scene], Sights]) -> Callable[[Scene], Sights]:
+    """The same function, which remembers what it found as long as the scene is there; nobody may change it."""
+    known: WeakKeyDictionary[Scene, Sights] = WeakKeyDictionary()
+
+    @wraps(find)
+    def found(scene: Scene) -> Sights:
+        sights = known.get(scene)
+        if sights is None:
+            sights = known[scene] = find(scene)
+        return sights
+
+    return found
 
 
 def points_in_view(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.int64]], bool]:
@@ -56,7 +80,7 @@ def points_in_view(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.i
     return *likely_in_view(scene), False
 
 
-def likely_in_view(scene: Scene, fewest: int = 0) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
+def likely_in_view(scene: Scene, fewest: int = 0) -> Sights:
     """What each view's frustum holds of the scene's points or, where there are none, of samples of the frusta.
 
     Parameters
@@ -70,23 +94,38 @@ def likely_in_view(scene: Scene, fewest: int = 0) -> tuple[NDArray[np.float64], 
     points, observed
         As of `points_in_view`.
     """
-    points = scene.points[np.isfinite(scene.points).all(axis=1)]
-    if len(points):
-        in_view = observe_points(scene, points)
-        if not fewest or np.median([len(rows) for rows in in_view]) >= fewest:
-            return points, in_view
+    points, in_view = observe_points(scene)
+    if len(points) and (not fewest or np.median([len(rows) for rows in in_view]) >= fewest):
+        return points, in_view
     return observe_frusta(scene)
 
 
-def observe_points(scene: Scene, points: NDArray[np.float64]) -> list[NDArray[np.int64]]:
-    """Return for every view the rows of (N, 3) `points` which project into it.
+@_once
+def observe_points(scene: Scene) -> Sights:
+    """Project a scene's finite points into all views.
 
-    Of many points every n-th is used, in such a way that all views use the same.
+    Of many points every n-th is used, in such a way that all views use the same: the more seldom, the more points
+    all views together have in sight.
+
+    Returns
+    -------
+    points, observed
+        As of `points_in_view`.
     """
-    rows = np.arange(0, len(points), -(-len(points) // _MAX_POINTS), dtype=np.int64)
-    return [rows[sees(view, points[rows])] for view in scene.views]
+    points = scene.points[np.isfinite(scene.points).all(axis=1)]
+    step = -(-len(points) // _MAX_POINTS) or 1
+    views = scene.views
+    most = max(_LEAST_IN_VIEW, _IN_VIEW_OF_ALL // max(len(views), 1))
+    if len(points) // step > most:
+        asked = views[:: -(-len(views) // _NUM_ASKED)]
+        seen = np.mean([np.count_nonzero(sees(view, points[::step])) for view in asked])
+        step *= -(-int(seen) // most) or 1
+    rows = np.arange(0, len(points), step, dtype=np.int64)
+    used = points[rows]
+    return points, [rows[sees(view, used)] for view in views]
 
 
+@_once
 def observe_frusta(scene: Scene) -> tuple[NDArray[np.float64], list[NDArray[np.int64]]]:
     """Sample the viewing frusta.
 

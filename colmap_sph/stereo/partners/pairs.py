@@ -31,6 +31,9 @@ _MAX_CANDIDATES = 100
 _AT_A_TIME = 64
 # So many times as many may stand beside these.
 _MAX_BESIDE = 10
+# Of more candidates than twice as many those are looked at that share most, so many, and as many of the others,
+# evenly: where a camera hovers, thousands may stand beside a view before the first that does not.
+_MOST_SHARING = 1000
 
 
 @dataclass(frozen=True)
@@ -168,7 +171,7 @@ def select_pairs(
     graph = find_covisibility(scene, options.min_shared_points, matches)
     if explicit is None:
         photographs = enumerate(graph.photographs)
-        partners = {photograph.lead.name: _best_partners(graph, options, i) for i, photograph in photographs}
+        partners = {photograph.lead.name: best_partners(graph, options, i) for i, photograph in photographs}
         selection = PairSelection(partners, graph.source)
     else:
         selection = _explicit_selection(scene, graph, options, explicit)
@@ -205,7 +208,7 @@ def overlapping_views(scene: Scene, most: int) -> dict[str, list[str]]:
     return {name: [*itertools.chain(*views)] for name, views in found.items()}
 
 
-def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[Partner, ...]:
+def best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[Partner, ...]:
     """Return the best partners of photograph `i`, each by the name of its first view.
 
     These are the ones that together see most of it, then those under a wide angle, and last those that stand
@@ -218,7 +221,7 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
     most = max(_MAX_CANDIDATES, options.num_pairs)
     photographs = graph.photographs
     stations = StationCounter(graph.seen_by(i), photographs[i], options.min_triangulation_angle)
-    candidates, weights = graph.candidates(i)
+    candidates, weights = (found[_looked_at(len(found))] for found in graph.candidates(i))
     for first in range(0, len(candidates), _AT_A_TIME):
         if len(near) == most or len(near) + len(wide) == 2 * most or len(beside) == _MAX_BESIDE * most:
             break
@@ -246,6 +249,14 @@ def _best_partners(graph: Covisibility, options: PairOptions, i: int) -> tuple[P
     return tuple(([near[k] for k in best] + wide + beside)[: options.num_pairs])
 
 
+def _looked_at(count: int) -> NDArray[np.int64]:
+    """Places of the candidates that are looked at, ascending, of so many with those that share most first."""
+    if count <= 2 * _MOST_SHARING:
+        return np.arange(count)
+    others = np.linspace(_MOST_SHARING, count - 1, _MOST_SHARING).astype(np.int64)
+    return np.concatenate([np.arange(_MOST_SHARING), others])
+
+
 def _explicit_selection(
     scene: Scene, graph: Covisibility, options: PairOptions, explicit: Mapping[str, SourceImages]
 ) -> PairSelection:
@@ -258,7 +269,7 @@ def _explicit_selection(
         photograph = scene.photograph(name)
         i = place_of[photograph.name]
         if isinstance(sources, int):
-            found = _best_partners(graph, options, i)
+            found = best_partners(graph, options, i)
         else:
             obeyed = True
             named = index_of if sources == "__all__" else sources
