@@ -76,6 +76,9 @@ class View:
     reprojection_error : float
         Median distance in pixels between where the view observes sparse points, as the model says, and where they
         project; NaN where that is not known.
+    unexplained_error : float
+        The same once the observations are scaled and shifted to fit: what is left of it if they were made in an
+        image of another size, or in one that was cropped since.
     full_size : (int, int), optional
         Width and height of its image's file, where the view is smaller: the image is reduced when it is read.
     original : str
@@ -92,6 +95,7 @@ class View:
     t: NDArray[np.float64]
     point_indices: NDArray[np.int64]
     reprojection_error: float = math.nan
+    unexplained_error: float = math.nan
     full_size: tuple[int, int] | None = None
     original: str = ""
 
@@ -148,14 +152,15 @@ class View:
         if (width, height) == (self.width, self.height):
             return self
         scale = np.array([width / self.width, height / self.height, 1.0])
-        error = self.reprojection_error * float(scale[:2].mean())
+        factor = float(scale[:2].mean())
         full_size = None if (width, height) == self.file_size else self.file_size
         return replace(
             self,
             width=width,
             height=height,
             K=self.K * scale[:, None],
-            reprojection_error=error,
+            reprojection_error=self.reprojection_error * factor,
+            unexplained_error=self.unexplained_error * factor,
             full_size=full_size,
         )
 

@@ -26,6 +26,7 @@ from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.self_check import (
     judge_agreement,
     judge_reprojection,
+    refuse_cameras,
     refuse_disagreement,
     share_in_sight,
 )
@@ -419,6 +420,67 @@ def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):
     assert sound.doubts == ""
     with pytest.raises(NoResultError, match="cameras or poses of the model are not those"):
         colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)
+
+
+def with_cameras(project, change):
+    """A folder with the project's model, whose cameras were changed."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for camera in model.cameras.values():
+        camera.params = list(np.multiply(camera.params, change))
+    changed = project / "changed"
+    changed.mkdir()
+    model.write_binary(changed)
+    return changed
+
+
+def test_a_camera_with_one_wrong_focal_length_is_refused_before_anything_is_matched(project):
+    """Most points agreed with depth maps made with it, in which only one direction was wrong."""
+    wrong = with_cameras(project, [0.1, 1, 1, 1])
+    folders = {"images": project / "images", "output": project / "dense"}
+    for run in (
+        lambda: colmap_sph.run(wrong, options=OPTIONS, **folders),
+        lambda: make_plan(Project(wrong, folders["images"], output=folders["output"]), OPTIONS),
+    ):
+        with pytest.raises(NoResultError, match=r"no other size or crop .*one of two focal lengths"):
+            run()
+    assert not list((project / "dense/stereo").rglob("*.bin"))
+
+
+@pytest.mark.parametrize(
+    ("factors", "shift"),
+    [((1, 1), (0, 0)), ((3, 3), (0, 0)), ((0.25, 0.25), (0, 0)), ((1, 1), (-90, 40)), ((1.02, 1), (5, 5))],
+)
+def test_observations_of_another_size_or_crop_are_no_wrong_cameras(project, factors, shift):
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = point.xy * factors + shift
+    refuse_cameras(scene_of_model(model, project))
+
+
+def test_wild_tracks_are_no_wrong_cameras(project):
+    """Two in five observations are anywhere in the image."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    rng = np.random.default_rng(1)
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        for index, point in enumerate(image.points2D):
+            if index % 5 < 2:
+                point.xy = rng.uniform(0, (camera.width, camera.height))
+    refuse_cameras(scene_of_model(model, project))
+
+
+def test_cameras_are_refused_where_most_images_tell_so(project):
+    scene = read_scene(project / "sparse/0")
+    far = [
+        replace(view, reprojection_error=0.1 * view.width, unexplained_error=0.04 * view.width)
+        for view in scene.views
+    ]
+    refuse_cameras(replace(scene, views=(*far[:2], *scene.views[2:])))
+    with pytest.raises(NoResultError):
+        refuse_cameras(replace(scene, views=(*far[:3], scene.views[3])))
+    # Too few points to tell.
+    refuse_cameras(replace(scene, views=tuple(replace(view, point_indices=np.arange(9)) for view in far)))
 
 
 def test_points_that_no_image_has_in_sight_are_told(project):

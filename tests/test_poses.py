@@ -7,7 +7,15 @@ import pytest
 from rendered import SIDES, array_coordinates, pixel_rays
 
 from colmap_sph.scene import Scene, View
-from colmap_sph.stereo.poses.quality import common_bends, judged, movements, refusal, sound_tracks, usual_error
+from colmap_sph.stereo.poses.quality import (
+    Judgement,
+    common_bends,
+    judged,
+    movements,
+    refusal,
+    sound_tracks,
+    usual_error,
+)
 from colmap_sph.stereo.poses.tracks import (
     ImageTies,
     Tracks,
@@ -231,6 +239,18 @@ def test_poses_that_fit_sparse_points_worse_are_refused() -> None:
 def test_what_polishing_leaves_wrong_is_told() -> None:
     true, turned = make_scene(), make_scene(turns=small_turns(10.0))
     assert "check the cameras" in judged(make_tracks(true, noise=1.5), turned, true).refusal(0.05)
+
+
+@pytest.mark.parametrize(
+    ("movement", "sparse", "is_told"),
+    [(10.7, (0.0, 0.0), True), (1.6, (0.0, 0.0), False), (2.3, (2.2, 0.3), False)],
+)
+def test_poses_that_move_along_what_ties_leave_open_are_refused(
+    movement: float, sparse: tuple[float, float], is_told: bool
+) -> None:
+    """A kitchen whose cameras were turned by 2.3 pixels was moved by 10.7, and its depth lost."""
+    judgement = Judgement(0.78, 0.18, 11.3, *sparse, movement, 0.18)
+    assert ("ties do not tell them" in judgement.refusal(0.05)) == is_told
 
 
 def test_movement_is_that_of_the_points_in_the_image() -> None:

@@ -27,11 +27,15 @@ _REFUSED_SHARE_OF_MISPLACED = 0.5
 # Where so large a share of the points with a depth agrees, and of all, little was matched, but what was is right.
 _RIGHT_SHARE_OF_FOUND = 0.5
 _LEAST_SHARE = 0.05
-# Fewer points say nothing of a run.
+# Fewer points say nothing of a run, and of an image.
 _FEWEST = 30
+_FEWEST_OF_IMAGE = 10
 # Sparse points lie a pixel or so from their observations, be they ever so roughly adjusted.
 _FAR_PIXELS = 4.0
 _FAR_SHARE = 0.01
+# Of the longer side, beyond what another size and crop explain: of sound models points lie a thousandth off, with
+# one of two focal lengths halved a thirtieth.
+_IMPOSSIBLE_SHARE = 0.03
 _MAX_NAMED = 10
 # Rows of pairs with good poses and lenses disagree by no more; by twice as much, the results suffer.
 _EXPECTED_PIXELS = 0.2
@@ -111,6 +115,28 @@ def judge_reprojection(report: RunReport, scene: Scene) -> float:
         )
         add_doubt(report, words)
     return len(far) / max(len(scene.views), 1)
+
+
+def refuse_cameras(scene: Scene) -> None:
+    """Raise `NoResultError` where in most images points project so far off that hours of work would be in vain.
+
+    Not where the observations may be of another size or crop: depth may be right then, and is judged by itself.
+
+    Parameters
+    ----------
+    scene : Scene
+    """
+    telling = [view for view in scene.views if len(view.point_indices) >= _FEWEST_OF_IMAGE]
+    shares = [
+        min(view.reprojection_error, view.unexplained_error) / max(view.width, view.height) for view in telling
+    ]
+    if 2 * sum(share > _IMPOSSIBLE_SHARE for share in shares) > len(shares):
+        raise NoResultError(
+            "Sparse points do not project to where most images observe them, and no other size or crop of the "
+            f"images explains it: {median(shares):.0%} of their longer side is left. Cameras, poses or points of "
+            "the model were changed apart from each other (one of two focal lengths, say); give the model as it "
+            "was adjusted, with its cameras."
+        )
 
 
 def share_in_sight(scene: Scene) -> float:

@@ -190,16 +190,30 @@ def _with_observations(
     """A view with what it observes of points, and how far off these are."""
     rows = rows_of.of(observations.point)
     known = rows >= 0
-    error = _reprojection_error(view, observations.xy[known], points[rows[known]])
-    return replace(view, point_indices=np.unique(rows[known]), reprojection_error=error)
-
-
-def _reprojection_error(view: View, observed: NDArray[np.float64], points: NDArray[np.float64]) -> float:
-    """Median distance in pixels between (n, 2) observed image coordinates and (n, 3) points; NaN without any."""
     with np.errstate(all="ignore"):  # an impossible pose is told later
-        projected, _ = view.project(points)
-        distance = np.linalg.norm(projected - observed, axis=1)
-    known = distance[np.isfinite(distance)]
+        projected, _ = view.project(points[rows[known]])
+        observed = observations.xy[known]
+        return replace(
+            view,
+            point_indices=np.unique(rows[known]),
+            reprojection_error=_median_of_finite(np.linalg.norm(projected - observed, axis=1)),
+            unexplained_error=_unexplained_error(projected, observed),
+        )
+
+
+def _unexplained_error(projected: NDArray[np.float64], observed: NDArray[np.float64]) -> float:
+    """Median distance in pixels, once the observed coordinates are scaled and shifted to fit; NaN without any."""
+    is_finite = np.isfinite(projected).all(axis=1) & np.isfinite(observed).all(axis=1)
+    if not is_finite.any():
+        return math.nan
+    arms, observed = (places[is_finite] - np.median(places[is_finite], axis=0) for places in (projected, observed))
+    factor = _median_of_finite((arms * observed).sum(axis=1) / (observed**2).sum(axis=1))
+    return _median_of_finite(np.linalg.norm(arms - factor * observed, axis=1))
+
+
+def _median_of_finite(values: NDArray[np.float64]) -> float:
+    """NaN without any."""
+    known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else math.nan
 
 

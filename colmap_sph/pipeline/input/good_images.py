@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.self_check import misplaced_views
+from colmap_sph.pipeline.self_check import misplaced_views, refuse_cameras
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
 from colmap_sph.pipeline.stages.stage import keys_of
 from colmap_sph.stereo.rectification import sampling_of
@@ -66,8 +66,10 @@ def without_misplaced(context: Context) -> Context:
     """Leave out a few images of which the model contradicts itself: their depth would be wrong, and spoil others'.
 
     Where half of the images that observe any points are such, it may be the points or the image coordinates, see
-    `judge_reprojection`. All views of one photograph have its pose.
+    `judge_reprojection`; where it can only be cameras or poses, `NoResultError` is raised. All views of one
+    photograph have its pose.
     """
+    refuse_cameras(context.scene)
     errors_of = misplaced_views(context.scene)
     judged = 0
     misplaced: dict[str, float] = {}

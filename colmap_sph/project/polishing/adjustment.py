@@ -24,8 +24,10 @@ _LEAST_USUAL = 0.1
 _MOST_USUAL = 1.0
 # Centres that are trusted count so many times more than what they look at.
 _CENTER_WEIGHT = 100
-# Standard deviation of a given centre, in what a pixel covers at the median depth of the image's points.
+# Standard deviation of a given centre, in what a pixel covers at the median depth of the image's points; and of
+# its ties where it has none, which hardly tell a turn of the camera from a step.
 _CENTER_PIXELS = 5.0
+_CENTER_PIXELS_BY_TIES = 1.0
 _MAX_ITERATIONS = 100
 _CONVERGED = 1e-7
 
@@ -168,16 +170,20 @@ def _config(model: pycolmap.Reconstruction, *, refine_distortion: bool) -> pycol
 
 def _priors(model: pycolmap.Reconstruction, larger: pycolmap.Reconstruction) -> list[pycolmap.PosePrior]:
     """Where the centres were given, known as well as some pixels tell."""
-    sizes = {image_id: _pixel_size(model, image_id) for image_id in sorted(model.images)}
-    known = [size for size in sizes.values() if size > 0]
+    deviations = {
+        image_id: _CENTER_PIXELS * _pixel_size(model, image_id)
+        or _CENTER_PIXELS_BY_TIES * _pixel_size(larger, image_id)
+        for image_id in sorted(model.images)
+    }
+    known = [deviation for deviation in deviations.values() if deviation > 0]
     usual = float(np.median(known)) if known else 1.0
     priors = []
-    for image_id, size in sizes.items():
+    for image_id, deviation in deviations.items():
         prior = pycolmap.PosePrior()
         prior.corr_data_id = larger.image(image_id).data_id
         prior.coordinate_system = pycolmap.PosePriorCoordinateSystem.CARTESIAN
         prior.position = model.image(image_id).projection_center()
-        prior.position_covariance = np.eye(3) * (_CENTER_PIXELS * (size or usual)) ** 2
+        prior.position_covariance = np.eye(3) * (deviation or usual) ** 2
         priors.append(prior)
     return priors
 
@@ -209,6 +215,7 @@ def _lay_over(
     """Move an adjusted model over the given one, by the similarity that fits centres and what they look at best.
 
     Centres alone leave a turn about them open where they are in a row, and a scale where they are near each other.
+    Without points cameras are turned as they were.
     """
     places: list[list[NDArray[np.float64]]] = [[], []]
     own = set(own_points)
@@ -219,9 +226,33 @@ def _lay_over(
             if observed:
                 points = [model.point3D(point.point3D_id).xyz for point in observed]
                 there.append(np.median(points, axis=0))
-    similarity = pycolmap.estimate_sim3d(*(np.array(there) for there in places))
+    if own:
+        similarity = pycolmap.estimate_sim3d(*(np.array(there) for there in places))
+    else:
+        similarity = _similarity_of_cameras(adjusted, given)
     if similarity is not None:
         adjusted.transform(similarity)
+
+
+def _similarity_of_cameras(
+    adjusted: pycolmap.Reconstruction, given: pycolmap.Reconstruction
+) -> pycolmap.Sim3d | None:
+    """The similarity that leaves cameras turned as they were given, and centres where they were; None: none."""
+    turns, centers = [], []
+    for image_id in sorted(given.images):
+        images = [model.image(image_id) for model in (given, adjusted)]
+        before, after = (image.cam_from_world().rotation.matrix() for image in images)
+        turns.append(before.T @ after)
+        centers.append([image.projection_center() for image in images])
+    u, _, vt = np.linalg.svd(np.sum(turns, axis=0))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    there, here = np.moveaxis(np.array(centers), 1, 0)
+    arms, turned = there - there.mean(axis=0), (here - here.mean(axis=0)) @ turn.T
+    scale = (arms * turned).sum() / max((turned**2).sum(), 1e-300)
+    if scale <= 0:
+        return None
+    shift = there.mean(axis=0) - scale * turn @ here.mean(axis=0)
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn), shift)
 
 
 def _take_over(

@@ -31,6 +31,8 @@ _PLANE = 0.005
 # Pixels: poses alone leave less than this, of a camera that is right.
 _MOST_LEFT = 1.0
 _MOST_MOVEMENT = 30.0
+# Pixels by which images may still be off, as far as ties alone can tell.
+_MOST_HIDDEN = 0.5
 # The model's own tracks may fit worse by this share: a rounding.
 _RISE = 0.02
 # Pixels: no bundle adjustment leaves so much.
@@ -155,6 +157,14 @@ class Judgement:
             return (
                 f"other poses do not explain what is wrong (images would move by {self.movement:.1f} px, and "
                 f"{max(self.after, self.sparse_after):.2f} px would be left); check the cameras of the model"
+            )
+        # Of what is left ties show no larger a part than of the movement; tracks of the model's own would.
+        hidden = self.after * self.movement / self.before
+        if not self.sparse_before and hidden > _MOST_HIDDEN:
+            return (
+                f"ties do not tell them (images would move by {self.movement:.1f} px, though ties miss by "
+                f"{self.before:.2f} px, and could still be off by {hidden:.1f} px); triangulate points and adjust "
+                "the model (COLMAP: point_triangulator, bundle_adjuster)"
             )
         return ""
 
