@@ -509,8 +509,8 @@ def test_no_run_begins_where_a_product_is_being_made(what, workspace, tmp_path, 
         with claimed(workspace):
             raise AssertionError("a run began")
 
-    made = "export" if what == "export" else f"make_{what}"
-    monkeypatch.setattr(f"colmap_sph.app.products.{what}_command.{made}", a_run_begins)
+    maker = "app.products.export_command.export" if what == "export" else f"products.{what}.make.make_{what}"
+    monkeypatch.setattr(f"colmap_sph.{maker}", a_run_begins)
     workspace.state_dir.mkdir(exist_ok=True)
     assert cli.main([what, str(workspace.root), "--output", str(tmp_path / "out")]) == 3
 

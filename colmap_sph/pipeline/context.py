@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from colmap_sph.pipeline.digests import digest
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.presets import changed_options
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.maps import MapFiles
 from colmap_sph.project.region_file import AUTO, as_given, read_region
@@ -95,6 +96,10 @@ class Context:
     def lead(self, name: str) -> str:
         """What pairs call an image by: itself, or the first of those that were cut from the same photograph."""
         return self.scene.photograph(name).lead.name
+
+    def changed(self, *stages: str) -> list[str]:
+        """See `changed_options`."""
+        return changed_options(self.options, *stages)
 
     @cached_property
     def facing(self) -> Facing:

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
-from colmap_sph.pipeline.presets import changed_options
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import read_estimate, residuals_of
@@ -374,8 +373,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
 
     def _why_nothing(self) -> str:
         """Why no image has a depth, and what to look at first."""
-        stages = ("rectification", "matching", "vote", "confirm", "normals")
-        changed = changed_options(self.context.options, *stages)
+        changed = self.context.changed("rectification", "matching", "vote", "confirm", "normals")
         found = any(share > 0 for share in self._voted.values())
         what = "No depth was confirmed by a second image" if found else "No pair of images found any depth"
         questions = ["are the model's poses right for these images"]
