@@ -837,19 +837,6 @@ def remove_small_segments(
     min_segment : int
     """
 
-def fill_nearest(
-    offset: NDArray[np.int32],
-    predicted: NDArray[np.int32],
-    filled: NDArray[np.float32],
-    /,
-) -> None:
-    """Offsets in pixels; where there is none, as far from the predicted one as the nearest is from its own.
-
-    offset : (H, W) int32
-    predicted : (H, W) int32
-    filled : (H, W) float32, written
-    """
-
 def count_fractions(
     offset: NDArray[np.int32],
     counts: NDArray[np.uint32],

@@ -229,11 +229,6 @@ def join_targets(rng: Random) -> Arguments:
     return [w, source, np.zeros(joined, np.uint64), np.zeros(joined, np.int32)]
 
 
-def fill_nearest(rng: Random) -> Arguments:
-    shape = size(rng)
-    return [filled(rng, shape, np.int32), filled(rng, shape, np.int32), np.zeros(shape, np.float32)]
-
-
 def bases_about(rng: Random) -> Arguments:
     return [filled(rng, size(rng), np.int32), 32, *sorted(rng.integers(-99, 99, 2).tolist())]
 
@@ -563,7 +558,6 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         target_bases,
         join_targets,
         bases_about,
-        fill_nearest,
         mark_steps,
         count_slopes,
         disparity_range,

@@ -368,7 +368,6 @@ def offsets_arguments():
     return {
         "keep_between": {"out offset": ints(), "first": -300, "last": 300},
         "remove_small_segments": {"out offset": ints(), "min_segment": 20},
-        "fill_nearest": {"offset": ints(), "predicted": ints(), "out filled": np.zeros((H, W), np.float32)},
         "count_fractions": {"offset": ints(), "out counts": np.zeros(256, np.uint32)},
         "unwarp_torn": {"offset": ints(), "torn": torn(), "as_it_is": 70, "out unwarped": ints()},
         "first_offsets": {"predicted": ints(), "base": ints(), "torn": torn(), "out first": ints()},

@@ -78,26 +78,6 @@ def test_a_spiral_is_one_segment():
 
 
 @property_test
-@given(shape=sizes, kind=kinds, share=st.sampled_from([0.02, 0.3]), seed=seeds)
-def test_gaps_are_filled_from_the_nearest(shape, kind, share, seed):
-    """By the chamfer distance to every offset; of those equally near, the one that exceeds its prediction most."""
-    offset, predicted = offsets_of(kind, shape, seed), offsets_of("slopes", shape, seed + 1)
-    predicted[predicted == INVALID] = 0
-    offset[np.random.default_rng(seed).random(shape) > share] = INVALID
-    filled = np.empty(shape, np.float32)
-    _native.fill_nearest(offset, predicted, filled)
-    places = np.argwhere(offset != INVALID)
-    residuals = (offset - predicted)[offset != INVALID]  # 32 bits, as in the kernel
-    nearest = np.zeros(shape, np.int32)
-    for pixel in np.ndindex(shape) if len(places) else ():
-        less, more = np.sort(np.abs(places - pixel), axis=1).T
-        flat = 1125 * less + 512 * (more - 2 * less)
-        distances = np.where(2 * less <= more, flat, 1125 * (more - less) + 717 * (2 * less - more))
-        nearest[pixel] = residuals[distances == distances.min()].max()
-    np.testing.assert_array_equal(filled, (predicted + nearest).astype(np.float32) / 256)
-
-
-@property_test
 @given(shape=sizes, kind=kinds, first=st.integers(-(2**40), 2**40), reach=st.integers(-5, 2**41), seed=seeds)
 def test_what_lies_between_is_kept(shape, kind, first, reach, seed):
     for least in (first, first >> 25):

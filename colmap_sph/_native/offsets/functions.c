@@ -40,25 +40,6 @@ FUNCTION(
     remove_small_segments, REMOVE_SMALL_SEGMENTS, check_remove_small_segments,
     "Invalidate, in place, connected regions of fewer pixels, whose neighbours differ by about a pixel at most.");
 
-#define FILL_NEAREST(X) \
-    X(IN, int32, offset, H, W) \
-    X(IN, int32, predicted, H, W) \
-    X(OUT, float32, filled, H, W)
-ARGUMENTS(fill_nearest, FILL_NEAREST);
-
-static int check_fill_nearest(const void *arguments) {
-    const fill_nearest_arguments *a = arguments;
-    return check(a->size.H <= 65535 && a->size.W <= 65535, "maps are limited to 65535 rows and columns");
-}
-
-static int run_fill_nearest(void *arguments) {
-    const fill_nearest_arguments *a = arguments;
-    return fill_nearest(a->offset, a->predicted, a->size.H, a->size.W, a->filled);
-}
-
-FUNCTION(fill_nearest, FILL_NEAREST, check_fill_nearest,
-         "Offsets in pixels; where there is none, as far from the predicted one as the nearest is from its own.");
-
 #define COUNT_FRACTIONS(X) \
     X(IN, int32, offset, H, W) \
     X(OUT, uint32, counts, 256)
@@ -302,11 +283,9 @@ static int run_seed_planes(void *arguments) {
 FUNCTION(seed_planes, SEED_PLANES, check_seed_planes,
          "Values, at the centres of cells of so many pixels, of planes through the seeds around them.");
 
-native_function *const offsets_functions[] = {&keep_between_function,   &remove_small_segments_function,
-                                              &fill_nearest_function,   &count_fractions_function,
-                                              &unwarp_torn_function,    &first_offsets_function,
-                                              &target_bases_function,   &join_targets_function,
-                                              &bases_about_function,    &mark_steps_function,
-                                              &count_slopes_function,   &disparity_range_function,
-                                              &code_disparity_function, &decode_disparity_function,
-                                              &seed_planes_function,    NULL};
+native_function *const offsets_functions[] = {
+    &keep_between_function,     &remove_small_segments_function, &count_fractions_function,
+    &unwarp_torn_function,      &first_offsets_function,         &target_bases_function,
+    &join_targets_function,     &bases_about_function,           &mark_steps_function,
+    &count_slopes_function,     &disparity_range_function,       &code_disparity_function,
+    &decode_disparity_function, &seed_planes_function,           NULL};

@@ -15,16 +15,6 @@ void keep_between(int32_t *offset, ptrdiff_t pixels, ptrdiff_t first, ptrdiff_t 
 /* Invalidates connected regions of fewer pixels than `min_segment`; -1 without memory. */
 int remove_small_segments(int32_t *offset, ptrdiff_t height, ptrdiff_t width, ptrdiff_t min_segment);
 
-/* 1/512 pixel: steps along rows and columns, across, and of a knight, that come near to distances in all
- * directions. Smaller numbers would find many places equally near. */
-enum { STRAIGHT_STEP = 512, DIAGONAL_STEP = 717, KNIGHT_STEP = 1125 };
-
-/* Offsets in pixels. Where there is none, the predicted one and what the nearest exceeds its own prediction by, of
- * several equally near the one that does so most; the predicted one where there is none at all. -1 without memory.
- */
-int fill_nearest(const int32_t *offset, const int32_t *predicted, ptrdiff_t height, ptrdiff_t width,
-                 float *filled);
-
 /* How many offsets have each of the 256 fractions. */
 void count_fractions(const int32_t *offset, ptrdiff_t pixels, uint32_t *counts);
 

@@ -153,7 +153,7 @@ def from_coarser(
     Prediction
         Warps, unless hardly any surface is stretched or slanted.
     """
-    own = _filled(offset, prior.offset) if (offset != INVALID).any() else _in_pixels(prior.offset)
+    own = _filled(offset, prior)
     predicted = _upsampled(2 * _mean_on_surfaces(own), shape)
     low, high = offsets
     np.clip(predicted, low * SUBPIXEL, high * SUBPIXEL, out=predicted)
@@ -173,8 +173,9 @@ def about_coarser(
     offset: NDArray[np.int32], shape: tuple[int, ...], depth: int, radius: int, offsets: tuple[int, int]
 ) -> Prediction:
     """What a level searches without warping."""
-    if (offset != INVALID).any():
-        own = _filled(offset, np.zeros_like(offset))
+    valid = offset != INVALID
+    if valid.any():
+        own = _median(_fill_nearest(_in_pixels(offset), valid))
         base = _windows_about(own, *_neighbourhood(own, radius), shape, depth, offsets)
     else:
         base = np.full(shape, (sum(offsets) - depth) // 2, dtype=np.int32)
@@ -249,11 +250,17 @@ def _in_pixels(offset: NDArray[np.int32]) -> NDArray[np.float32]:
     return offset.astype(np.float32) * np.float32(1 / SUBPIXEL)
 
 
-def _filled(offset: NDArray[np.int32], predicted: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Offsets in pixels, without single outliers or gaps: these exceed `predicted` by what the nearest ones do."""
-    filled = np.empty(offset.shape, dtype=np.float32)
-    _native.fill_nearest(offset, predicted, filled)
-    return np.asarray(cv2.medianBlur(filled, MEDIAN_SIDE), dtype=np.float32)
+def _filled(offset: NDArray[np.int32], prior: Prediction) -> NDArray[np.float32]:
+    """Offsets in pixels, without gaps or single outliers."""
+    valid = offset != INVALID
+    predicted = _in_pixels(prior.offset)
+    if not valid.any():
+        return predicted
+    return _median(predicted + _fill_nearest(_in_pixels(offset) - predicted, valid))
+
+
+def _median(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    return np.asarray(cv2.medianBlur(values, MEDIAN_SIDE), dtype=np.float32)
 
 
 def _mean_on_surfaces(offset: NDArray[np.float32]) -> NDArray[np.int32]:
@@ -274,3 +281,12 @@ def _upsampled(offset: NDArray[np.int32], shape: tuple[int, ...]) -> NDArray[np.
     fine = np.empty(shape, dtype=np.int32)
     _native.upsample_offsets(backend(), offset, _MAX_SURFACE_STEP * SUBPIXEL, fine)
     return fine
+
+
+def _fill_nearest(values: NDArray[np.float32], valid: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Give pixels that are not valid the value of the nearest one that is."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    # Labels count the valid pixels, row by row, from 1.
+    return np.asarray(values[valid][labels - 1], dtype=np.float32)
