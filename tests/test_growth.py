@@ -81,6 +81,22 @@ def test_each_image_of_a_block_is_compared_with_its_neighbours(monkeypatch: pyte
         assert many[kind] <= 4.5 * work, kind
 
 
+def test_what_an_image_shares_with_all_is_counted_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where patch-match.cfg names all images for each."""
+    scene = one_place(30)
+    shared = Covisibility._shared
+    asked: list[int] = []
+
+    def count(graph: Covisibility, i: int) -> NDArray[np.int64]:
+        asked.append(i)
+        return shared(graph, i)
+
+    monkeypatch.setattr(Covisibility, "_shared", count)
+    chosen = select_pairs(scene, PairOptions(), explicit=dict.fromkeys(scene.index_of, "__all__"))
+    assert asked == list(range(30))
+    assert all(len(partners) == 29 for partners in chosen.partners.values())
+
+
 def test_every_nth_point_stands_for_n(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = one_place(60)
     exact = select_pairs(scene, PairOptions())
@@ -132,7 +148,7 @@ def test_angles_do_not_depend_on_how_common_points_are_found() -> None:
         rays = [points[common] - centre for centre in (centres[0], centres[j])]
         cosines = np.einsum("ij,ij->i", *rays) / np.prod([np.linalg.norm(each, axis=1) for each in rays], axis=0)
         assert together[j - 1] == pytest.approx(np.percentile(np.degrees(np.arccos(cosines)), 75), abs=1e-6)
-        assert graph.weight(0, j) == len(common)
+        assert graph.weights(0, np.array([j])).tolist() == [len(common)]
 
 
 def test_what_is_in_view_is_found_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -80,9 +80,9 @@ class Covisibility:
         self._place = np.full(len(observed), -1)
         self._entry = np.full(len(points), -1)
 
-    def weight(self, i: int, j: int) -> int:
-        """Return what photographs `i` and `j` share."""
-        return int(self._shared(i)[j])
+    def weights(self, i: int, others: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return what photograph `i` shares with each of (C,) others."""
+        return np.asarray(self._shared(i)[others])
 
     def candidates(self, i: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the photographs that share something with `i`, most first, and how much it is."""

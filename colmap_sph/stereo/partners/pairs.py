@@ -274,11 +274,10 @@ def _explicit_selection(
             obeyed = True
             named = index_of if sources == "__all__" else sources
             places = [place_of[scene.photograph(other).name] for other in named if other in index_of]
-            known = [place for place in dict.fromkeys(places) if place != i]
-            angles = graph.angles(i, np.array(known, np.int64))
+            known = np.array([place for place in dict.fromkeys(places) if place != i], np.int64)
             found = tuple(
-                Partner(graph.photographs[j].lead.name, graph.weight(i, j), float(angle))
-                for j, angle in zip(known, angles, strict=True)
+                Partner(graph.photographs[j].lead.name, int(weight), float(angle))
+                for j, weight, angle in zip(known, graph.weights(i, known), graph.angles(i, known), strict=True)
             )
         # Views of one photograph have their partners in common.
         before = partners.get(photograph.lead.name, ())
