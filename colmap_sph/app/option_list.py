@@ -4,7 +4,8 @@ import ast
 import inspect
 import io
 from collections.abc import Iterable, Iterator
-from dataclasses import MISSING, Field, dataclass, fields, is_dataclass, replace
+from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from textwrap import dedent, fill
 from types import NoneType, UnionType
@@ -24,37 +25,57 @@ class Option:
 
     Attributes
     ----------
-    flag : str
-        As it is typed; of a positional argument the word that stands for it.
-    values : str
-        What it takes: a kind of value, or a choice of words; empty where it takes none.
-    default : str
-        Empty where there is none to speak of.
-    text : str
-        What it does, in whole sentences.
     place : str
         In the records, such as "vote.min_support".
     kind : type
         Of its values.
     is_switch : bool
         Whether it is typed without a value.
-    is_required, is_positional : bool
+    is_positional : bool
+    record : type
+        The dataclass it is a field of.
+    field : dataclasses.Field
     """
 
-    flag: str
-    values: str
-    default: str
-    text: str
     place: str
     kind: Any
-    is_switch: bool = False
-    is_required: bool = False
-    is_positional: bool = False
+    is_switch: bool
+    is_positional: bool
+    record: type
+    field: "Field[Any]"
+
+    @property
+    def flag(self) -> str:
+        """As it is typed; of a positional argument the word that stands for it."""
+        return self.place.upper() if self.is_positional else flag_of(self.place)
 
     @property
     def full_flag(self) -> str:
         """The flag that the records give it, which is how the parser knows it."""
         return f"--{self.place.replace('_', '-')}"
+
+    @property
+    def is_required(self) -> bool:
+        """Whether it has no default."""
+        return self.field.default is MISSING and self.field.default_factory is MISSING
+
+    @property
+    def values(self) -> str:
+        """What it takes: a kind of value, or a choice of words; empty where it takes none."""
+        return "" if self.is_switch or self.is_positional else _values_of(self.kind)
+
+    @property
+    def default(self) -> str:
+        """Empty where there is none to speak of."""
+        default = self.field.default
+        if default in (None, "", MISSING, ()) or (self.is_switch and not default):
+            return ""
+        return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+
+    @property
+    def text(self) -> str:
+        """What it does, in whole sentences."""
+        return _texts_of(self.record)[self.field.name]
 
     @property
     def text_with_default(self) -> str:
@@ -74,7 +95,7 @@ class OptionGroup:
 # Characters of help that an option and its values take, beside its text.
 _WIDEST = 48
 # Records whose options have no prefix.
-TAKEN_APART = ("project", "options", "georeference")
+_TAKEN_APART = ("project", "options", "georeference")
 
 
 def option_groups(record: type) -> Iterator[OptionGroup]:
@@ -88,54 +109,34 @@ def option_groups(record: type) -> Iterator[OptionGroup]:
     plain: list[Option] = []
     stages: list[OptionGroup] = []
     _take_apart(record, plain, stages)
-    yield OptionGroup("", _one_paragraph(inspect.getdoc(record) or ""), tuple(plain))
+    yield OptionGroup("", _text_of(record), tuple(plain))
     yield from stages
 
 
 def _take_apart(
     record: type, plain: list[Option], stages: list[OptionGroup], *, has_switches: bool = True
 ) -> None:
-    types = get_type_hints(record, include_extras=True)
-    texts = _texts_of(record)
-    for field in fields(record):
-        kind, marks = without_marks(types[field.name])
+    for field, kind, marks in _fields_of(record):
         if not (isinstance(kind, type) and is_dataclass(kind)):
-            option = _option(field.name, kind, field, texts[field.name], is_switch=has_switches and kind is bool)
-            plain.append(_positional(option) if tyro.conf.Positional in marks else option)
-        elif field.name in TAKEN_APART:
+            is_switch = has_switches and kind is bool
+            plain.append(Option(field.name, kind, is_switch, tyro.conf.Positional in marks, record, field))
+        elif field.name in _TAKEN_APART:
             _take_apart(kind, plain, stages, has_switches=tyro.conf.FlagConversionOff not in marks)
         else:
-            stages.append(_stage_group(field.name, kind))
+            options = (
+                Option(f"{field.name}.{each.name}", its_kind, False, False, kind, each)
+                for each, its_kind, _ in _fields_of(kind)
+            )
+            stages.append(OptionGroup(field.name, _text_of(kind), tuple(options)))
 
 
-def without_marks(annotated: Any) -> tuple[Any, tuple[Any, ...]]:
-    """A kind of values, and how it is marked for the parser."""
-    marks = getattr(annotated, "__metadata__", ())
-    return (get_args(annotated)[0] if marks else annotated), marks
-
-
-def _stage_group(name: str, record: type) -> OptionGroup:
-    types = get_type_hints(record)
-    texts = _texts_of(record)
-    options = (
-        _option(f"{name}.{field.name}", types[field.name], field, texts[field.name]) for field in fields(record)
-    )
-    return OptionGroup(name, _one_paragraph(inspect.getdoc(record) or ""), tuple(options))
-
-
-def _option(place: str, kind: Any, field: "Field[Any]", text: str, *, is_switch: bool = False) -> Option:
-    is_told = field.default not in (None, "", MISSING, ()) and not (is_switch and not field.default)
-    default = _words_of(field.default) if is_told else ""
-    values = "" if is_switch else _values_of(kind)
-    return Option(flag_of(place), values, default, text, place, kind, is_switch, field.default is MISSING)
-
-
-def _positional(option: Option) -> Option:
-    return replace(option, flag=option.place.upper(), values="", is_positional=True)
-
-
-def _words_of(default: object) -> str:
-    return " ".join(map(str, default)) if isinstance(default, tuple) else str(default)
+def _fields_of(record: type) -> Iterator[tuple["Field[Any]", Any, tuple[Any, ...]]]:
+    """The fields of a dataclass, each with the kind of its values and how it is marked for the parser."""
+    kinds = get_type_hints(record, include_extras=True)
+    for field in fields(record):
+        annotated = kinds[field.name]
+        marks = getattr(annotated, "__metadata__", ())
+        yield field, get_args(annotated)[0] if marks else annotated, marks
 
 
 def _values_of(kind: Any) -> str:
@@ -149,6 +150,7 @@ def _values_of(kind: Any) -> str:
     return {int: "N", float: "X", bool: "{True,False}", Path: "PATH", str: "TEXT"}[kind]
 
 
+@cache
 def _texts_of(record: type) -> dict[str, str]:
     """The docstring below each field of a dataclass."""
     (definition,) = ast.parse(dedent(inspect.getsource(record))).body
@@ -159,6 +161,10 @@ def _texts_of(record: type) -> dict[str, str]:
             assert isinstance(text.value, ast.Constant)
             texts[field.target.id] = _one_paragraph(str(text.value.value))
     return texts
+
+
+def _text_of(record: type) -> str:
+    return _one_paragraph(inspect.getdoc(record) or "")
 
 
 def _one_paragraph(text: str) -> str:

@@ -4,32 +4,19 @@ import io
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr
-from dataclasses import MISSING, dataclass, fields, is_dataclass
 from difflib import get_close_matches
 from itertools import dropwhile, takewhile
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin
 
-import tyro
-
-from colmap_sph.app.option_list import TAKEN_APART, without_marks
+from colmap_sph.app.option_list import Option, option_groups
 from colmap_sph.app.spelling import SHORT, full_flag
 from colmap_sph.errors import InputError
 
 _OPTION = re.compile(r"--?[^\W\d]")
 # Lines, corners and colours of the parser's box, with or without Unicode.
 _DRAWN = re.compile(r"[╭╮╰╯│─]|^[|+]|[|+]$|-{3,}|\x1b\[[\d;]*m")
-
-
-@dataclass(frozen=True)
-class _Known:
-    """An option or, without a flag, a positional argument; its kind is None where it takes no value."""
-
-    flag: str
-    name: str
-    kind: Any
-    is_required: bool
 
 
 @contextmanager
@@ -63,7 +50,8 @@ def refuse_empty_paths(arguments: Sequence[str], command: Any) -> None:
     command : type
         The record of its options.
     """
-    paths = {each.flag for each in _known(command) if each.flag and _is_path(each.kind)}
+    options, _ = _options_of(command)
+    paths = {flag for flag, each in options.items() if _is_path(each.kind)}
     for before, word in zip(["", *arguments], arguments, strict=False):
         flag, equals, value = word.partition("=")
         if flag in paths and equals and not value:
@@ -93,30 +81,19 @@ def _reason(arguments: Sequence[str], commands: Mapping[str, Any]) -> str | None
             f"There is no command {command!r}{_nearest(command, commands)}; the commands are {names}, "
             "and those of COLMAP."
         )
-    known = list(_known(commands[command]))
-    problem = _problem(typed, {each.flag: each for each in known if each.flag}, known)
+    problem = _problem(typed, *_options_of(commands[command]))
     more = "--help-all" if command == "run" else "--help"
     return problem and f"{problem}; see colmap_sph {command} {more}."
 
 
-def _known(annotated: Any, prefix: str = "", *, has_switches: bool = True) -> Iterator[_Known]:
-    record, marks = without_marks(annotated)
-    has_switches = has_switches and tyro.conf.FlagConversionOff not in marks
-    kinds = get_type_hints(record, include_extras=True)
-    for each in fields(record):
-        kind, marks = without_marks(kinds[each.name])
-        if is_dataclass(kind):
-            inner = prefix if each.name in TAKEN_APART else f"{prefix}{each.name}."
-            yield from _known(kinds[each.name], inner, has_switches=has_switches)
-        else:
-            is_positional = tyro.conf.Positional in marks
-            flag = "" if is_positional else f"--{prefix}{each.name}".replace("_", "-")
-            is_required = each.default is MISSING and each.default_factory is MISSING
-            is_switch = kind is bool and has_switches
-            yield _Known(flag, flag or f"a {each.name}", None if is_switch else kind, is_required)
+def _options_of(command: Any) -> tuple[dict[str, Option], list[Option]]:
+    """The options of a command by their full flag, and its positional arguments."""
+    every = [option for group in option_groups(command) for option in group.options]
+    options = {option.full_flag: option for option in every if not option.is_positional}
+    return options, [option for option in every if option.is_positional]
 
 
-def _problem(typed: Sequence[str], options: Mapping[str, _Known], known: Sequence[_Known]) -> str | None:
+def _problem(typed: Sequence[str], options: Mapping[str, Option], places: Sequence[Option]) -> str | None:
     """Say what is wrong first; None where nothing is seen to be."""
     given = set()
     loose = []
@@ -130,12 +107,13 @@ def _problem(typed: Sequence[str], options: Mapping[str, _Known], known: Sequenc
         option = options.get(full_flag(flag)) or options.get(full_flag(flag.replace("--no-", "--", 1)))
         if option is None:
             return f"There is no option {flag}{_nearest(flag, [*SHORT.values(), *options])}"
-        given.add(option.flag)
-        values = [value] if equals else _taken(rest, option.kind)
-        problem = _wrong_value(flag, option.kind, values)
+        given.add(option.full_flag)
+        kind = None if option.is_switch else option.kind
+        values = [value] if equals else _taken(rest, kind)
+        problem = _wrong_value(flag, kind, values)
         if problem:
             return problem
-    return _wrong_number(loose, given, known)
+    return _wrong_number(loose, given, options, places)
 
 
 def _taken(rest: list[str], kind: Any) -> list[str]:
@@ -192,15 +170,16 @@ def _fits(kind: Any, value: str) -> bool:
     return True
 
 
-def _wrong_number(loose: Sequence[str], given: set[str], known: Sequence[_Known]) -> str | None:
+def _wrong_number(
+    loose: Sequence[str], given: set[str], options: Mapping[str, Option], places: Sequence[Option]
+) -> str | None:
     """Say which argument is missing, or one too many."""
-    places = [each for each in known if not each.flag]
     most = sum(_most_values(each.kind) for each in places)
-    is_model = "--model" in {each.flag for each in known} and "--model" not in given and not places
+    is_model = "--model" in options and "--model" not in given and not places
     if len(loose) > most + is_model:
         return f"{loose[-1]!r} is one argument too many, or an option's name is missing before it"
-    missing = [each.name for each in known if each.is_required and each.flag and each.flag not in given]
-    missing += [each.name for each in places if each.is_required and not loose]
+    missing = [flag for flag, each in options.items() if each.is_required and flag not in given]
+    missing += [f"a {each.place}" for each in places if each.is_required and not loose]
     return f"Give {' and '.join(missing)}" if missing else None
 
 
