@@ -216,6 +216,6 @@ def vote_depth(
             voted.sigma[rows],
             voted.support[rows],
         )
-        voted.depth[rows][voted.depth[rows] < _LEAST_PRECISION * voted.sigma[rows]] = 0
-    voted.depth[voted.support < options.min_support] = 0
+        is_unsure = voted.depth[rows] < _LEAST_PRECISION * voted.sigma[rows]
+        voted.depth[rows][is_unsure | (voted.support[rows] < options.min_support)] = 0
     return voted
