@@ -8,7 +8,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from statistics import median
 
 import numpy as np
@@ -70,22 +70,26 @@ class Compared:
     features: tuple[Features, Features]
     matches: NDArray[np.int64]
 
-    def distances(self, factor: float = 1.0) -> NDArray[np.float64]:
-        """See `epipolar_distances`; with so many times the focal length, of photographs that are one view."""
-        features = self.features
+    @cached_property
+    def distances(self) -> NDArray[np.float64]:
+        """See `epipolar_distances`."""
+        return self._distances_of(*self.features)
+
+    def distances_with(self, factor: float) -> NDArray[np.float64]:
+        """The same with so many times the focal length, of photographs that are one view."""
+        if factor == 1.0:
+            return self.distances
+        pairs = zip(self.features, self.photographs, strict=True)
+        return self._distances_of(*(with_focal_length(shown, of.views[0], factor) for shown, of in pairs))
+
+    def _distances_of(self, first: Features, second: Features) -> NDArray[np.float64]:
         left, right = self.photographs
-        if factor != 1.0:
-            first, second = features
-            features = (
-                with_focal_length(first, left.views[0], factor),
-                with_focal_length(second, right.views[0], factor),
-            )
-        return epipolar_distances(*features, self.matches, right.center - left.center)
+        return epipolar_distances(first, second, self.matches, right.center - left.center)
 
     @property
     def fits(self) -> bool:
         """Whether most of the features lie in common epipolar planes."""
-        return bool((self.distances() <= 1).mean() > _FITTING)
+        return bool((self.distances <= 1).mean() > _FITTING)
 
 
 def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
@@ -172,8 +176,8 @@ def fitting_factor(compared: Sequence[Compared]) -> tuple[float, float, float]:
     of_pairs : float
         Share of the pairs in which it is less.
     """
-    now = np.array([np.median(pair.distances()) for pair in compared])
-    there = np.array([[np.median(pair.distances(factor)) for pair in compared] for factor in _FACTORS])
+    now = np.array([np.median(pair.distances) for pair in compared])
+    there = np.array([[np.median(pair.distances_with(factor)) for pair in compared] for factor in _FACTORS])
     # Where cameras do not turn, any focal length fits, and with a longer one a pixel is a smaller angle.
     there *= np.maximum(_FACTORS, 1)[:, None]
     best = int(np.median(there, axis=1).argmin())
@@ -217,7 +221,7 @@ def distance_of_pairs(compared: Sequence[Compared]) -> float:
     """
     fitting = [pair for pair in compared if pair.fits]
     told = fitting if 2 * len(fitting) >= len(compared) else compared
-    return median(float(np.median(pair.distances())) for pair in told)
+    return median(float(np.median(pair.distances)) for pair in told)
 
 
 def _shown(context: Context, view: View) -> Shown:
