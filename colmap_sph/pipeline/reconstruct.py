@@ -136,19 +136,9 @@ def run_project(
     report.command = command_of(project, options)
     dense = open_workspace(project) if project.model is None else Workspace(project.root)
     with claimed(dense), executor_of(options, dense) as executor:
-        prepared = prepare(
-            project, options, dense, executor, overwrite=overwrite, verify=verify, progress=progress, report=report
-        )
-        request = Request(
-            progress=progress,
-            report=report,
-            database=project.database(),
-            expected=prepared.names,
-            given=prepared.given,
-            overwrite=overwrite,
-            verify=verify,
-        )
-        return reconstruct(dense, prepared.options, request, executor=executor, limit=limit)
+        request = Request(progress=progress, report=report, overwrite=overwrite, verify=verify)
+        options, request = prepare(project, options, dense, executor, request)
+        return reconstruct(dense, options, request, executor=executor, limit=limit)
 
 
 def check_input(project: Project, options: RunOptions, limit: TimeLimit | None = None) -> None:

@@ -23,7 +23,7 @@ from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.reconstruct import by_name, check_input
-from colmap_sph.pipeline.report import Progress, RunReport, Silent
+from colmap_sph.pipeline.report import Progress, Silent
 from colmap_sph.pipeline.shards.part import Part, StageName
 from colmap_sph.pipeline.stages.check_images import CheckStage
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
@@ -108,19 +108,18 @@ def run_part(
     check_input(project, options)
     program_digests()
     _check_alone(options, stage, is_begun_anew=overwrite or verify)
-    progress = Silent() if progress is None else progress
-    report = RunReport()
+    request = Request(progress=Silent() if progress is None else progress, overwrite=overwrite, verify=verify)
     workspace = open_workspace(project) if project.model is None else Workspace(project.root)
     if stage == "prepare":
-        return _prepare(project, options, workspace, progress, report, overwrite=overwrite, verify=verify)
+        return _prepare(project, options, workspace, request)
     if not workspace.state_dir.is_dir():
         raise _unprepared(workspace)
     with shared(workspace), room_for_workers():
-        prepared = find_prepared(project, options, workspace, progress, report)
+        prepared = find_prepared(project, options, workspace, request)
         if prepared is None:
             raise _unprepared(workspace)
-        request = Request(progress=progress, report=report, database=project.database(), given=prepared.given)
-        context, selection = start(workspace, prepared.options, _only_prepared, request)
+        options, request = prepared
+        context, selection = start(workspace, options, _only_prepared, request)
         return _make(_stage_of(stage, part, context, selection.unique_pairs()), part, _WHAT[stage])
 
 
@@ -141,38 +140,12 @@ def _unprepared(workspace: Workspace) -> InputError:
     )
 
 
-def _prepare(
-    project: Project,
-    options: RunOptions,
-    workspace: Workspace,
-    progress: Progress,
-    report: RunReport,
-    *,
-    overwrite: bool,
-    verify: bool,
-) -> PartReport:
+def _prepare(project: Project, options: RunOptions, workspace: Workspace, request: Request) -> PartReport:
     """Do all that comes before the first pair, in a workspace that this job holds alone."""
     with claimed(workspace), room_for_workers():
-        prepared = prepare(
-            project,
-            options,
-            workspace,
-            execute,
-            overwrite=overwrite,
-            verify=verify,
-            progress=progress,
-            report=report,
-        )
-        request = Request(
-            progress=progress,
-            report=report,
-            database=project.database(),
-            expected=prepared.names,
-            given=prepared.given,
-            overwrite=overwrite,
-            verify=verify,
-        )
-        context, selection = start(workspace, prepared.options, execute, request)
+        options, request = prepare(project, options, workspace, execute, request)
+        context, selection = start(workspace, options, execute, request)
+    report = request.report
     number = len(context.scene.views)
     made = sum(report.made.values())
     return PartReport(
