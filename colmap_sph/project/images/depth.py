@@ -68,8 +68,7 @@ def sample_values(path: Path) -> ValueSample | None:
             return None
         pixels = read_pixels(path)
     except (OSError, DamagedError) as error:
-        reason = reason_of(error) if isinstance(error, OSError) else error
-        raise InputError(f"{path} cannot be read as an image ({reason}); mend or remove it.") from error
+        raise InputError(f"{path} cannot be read as an image ({reason_of(error)}); mend or remove it.") from error
     colours = "grey" if header.channels == 1 else "colour"
     return ValueSample(f"{_KIND_NAMES[header.dtype]} {colours}", tuple(map(float, _quantiles(pixels))))
 

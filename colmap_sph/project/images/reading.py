@@ -210,7 +210,6 @@ def read_small_colours(path: Path, longest: int) -> NDArray[np.uint8]:
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
-    reason = reason_of(error) if isinstance(error, OSError) else error
     return InputError(
-        f"{path} cannot be read as an image ({reason}); undistort it again or remove it from the model."
+        f"{path} cannot be read as an image ({reason_of(error)}); undistort it again or remove it from the model."
     )

@@ -102,8 +102,9 @@ def _read(source: Path, size: tuple[int, int], *, deep: bool) -> NDArray[Any]:
     try:
         image = read_pixels(source, deep=deep)
     except (OSError, DamagedError) as error:
-        reason = reason_of(error) if isinstance(error, OSError) else error
-        raise InputError(f"{source} cannot be read as an image ({reason}); mend or remove it.") from error
+        raise InputError(
+            f"{source} cannot be read as an image ({reason_of(error)}); mend or remove it."
+        ) from error
     if image.shape[1::-1] != size:
         raise InputError(f"{source} is not of its camera's size; start again.")
     return image
