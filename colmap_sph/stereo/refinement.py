@@ -162,14 +162,7 @@ def refine_maps(
     K = np.ascontiguousarray(view.K)
     for done in range(options.rounds):
         if done:
-            smooth = NormalOptions(radius=options.smoothing_radius)
-            moved = replace(estimate, depth=depth)
-            smooth_normals, smooth_depth = fit_normals(view, moved, smooth)
-            lone = smooth_depth == 0  # a pixel without neighbours keeps its plane
-            smooth_normals[lone] = normals[lone]
-            smooth_depth[lone] = depth[lone]
-            normals[:] = smooth_normals
-            depth[:] = smooth_depth
+            _smooth_planes(view, estimate, normals, depth, options.smoothing_radius)
         is_last = done == options.rounds - 1
         most = options.max_partners if is_last else min(options.max_partners, _FEW_PARTNERS)
         for tile, first in enumerate(range(0, view.height, _TILE)):
@@ -181,6 +174,17 @@ def refine_maps(
             _native.refine_planes(equations, sigma, slope_sigma, planes)
             _native.maps_of_planes(planes, K, first, normals, depth)
     return normals, depth
+
+
+def _smooth_planes(
+    view: View, estimate: DepthEstimate, normals: NDArray[np.float32], depth: NDArray[np.float32], radius: int
+) -> None:
+    """Fit planes anew to the depths that have moved, in place; a pixel without neighbours keeps its plane."""
+    moved = replace(estimate, depth=depth)
+    smooth_normals, smooth_depth = fit_normals(view, moved, NormalOptions(radius=radius))
+    there = smooth_depth != 0
+    normals[there] = smooth_normals[there]
+    depth[there] = smooth_depth[there]
 
 
 def _refine_at_half_size(
