@@ -14,7 +14,7 @@ import pytest
 from conftest import keep_images
 from rich.cells import cell_len
 
-from colmap_sph.app import cli, display, run_command
+from colmap_sph.app import cli, display
 from colmap_sph.app.display import Display
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.terminal import Terminal, shortened, warnings_shown, wrapped
@@ -440,35 +440,6 @@ def test_the_current_folder_is_gone(tmp_path: Path) -> None:
     done = subprocess.run(WRONG, stderr=subprocess.PIPE, text=True, timeout=60, preexec_fn=leave)
     assert done.returncode == 2
     assert re.fullmatch(r"error: The current folder cannot be used .*\n", done.stderr)
-
-
-@pytest.mark.parametrize(
-    ("error", "code", "words"),
-    [
-        (RuntimeError("can't start new thread"), 6, "not enough memory"),
-        (OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), "some/file"), 3, "some/file cannot be used (Disk quota"),
-        (
-            OSError(errno.EFBIG, os.strerror(errno.EFBIG), "some/file"),
-            3,
-            "some/file cannot be used (File too large)",
-        ),
-    ],
-)
-def test_what_the_system_refuses(
-    error: Exception,
-    code: int,
-    words: str,
-    block,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def refused(*_: object, **__: object) -> None:
-        raise error
-
-    monkeypatch.setattr(run_command, "run_project", refused)
-    assert cli.main(["run", "--model", str(block.sparse_dir), "--output", str(tmp_path / "dense")]) == code
-    assert words in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("memory", ["0", "9" * 400])
