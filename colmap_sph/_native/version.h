@@ -7,14 +7,4 @@
 #define VERSION_PASTE(kernel, version) VERSION_JOIN(kernel, version)
 #define VERSION_JOIN(kernel, version) kernel##_##version
 
-/* Pixels side by side, as many as a register has: gcc does not divide larger vectors well. Each has a lane of its
- * own, so that their number cannot change a result. */
-#ifdef __AVX512F__
-enum { LANES = 16 };
-#elif defined(__AVX2__)
-enum { LANES = 8 };
-#else /* SSE2 of every x86-64, NEON of every aarch64 */
-enum { LANES = 4 };
-#endif
-
 #endif

@@ -16,13 +16,10 @@
 #endif
 
 #include "depth/depth.h"
+#include "lanes.h"
 #include "version.h"
 
 enum { SIDE = 6 };
-
-typedef float lanes __attribute__((vector_size(4 * LANES)));
-typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
-typedef uint32_t uint_lanes __attribute__((vector_size(4 * LANES)));
 
 /* Where a window may lie around its centre in the source; also what makes positions positive, so that cutting off
  * their fraction rounds down. */
@@ -45,8 +42,8 @@ static int ring(int place) { return place < SIDE / 2 ? SIDE / 2 - 1 - place : pl
  * the taps of their windows, and weighted sums over these. */
 typedef struct {
     double row, column[LANES], plane[3][LANES], there[LANES]; /* there: 1, or 0 without a plane */
-    lanes r[SIDE][SIDE], w[SIDE][SIDE];
-    lanes sum_w, sum_r, sum_rr;
+    float_lanes r[SIDE][SIDE], w[SIDE][SIDE];
+    float_lanes sum_w, sum_r, sum_rr;
 } block_windows;
 
 /* Where the pixels of a block lie in the source, each by its affine map there. */
@@ -61,27 +58,21 @@ typedef struct {
 /* Weighted sums over the taps of a block: of source s, and with reference r, and the source's derivative g by
  * inverse depth, times 1, dx, dy (and dx dx, dx dy, dy dy). */
 typedef struct {
-    lanes s, ss, rs;
-    lanes g[3], gr[3], gs[3], gg[6];
+    float_lanes s, ss, rs;
+    float_lanes g[3], gr[3], gs[3], gg[6];
 } block_sums;
 
-static inline lanes load(const float *values) {
-    lanes loaded;
-    memcpy(&loaded, values, sizeof loaded);
-    return loaded;
-}
-
 /* The same of fewer values, and back. Most often it is a whole block, of which compilers know how long it is. */
-static inline lanes load_some(const float *values, ptrdiff_t count) {
-    lanes loaded = {0};
+static inline float_lanes load_some(const float *values, ptrdiff_t count) {
+    float_lanes loaded = {0};
     if (count == LANES) {
-        return load(values);
+        return load_floats(values);
     }
     memcpy(&loaded, values, (size_t)count * sizeof *values);
     return loaded;
 }
 
-static inline void store_some(float *values, lanes stored, ptrdiff_t count) {
+static inline void store_some(float *values, float_lanes stored, ptrdiff_t count) {
     if (count == LANES) {
         memcpy(values, &stored, sizeof stored);
     } else {
@@ -94,7 +85,7 @@ static inline int read_planes(const float *planes, ptrdiff_t stride, ptrdiff_t c
                               ptrdiff_t count, block_windows *k) {
     int any = 0;
     for (int i = 0; i < 3; i++) {
-        const lanes plane = load_some(planes + i * stride, count);
+        const float_lanes plane = load_some(planes + i * stride, count);
         for (int l = 0; l < LANES; l++) {
             k->plane[i][l] = plane[l];
         }
@@ -111,7 +102,7 @@ static inline int read_planes(const float *planes, ptrdiff_t stride, ptrdiff_t c
 /* The taps of a block whose first pixel is at `corner` of the reference. */
 static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t count, float near[SIDE][SIDE],
                              float scale, block_windows *k) {
-    lanes centre;
+    float_lanes centre;
     enum { TAPS = (SIDE - 1 + LANES + LANES - 1) / LANES * LANES };
     uint8_t taps[TAPS] = {0};
     float row[TAPS];
@@ -133,8 +124,8 @@ static inline void read_taps(const uint8_t *corner, ptrdiff_t width, ptrdiff_t c
             row[l] = (float)taps[l];
         }
         for (int i = 0; i < SIDE; i++) {
-            const lanes r = load(row + i), edge = (r - centre) * scale;
-            const lanes w = near[j][i] / (1 + edge * edge), wr = w * r;
+            const float_lanes r = load_floats(row + i), edge = (r - centre) * scale;
+            const float_lanes w = near[j][i] / (1 + edge * edge), wr = w * r;
             k->r[j][i] = r;
             k->w[j][i] = w;
             k->sum_w += w;
@@ -200,7 +191,7 @@ static inline int_lanes load_pairs(const uint16_t *values, int_lanes offset) {
     /* In bytes, below 2^31 as sources have fewer than 2^30 pixels; compilers add such offsets to an address at no
      * cost. */
     const uint8_t *bytes = (const uint8_t *)values;
-    const uint_lanes at = (uint_lanes)(offset + offset);
+    const unsigned_lanes at = (unsigned_lanes)(offset + offset);
     int_lanes words;
     for (int l = 0; l < LANES; l++) {
         int32_t word;
@@ -216,13 +207,14 @@ static inline int_lanes load_pairs(const uint16_t *values, int_lanes offset) {
 typedef struct {
     const uint16_t *values;
     int32_t width;
-    lanes u[SIDE], v[SIDE];
-    lanes uy, vy, uw, vw;
+    float_lanes u[SIDE], v[SIDE];
+    float_lanes uy, vy, uw, vw;
     int_lanes base;
 } block_taps;
 
 static inline void place_taps(const paired_image *source, const block_place *place, block_taps *taps) {
-    const lanes u = load(place->u), v = load(place->v), ux = load(place->ux), vx = load(place->vx);
+    const float_lanes u = load_floats(place->u), v = load_floats(place->v), ux = load_floats(place->ux),
+                      vx = load_floats(place->vx);
     for (int i = 0; i < SIDE; i++) {
         const float dx = (float)i - 0.5f * (SIDE - 1);
         taps->u[i] = u + ux * dx;
@@ -230,42 +222,44 @@ static inline void place_taps(const paired_image *source, const block_place *pla
     }
     taps->values = source->values;
     taps->width = (int32_t)source->width;
-    taps->uy = load(place->uy);
-    taps->vy = load(place->vy);
-    taps->uw = load(place->uw);
-    taps->vw = load(place->vw);
+    taps->uy = load_floats(place->uy);
+    taps->vy = load_floats(place->vy);
+    taps->uw = load_floats(place->uw);
+    taps->vw = load_floats(place->vw);
     memcpy(&taps->base, place->base, sizeof taps->base);
 }
 
 /* Value of the source at (u, v) and its derivative by inverse depth, bilinear between four pixels. */
-static inline lanes sample(const block_taps *k, lanes u, lanes v, lanes *slope) {
+static inline float_lanes sample(const block_taps *k, float_lanes u, float_lanes v, float_lanes *slope) {
     const int_lanes x = __builtin_convertvector(u, int_lanes), y = __builtin_convertvector(v, int_lanes);
-    const lanes fu = u - __builtin_convertvector(x, lanes), fv = v - __builtin_convertvector(y, lanes);
+    const float_lanes fu = u - __builtin_convertvector(x, float_lanes),
+                      fv = v - __builtin_convertvector(y, float_lanes);
     const int_lanes offset = k->base + y * k->width + x;
     const int_lanes four = load_pairs(k->values, offset), a = four & 255, c = four >> 8 & 255;
     /* Differences of integers are exact as well, and leave the units of floating-point numbers free. */
-    const lanes across = __builtin_convertvector((four >> 16 & 255) - a, lanes),
-                across_below = __builtin_convertvector((int_lanes)((uint_lanes)four >> 24) - c, lanes);
-    const lanes above = __builtin_convertvector(a, lanes) + fu * across,
-                below = __builtin_convertvector(c, lanes) + fu * across_below;
+    const float_lanes across = __builtin_convertvector((four >> 16 & 255) - a, float_lanes),
+                      across_below =
+                          __builtin_convertvector((int_lanes)((unsigned_lanes)four >> 24) - c, float_lanes);
+    const float_lanes above = __builtin_convertvector(a, float_lanes) + fu * across,
+                      below = __builtin_convertvector(c, float_lanes) + fu * across_below;
     *slope = (across + fv * (across_below - across)) * k->uw + (below - above) * k->vw;
     return above + fv * (below - above);
 }
 
 /* A row of taps: what depends on dy alone is multiplied once, at its end. */
-static inline void accumulate_row(const block_taps *taps, const lanes *reference, const lanes *weights, float dy,
-                                  block_sums *sums) {
-    lanes g[2] = {{0}}, gr[2] = {{0}}, gs[2] = {{0}}, gg[3] = {{0}};
-    const lanes down_u = taps->uy * dy, down_v = taps->vy * dy;
+static inline void accumulate_row(const block_taps *taps, const float_lanes *reference, const float_lanes *weights,
+                                  float dy, block_sums *sums) {
+    float_lanes g[2] = {{0}}, gr[2] = {{0}}, gs[2] = {{0}}, gg[3] = {{0}};
+    const float_lanes down_u = taps->uy * dy, down_v = taps->vy * dy;
 #ifndef __aarch64__ /* there, gcc works on all taps side by side, for which registers are too few */
 #pragma GCC unroll 6
 #endif
     for (int i = 0; i < SIDE; i++) {
         const float dx = (float)i - 0.5f * (SIDE - 1);
-        lanes slope;
-        const lanes s = sample(taps, taps->u[i] + down_u, taps->v[i] + down_v, &slope);
-        const lanes r = reference[i], w = weights[i], ws = w * s, wg = w * slope;
-        const lanes wgr = wg * r, wgs = wg * s, wgg = wg * slope;
+        float_lanes slope;
+        const float_lanes s = sample(taps, taps->u[i] + down_u, taps->v[i] + down_v, &slope);
+        const float_lanes r = reference[i], w = weights[i], ws = w * s, wg = w * slope;
+        const float_lanes wgr = wg * r, wgs = wg * s, wgg = wg * slope;
         sums->s += ws;
         sums->ss += ws * s;
         sums->rs += ws * r;
@@ -308,18 +302,19 @@ static inline void match_block(const block_windows *windows, const paired_image 
 
 /* Equations of the normalised windows, weighed by how well they match. */
 static inline void add_block(const block_windows *windows, const block_sums *sums, const block_place *place,
-                             float min_score, lanes *equations) {
-    lanes mean[3], with_r[3], with_s[3], ir, is;
-    const lanes n = 1 / windows->sum_w, mr = windows->sum_r * n, ms = sums->s * n;
-    const lanes vr = windows->sum_rr * n - mr * mr + NOISE_VARIANCE, vs = sums->ss * n - ms * ms + NOISE_VARIANCE;
+                             float min_score, float_lanes *equations) {
+    float_lanes mean[3], with_r[3], with_s[3], ir, is;
+    const float_lanes n = 1 / windows->sum_w, mr = windows->sum_r * n, ms = sums->s * n;
+    const float_lanes vr = windows->sum_rr * n - mr * mr + NOISE_VARIANCE,
+                      vs = sums->ss * n - ms * ms + NOISE_VARIANCE;
     for (int l = 0; l < LANES; l++) {
         ir[l] = 1 / sqrtf(vr[l]);
         is[l] = 1 / sqrtf(vs[l]);
     }
-    const lanes uw = load(place->uw), vw = load(place->vw);
-    const lanes score = (sums->rs * n - mr * ms) * ir * is;
-    const lanes counts = __builtin_convertvector(-(score > min_score), lanes);
-    const lanes weight = load(place->inside) * counts * windows->sum_w;
+    const float_lanes uw = load_floats(place->uw), vw = load_floats(place->vw);
+    const float_lanes score = (sums->rs * n - mr * ms) * ir * is;
+    const float_lanes counts = __builtin_convertvector(-(score > min_score), float_lanes);
+    const float_lanes weight = load_floats(place->inside) * counts * windows->sum_w;
     for (int i = 0; i < 3; i++) {
         mean[i] = sums->g[i] * n;
         with_r[i] = (sums->gr[i] * n - mr * mean[i]) * ir;
@@ -341,7 +336,7 @@ static inline void add_block(const block_windows *windows, const block_sums *sum
 static inline void match_sources(const block_windows *windows, const patch_source *sources, ptrdiff_t source_count,
                                  uint32_t used, float min_score, ptrdiff_t count, ptrdiff_t stride,
                                  float *equations) {
-    lanes e[PATCH_EQUATIONS];
+    float_lanes e[PATCH_EQUATIONS];
     for (int k = 0; k < PATCH_EQUATIONS; k++) {
         e[k] = load_some(equations + k * stride, count);
     }

@@ -8,6 +8,7 @@
 #include <string.h>
 
 #include "depth/depth.h"
+#include "lanes.h"
 #include "version.h"
 
 enum { ROUNDS = 3 };
@@ -17,9 +18,6 @@ enum { ROUNDS = 3 };
 #define SMALLEST 1e-18f
 #define LARGEST 1e18f
 #define LEAST_NOISE 1e-8f
-
-typedef float lanes __attribute__((vector_size(4 * LANES)));
-typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
 
 /* One value per pixel of a block; inverse depths are relative to the centre's: (w - centre) / centre. */
 typedef struct {
@@ -34,12 +32,6 @@ typedef struct {
     float n[6][LANES], b[3][LANES];
 } normal_equations;
 
-static inline lanes load(const float *values) {
-    lanes loaded;
-    memcpy(&loaded, values, sizeof loaded);
-    return loaded;
-}
-
 /* NaN becomes `least`. */
 static inline float clamp(float v, float least, float most) { return v > least ? v < most ? v : most : least; }
 
@@ -48,20 +40,21 @@ static inline float clamp(float v, float least, float most) { return v > least ?
 static inline void accumulate(const float *window, ptrdiff_t stride, int radius, int step, const float *falloff,
                               float widening, const block *k, normal_equations *sums) {
     const int reach = radius / step * step;
-    const lanes centre = load(k->centre), scale = load(k->scale), noise = load(k->noise);
-    const lanes value = load(k->value), du = load(k->du), dv = load(k->dv);
-    const lanes inverse_scale = 1 / (noise * noise * widening * widening);
-    lanes n[6] = {{0}}, b[3] = {{0}};
+    const float_lanes centre = load_floats(k->centre), scale = load_floats(k->scale),
+                      noise = load_floats(k->noise);
+    const float_lanes value = load_floats(k->value), du = load_floats(k->du), dv = load_floats(k->dv);
+    const float_lanes inverse_scale = 1 / (noise * noise * widening * widening);
+    float_lanes n[6] = {{0}}, b[3] = {{0}};
     for (int x = -reach; x <= reach; x += step) {
-        lanes a0 = {0}, a1 = {0}, a2 = {0}, b0 = {0}, b1 = {0};
+        float_lanes a0 = {0}, a1 = {0}, a2 = {0}, b0 = {0}, b1 = {0};
         const float fx = (float)x;
         for (int y = -reach; y <= reach; y += step) {
-            const lanes tap = load(window + y * stride + x);
+            const float_lanes tap = load_floats(window + y * stride + x);
             const float fy = (float)y, near = falloff[abs(x)] * falloff[abs(y)];
-            const lanes w = (tap - centre) * scale;
-            const lanes residual = w - (value + du * fx + dv * fy);
-            const lanes robust = 1 / (1 + residual * residual * inverse_scale);
-            const lanes weight = (lanes)((int_lanes)(near * robust * robust) & (int_lanes)(tap > 0));
+            const float_lanes w = (tap - centre) * scale;
+            const float_lanes residual = w - (value + du * fx + dv * fy);
+            const float_lanes robust = 1 / (1 + residual * residual * inverse_scale);
+            const float_lanes weight = (float_lanes)((int_lanes)(near * robust * robust) & (int_lanes)(tap > 0));
             a0 += weight;
             a1 += weight * fy;
             a2 += weight * fy * fy;

@@ -5,28 +5,26 @@
 
 #include "aligned_memory.h"
 #include "depth/depth.h"
+#include "lanes.h"
 #include "version.h"
 
 enum { MAX_CANDIDATES = 255 };
 
-typedef float lanes __attribute__((vector_size(4 * LANES)));
-typedef int32_t int_lanes __attribute__((vector_size(4 * LANES)));
-
 /* A pair's candidates for the pixels of a block. */
 typedef struct {
-    lanes depth, variance;
+    float_lanes depth, variance;
     int_lanes there;  /* -1, or 0 where it has none */
     int ends_station; /* no later one of the block is of its station */
 } candidates;
 
 /* Where most stations agree. */
 typedef struct {
-    lanes depth, variance;
+    float_lanes depth, variance;
     int_lanes stations;
 } cluster;
 
-static inline lanes chosen(int_lanes mask, lanes value, lanes otherwise) {
-    return (lanes)((mask & (int_lanes)value) | (~mask & (int_lanes)otherwise));
+static inline float_lanes chosen(int_lanes mask, float_lanes value, float_lanes otherwise) {
+    return (float_lanes)((mask & (int_lanes)value) | (~mask & (int_lanes)otherwise));
 }
 
 static inline int any(int_lanes mask) {
@@ -37,8 +35,9 @@ static inline int any(int_lanes mask) {
     return found != 0;
 }
 
-static inline int_lanes agree(const candidates *c, lanes depth, lanes variance, float tolerance_squared) {
-    const lanes difference = depth - c->depth;
+static inline int_lanes agree(const candidates *c, float_lanes depth, float_lanes variance,
+                              float tolerance_squared) {
+    const float_lanes difference = depth - c->depth;
     return c->there & (int_lanes)(difference * difference <= tolerance_squared * (variance + c->variance));
 }
 
@@ -50,7 +49,7 @@ static inline ptrdiff_t collect(const float *depths, const float *sigmas, const 
     int32_t station = 0;
     int_lanes before = {0};
     for (ptrdiff_t k = 0; k < pairs; k++) {
-        lanes depth = {0}, sigma = {0};
+        float_lanes depth = {0}, sigma = {0};
         memcpy(&depth, depths + k * pixels + first, (size_t)count * sizeof *depths);
         memcpy(&sigma, sigmas + k * pixels + first, (size_t)count * sizeof *sigmas);
         const int_lanes there = (int_lanes)(depth > 0) & (before < MAX_CANDIDATES);
@@ -94,9 +93,9 @@ static inline cluster largest_cluster(const candidates *found, ptrdiff_t number,
 /* Weighted mean of what agrees with the centre of the cluster, and its variance; each station has the mean weight
  * of its candidates. The centre's stations are counted anew: as many. */
 static inline void mean_of_cluster(const candidates *found, ptrdiff_t number, const cluster *centre,
-                                   float tolerance_squared, lanes *mean, lanes *variance) {
-    const lanes none = {0};
-    lanes sum = none, weights = none, own_sum = none, own_weights = none, members = none;
+                                   float tolerance_squared, float_lanes *mean, float_lanes *variance) {
+    const float_lanes none = {0};
+    float_lanes sum = none, weights = none, own_sum = none, own_weights = none, members = none;
     for (ptrdiff_t b = 0; b < number; b++) {
         const candidates *c = &found[b];
         const int_lanes counts = agree(c, centre->depth, centre->variance, tolerance_squared);
@@ -117,7 +116,7 @@ static inline void mean_of_cluster(const candidates *found, ptrdiff_t number, co
 int VERSION_OF(vote_depth)(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t pairs,
                            ptrdiff_t pixels, float tolerance, float *depth, float *sigma, uint8_t *support) {
     const float tolerance_squared = tolerance * tolerance;
-    candidates *found = allocate_aligned(sizeof(lanes), (size_t)(pairs + 1) * sizeof *found);
+    candidates *found = allocate_aligned(sizeof(float_lanes), (size_t)(pairs + 1) * sizeof *found);
     if (!found) {
         return -1;
     }
@@ -131,7 +130,7 @@ int VERSION_OF(vote_depth)(const float *depths, const float *sigmas, const int32
             continue;
         }
         const cluster best = largest_cluster(found, number, tolerance_squared);
-        lanes mean, variance;
+        float_lanes mean, variance;
         mean_of_cluster(found, number, &best, tolerance_squared, &mean, &variance);
         for (ptrdiff_t l = 0; l < count; l++) {
             const int there = best.depth[l] > 0;

@@ -7,6 +7,7 @@
 #include <stdlib.h>
 #include <string.h>
 
+#include "lanes.h"
 #include "matching/matching.h"
 #include "version.h"
 
@@ -28,30 +29,22 @@ typedef struct {
     uint32_t *costs;
 } window_row;
 
-/* GCC's and Clang's vectors, whose comparisons give 0 or -1. */
-typedef int32_t lanes __attribute__((vector_size(4 * LANES)));
-typedef uint32_t unsigned_lanes __attribute__((vector_size(4 * LANES)));
-typedef float float_lanes __attribute__((vector_size(4 * LANES)));
-typedef double double_lanes __attribute__((vector_size(8 * LANES)));
-
 /* Gradient and value at the centre, in 1/256 of the unit of offsets, relative to the centre's offset. */
 typedef struct {
-    lanes value, dx, dy;
-    lanes found;
+    int_lanes value, dx, dy;
+    int_lanes found;
 } offset_planes;
 
-static inline lanes load_lanes(const void *p) {
-    lanes v;
-    memcpy(&v, p, sizeof v);
-    return v;
-}
-
-static inline lanes absolute(lanes v) { return (v ^ (v >> 31)) - (v >> 31); }
+static inline int_lanes absolute(int_lanes v) { return (v ^ (v >> 31)) - (v >> 31); }
 
 /* Where |v| <= most, in one comparison. */
-static inline lanes is_within(lanes v, int most) { return (unsigned_lanes)(v + most) <= (unsigned)(2 * most); }
+static inline int_lanes is_within(int_lanes v, int most) {
+    return (unsigned_lanes)(v + most) <= (unsigned)(2 * most);
+}
 
-static inline lanes choose(lanes condition, lanes yes, lanes no) { return (condition & yes) | (~condition & no); }
+static inline int_lanes choose(int_lanes condition, int_lanes yes, int_lanes no) {
+    return (condition & yes) | (~condition & no);
+}
 
 /* Whether none of a block's pixels can be used; most often the first one tells. */
 static inline int is_empty(const int32_t *offset) {
@@ -63,15 +56,15 @@ static inline int is_empty(const int32_t *offset) {
 }
 
 /* Whole quotients of numbers below 2^24 with few digits before the point: rounding lifts none to the next. */
-static inline lanes quotient(lanes a, lanes b) {
+static inline int_lanes quotient(int_lanes a, int_lanes b) {
     return __builtin_convertvector(
-        __builtin_convertvector(a, float_lanes) / __builtin_convertvector(b, float_lanes), lanes);
+        __builtin_convertvector(a, float_lanes) / __builtin_convertvector(b, float_lanes), int_lanes);
 }
 
 /* Nearest multiple of 256, divided by it; compilers shift negative numbers so that they round down. */
 static inline int32_t nearest_256(int32_t value) { return (value + 128) >> 8; }
 
-static inline lanes nearest_256_lanes(lanes value) { return (value + 128) >> 8; }
+static inline int_lanes nearest_256_lanes(int_lanes value) { return (value + 128) >> 8; }
 
 /* Within the widest row; OFFSET_INVALID is not. */
 static inline int is_offset(int32_t offset) { return offset >= -LARGEST && offset <= LARGEST; }
@@ -108,15 +101,15 @@ static inline void read_row(const int32_t *offset, const uint64_t *reference, co
 }
 
 /* Least-squares planes through the offsets within reach of the centre's; `difference` are offsets minus that. */
-static inline offset_planes fit_offsets(lanes difference[SIDE][SIDE]) {
-    lanes n = {0}, sx = {0}, sy = {0}, sxx = {0}, sxy = {0}, syy = {0}, so = {0}, sxo = {0}, syo = {0};
+static inline offset_planes fit_offsets(int_lanes difference[SIDE][SIDE]) {
+    int_lanes n = {0}, sx = {0}, sy = {0}, sxx = {0}, sxy = {0}, syy = {0}, so = {0}, sxo = {0}, syo = {0};
     for (int j = 0; j < SIDE; j++) {
         const int dy = j - RADIUS;
-        lanes count = {0}, count_x = {0}, sum = {0};
+        int_lanes count = {0}, count_x = {0}, sum = {0};
         for (int i = 0; i < SIDE; i++) {
             const int dx = i - RADIUS, ring = abs(dx) > abs(dy) ? abs(dx) : abs(dy);
-            const lanes kept = is_within(difference[j][i], MAX_OFFSET_STEP * ring);
-            const lanes o = difference[j][i] & kept;
+            const int_lanes kept = is_within(difference[j][i], MAX_OFFSET_STEP * ring);
+            const int_lanes o = difference[j][i] & kept;
             count -= kept;
             count_x -= kept * dx;
             sxx -= kept * (dx * dx);
@@ -131,52 +124,52 @@ static inline offset_planes fit_offsets(lanes difference[SIDE][SIDE]) {
         so += sum;
         syo += sum * dy;
     }
-    const lanes c00 = sxx * syy - sxy * sxy, c01 = sy * sxy - sx * syy, c02 = sx * sxy - sy * sxx;
-    const lanes c11 = n * syy - sy * sy, c12 = sx * sy - n * sxy, c22 = n * sxx - sx * sx;
-    const lanes determinant = n * c00 + sx * c01 + sy * c02;
-    const lanes solved = (n >= MIN_COUNT) & (determinant > 0);
+    const int_lanes c00 = sxx * syy - sxy * sxy, c01 = sy * sxy - sx * syy, c02 = sx * sxy - sy * sxx;
+    const int_lanes c11 = n * syy - sy * sy, c12 = sx * sy - n * sxy, c22 = n * sxx - sx * sx;
+    const int_lanes determinant = n * c00 + sx * c01 + sy * c02;
+    const int_lanes solved = (n >= MIN_COUNT) & (determinant > 0);
 #define DOUBLES(v) __builtin_convertvector(v, double_lanes)
-    const double_lanes scale = 256.0 / DOUBLES(choose(solved, determinant, (lanes){0} + 1));
+    const double_lanes scale = 256.0 / DOUBLES(choose(solved, determinant, (int_lanes){0} + 1));
     const double_lanes o = DOUBLES(so), xo = DOUBLES(sxo), yo = DOUBLES(syo);
     const double_lanes value = (DOUBLES(c00) * o + DOUBLES(c01) * xo + DOUBLES(c02) * yo) * scale;
     const double_lanes dx = (DOUBLES(c01) * o + DOUBLES(c11) * xo + DOUBLES(c12) * yo) * scale;
     const double_lanes dy = (DOUBLES(c02) * o + DOUBLES(c12) * xo + DOUBLES(c22) * yo) * scale;
 #undef DOUBLES
-    const lanes v = __builtin_convertvector(value, lanes), vx = __builtin_convertvector(dx, lanes);
-    const lanes vy = __builtin_convertvector(dy, lanes);
+    const int_lanes v = __builtin_convertvector(value, int_lanes), vx = __builtin_convertvector(dx, int_lanes);
+    const int_lanes vy = __builtin_convertvector(dy, int_lanes);
     /* Neighbours nearly on a line say nothing about the centre. What is beyond 32 bits becomes an extreme number.
      */
     const int most = 256 * MAX_OFFSET_STEP * SIDE;
-    const lanes found =
+    const int_lanes found =
         solved & (v < most) & (v > -most) & (vx < most) & (vx > -most) & (vy < most) & (vy > -most);
     return (offset_planes){v & found, vx & found, vy & found, found};
 }
 
 /* Fitted offsets of pixels of the middle row, the first at x. */
-static inline lanes fit_pixels(const window_row rows[SIDE], ptrdiff_t x, lanes centre) {
-    lanes difference[SIDE][SIDE];
+static inline int_lanes fit_pixels(const window_row rows[SIDE], ptrdiff_t x, int_lanes centre) {
+    int_lanes difference[SIDE][SIDE];
     for (int j = 0; j < SIDE; j++) {
         for (int i = 0; i < SIDE; i++) {
-            difference[j][i] = load_lanes(rows[j].offset + x + i - RADIUS) - centre;
+            difference[j][i] = load_ints(rows[j].offset + x + i - RADIUS) - centre;
         }
     }
     const offset_planes plane = fit_offsets(difference);
-    lanes count = {0}, rounded = {0};
+    int_lanes count = {0}, rounded = {0};
     unsigned_lanes beside = {0},
                    on = {0}; /* costs before (from bit 0) and behind (from bit 12) the plane, on it */
     /* By adding a half beforehand, cutting off rounds to the nearest: parts of 256, and whole pixels. */
-    const lanes centre_and_half = centre + 128;
-    lanes row_value = plane.value + 128 - RADIUS * plane.dy;
+    const int_lanes centre_and_half = centre + 128;
+    int_lanes row_value = plane.value + 128 - RADIUS * plane.dy;
     for (int j = 0; j < SIDE; j++, row_value += plane.dy) {
-        lanes value = row_value - RADIUS * plane.dx;
+        int_lanes value = row_value - RADIUS * plane.dx;
         for (int i = 0; i < SIDE; i++, value += plane.dx) {
             const ptrdiff_t at = x + i - RADIUS;
-            const lanes predicted = (value >> 8) + centre_and_half, whole = predicted >> 8;
+            const int_lanes predicted = (value >> 8) + centre_and_half, whole = predicted >> 8;
             /* Whole pixels from the first of the costs. */
-            const lanes step = whole - load_lanes(rows[j].least + at);
-            const lanes kept = is_within(load_lanes(rows[j].offset + at) + 128 - predicted, MAX_OFFSET_STEP) &
-                               ((unsigned_lanes)step <= 2 * (REACH - 1));
-            const unsigned_lanes costs = (unsigned_lanes)(load_lanes(rows[j].costs + at) & kept) >>
+            const int_lanes step = whole - load_ints(rows[j].least + at);
+            const int_lanes kept = is_within(load_ints(rows[j].offset + at) + 128 - predicted, MAX_OFFSET_STEP) &
+                                   ((unsigned_lanes)step <= 2 * (REACH - 1));
+            const unsigned_lanes costs = (unsigned_lanes)(load_ints(rows[j].costs + at) & kept) >>
                                          (unsigned_lanes)(COST_BITS * step & kept);
             beside += costs & (63 | 63 << 2 * COST_BITS);
             on += costs >> COST_BITS & 63;
@@ -185,13 +178,14 @@ static inline lanes fit_pixels(const window_row rows[SIDE], ptrdiff_t x, lanes c
         }
     }
     rounded -= 128 * count;
-    const lanes before = (lanes)(beside & 4095), after = (lanes)(beside >> 2 * COST_BITS), at = (lanes)on;
-    const lanes rise = choose(before > after, before, after) - at;
-    const lanes good = plane.found & (count >= MIN_COUNT) & (rise > 0) & (at <= before) & (at <= after);
+    const int_lanes before = (int_lanes)(beside & 4095), after = (int_lanes)(beside >> 2 * COST_BITS),
+                    at = (int_lanes)on;
+    const int_lanes rise = choose(before > after, before, after) - at;
+    const int_lanes good = plane.found & (count >= MIN_COUNT) & (rise > 0) & (at <= before) & (at <= after);
     /* Whole pixels lie beside the plane by `rounded / count` on average. A perfect match is at whole pixels. */
-    const lanes one = (lanes){0} + 1;
-    const lanes tip = quotient((before - after) * 128, choose(good, rise, one)) & (at != 0);
-    const lanes change = nearest_256_lanes(plane.value) + tip - quotient(rounded, choose(good, count, one));
+    const int_lanes one = (int_lanes){0} + 1;
+    const int_lanes tip = quotient((before - after) * 128, choose(good, rise, one)) & (at != 0);
+    const int_lanes change = nearest_256_lanes(plane.value) + tip - quotient(rounded, choose(good, count, one));
     return centre + (change & good & (absolute(change) <= MAX_OFFSET_CHANGE));
 }
 
@@ -210,15 +204,15 @@ int VERSION_OF(fit_offsets)(const int32_t *offset, const uint64_t *reference, co
     }
     for (ptrdiff_t y = 0; y < size.height && !failed; y++) {
         for (ptrdiff_t x = 0; x < size.width; x += LANES) {
-            const lanes centre = load_lanes(rows[RADIUS].offset + x), none = centre == NONE;
+            const int_lanes centre = load_ints(rows[RADIUS].offset + x), none = centre == NONE;
             const ptrdiff_t p = y * size.width + x, left = size.width - x, count = left < LANES ? left : LANES;
             if (is_empty(rows[RADIUS].offset + x)) {
                 memcpy(fitted + p, offset + p, (size_t)count * sizeof *fitted);
                 continue;
             }
-            const lanes result = fit_pixels(rows, x, centre & ~none);
+            const int_lanes result = fit_pixels(rows, x, centre & ~none);
             if (count == LANES) { /* which most blocks are: whole vectors */
-                const lanes stored = choose(none, load_lanes(offset + p), result);
+                const int_lanes stored = choose(none, load_ints(offset + p), result);
                 memcpy(fitted + p, &stored, sizeof stored);
                 continue;
             }

@@ -1,22 +1,13 @@
 /* Means of offsets of one surface; see `mean_offsets_fn` in matching.h. */
 #include <string.h>
 
+#include "lanes.h"
 #include "matching/matching.h"
 #include "version.h"
 
 /* Sums of differences fit in 32 bits, also of those from the least that are kept. */
 _Static_assert((2 * MAX_MEAN_RADIUS + 1) * (2 * MAX_MEAN_RADIUS + 1) * (int64_t)(2 * MAX_MEAN_STEP) < INT32_MAX,
                "sums");
-
-typedef int32_t lanes __attribute__((vector_size(4 * LANES)));
-typedef uint32_t unsigned_lanes __attribute__((vector_size(4 * LANES)));
-typedef double double_lanes __attribute__((vector_size(8 * LANES)));
-
-static inline lanes load_lanes(const int32_t *p) {
-    lanes v;
-    memcpy(&v, p, sizeof v);
-    return v;
-}
 
 /* Rows of a window that lie in the image, from the middle. */
 typedef struct {
@@ -26,30 +17,30 @@ typedef struct {
 /* Means of LANES pixels in a row, whose windows reach beyond neither side; `own` is the first of them. */
 static inline void mean_of_lanes(const int32_t *own, ptrdiff_t width, row_range rows, int radius, int32_t max_step,
                                  int32_t *mean) {
-    const lanes middle = load_lanes(own);
+    const int_lanes middle = load_ints(own);
     /* From the middle's offset less max_step to that plus max_step, as far as 32 bits go. */
-    const lanes below = (middle < INT32_MIN + max_step);
-    const lanes above = (middle > INT32_MAX - max_step);
-    const lanes least = (below & INT32_MIN) | (~below & (middle - (max_step & ~below)));
-    const lanes most = (above & INT32_MAX) | (~above & (middle + (max_step & ~above)));
+    const int_lanes below = (middle < INT32_MIN + max_step);
+    const int_lanes above = (middle > INT32_MAX - max_step);
+    const int_lanes least = (below & INT32_MIN) | (~below & (middle - (max_step & ~below)));
+    const int_lanes most = (above & INT32_MAX) | (~above & (middle + (max_step & ~above)));
     const unsigned_lanes range = (unsigned_lanes)most - (unsigned_lanes)least;
     unsigned_lanes sum_from_least = {0};
-    lanes count = {0};
+    int_lanes count = {0};
     for (ptrdiff_t dy = rows.first; dy <= rows.last; dy++) {
         for (ptrdiff_t dx = -radius; dx <= radius; dx++) {
-            const unsigned_lanes other = (unsigned_lanes)load_lanes(own + dy * width + dx);
+            const unsigned_lanes other = (unsigned_lanes)load_ints(own + dy * width + dx);
             /* Wraps round for what is less, to more than any range. */
             const unsigned_lanes from_least = other - (unsigned_lanes)least;
-            const lanes kept = from_least <= range;
+            const int_lanes kept = from_least <= range;
             sum_from_least += from_least & (unsigned_lanes)kept;
             count -= kept;
         }
     }
-    const lanes sum = (lanes)sum_from_least - count * (middle - least);
+    const int_lanes sum = (int_lanes)sum_from_least - count * (middle - least);
     /* Whole quotients of 32-bit numbers: doubles are fine enough that rounding lifts none to the next. */
     const double_lanes quotient =
         __builtin_convertvector(sum, double_lanes) / __builtin_convertvector(count, double_lanes);
-    const lanes means = middle + __builtin_convertvector(quotient, lanes);
+    const int_lanes means = middle + __builtin_convertvector(quotient, int_lanes);
     memcpy(mean, &means, sizeof means);
 }
 
