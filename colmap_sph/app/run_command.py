@@ -250,50 +250,52 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     ]
     caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images" if len(listed) > len(rows) else ""
     terminal.table("Depth maps", ["image", "coverage", "agreement"], rows, caption)
-    mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
-    facts = [("images", f"{report.images} with depth maps, mean coverage {mean:.1%}")]
-    if report.originals:
-        mean = sum(report.originals.values()) / len(report.originals)
-        facts.append(("originals", f"{len(report.originals)} of which these are views, mean coverage {mean:.1%}"))
-    if report.region is not None:
-        left = f"; {len(report.out_of_region)} left out that see too little of it" if report.out_of_region else ""
-        facts.append(("region", f"in {len(report.coverage)} images, of whose pixels in it coverage is{left}"))
-    if report.drawn_region:
-        facts.append(("drawn", report.drawn_region))
-    if report.stretched:
-        facts.append(("values", report.stretched))
-    facts.append(("agreement", _agreement(report)))
-    facts.append(("pairs", f"{report.pairs} matched ({report.pair_source})"))
-    if report.within:
-        facts.append(("within", report.within))
-    if report.polishing:
-        facts.append(("poses", report.polishing))
-    if report.points:  # there are none where only maps were asked for
-        where = f"{report.tiles} tiles in {workspace.tiles_dir}" if report.tiles else str(workspace.fused_path)
-        facts.append(("cloud", f"{report.points:,} points in {where}"))
-    if any(report.reused.values()):
-        kept = ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
-        facts.append(("up to date", kept))
-    times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
-    facts.append(("seconds", f"{report.total_seconds:.1f} ({times})"))
-    facts.append(("peak memory", f"{report.peak_memory / 2**30:.2f} GiB"))
-    if workspace.page_path.is_file():
-        facts.append(
-            ("look at", f"{workspace.page_path}, in a browser: colmap_sph view {shell_word(str(workspace.root))}")
-        )
-    terminal.facts(facts)
+    terminal.facts(list(_facts(report, workspace)))
     images = by_originals(report.skipped_images, report.views)
     for what, skipped in (("image", images), ("pair", report.skipped_pairs)):
         _print_causes(skipped, f"{what} skipped:", terminal)
     _print_causes(by_originals(report.incomplete, report.views), "incomplete:", terminal)
-    if report.imprecision:
-        terminal.say(report.imprecision, label="imprecise:", style="yellow")
-    if report.still:
-        terminal.say(report.still, label="ignored:", style="yellow")
-    if report.doubts:
-        terminal.say(report.doubts, label="disagreement:", style="yellow")
-    if report.advice:
-        terminal.say(report.advice, label="few points:", style="yellow")
+    for label, text in (
+        ("imprecise:", report.imprecision),
+        ("ignored:", report.still),
+        ("disagreement:", report.doubts),
+        ("few points:", report.advice),
+    ):
+        if text:
+            terminal.say(text, label=label, style="yellow")
+
+
+def _facts(report: RunReport, workspace: Workspace) -> Iterator[tuple[str, str]]:
+    """What a run did, with the names by which the summary calls it."""
+    mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
+    yield "images", f"{report.images} with depth maps, mean coverage {mean:.1%}"
+    if report.originals:
+        mean = sum(report.originals.values()) / len(report.originals)
+        yield "originals", f"{len(report.originals)} of which these are views, mean coverage {mean:.1%}"
+    if report.region is not None:
+        left = f"; {len(report.out_of_region)} left out that see too little of it" if report.out_of_region else ""
+        yield "region", f"in {len(report.coverage)} images, of whose pixels in it coverage is{left}"
+    if report.drawn_region:
+        yield "drawn", report.drawn_region
+    if report.stretched:
+        yield "values", report.stretched
+    yield "agreement", _agreement(report)
+    yield "pairs", f"{report.pairs} matched ({report.pair_source})"
+    if report.within:
+        yield "within", report.within
+    if report.polishing:
+        yield "poses", report.polishing
+    if report.points:  # there are none where only maps were asked for
+        where = f"{report.tiles} tiles in {workspace.tiles_dir}" if report.tiles else str(workspace.fused_path)
+        yield "cloud", f"{report.points:,} points in {where}"
+    if any(report.reused.values()):
+        yield "up to date", ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
+    times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
+    yield "seconds", f"{report.total_seconds:.1f} ({times})"
+    yield "peak memory", f"{report.peak_memory / 2**30:.2f} GiB"
+    if workspace.page_path.is_file():
+        shown = shell_word(str(workspace.root))
+        yield "look at", f"{workspace.page_path}, in a browser: colmap_sph view {shown}"
 
 
 def _print_causes(causes: Mapping[str, str], label: str, terminal: Terminal) -> None:
