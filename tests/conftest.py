@@ -2,7 +2,7 @@
 
 import os
 import shutil
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,8 +72,7 @@ def block(tmp_path_factory: pytest.TempPathFactory) -> DemoBlock:
 @pytest.fixture
 def project(block: DemoBlock, tmp_path: Path) -> Path:
     """A copy of the block's images and model, to do with as a test likes."""
-    shutil.copytree(block.images_dir, tmp_path / "images")
-    shutil.copytree(block.root / "sparse", tmp_path / "sparse")
+    copy_block(block, tmp_path)
     return tmp_path
 
 
@@ -92,7 +91,15 @@ def finished(block: DemoBlock, tmp_path_factory: pytest.TempPathFactory) -> Fini
     return FinishedRun(dense, colmap_sph.run(block.sparse_dir, output=dense))
 
 
-def keep_images(project: Path, names: list[str]) -> None:
+def copy_block(block: DemoBlock, project: Path, names: Sequence[str] | None = None) -> None:
+    """Copy a block's images and model; where `names` are given, only these images stay registered."""
+    shutil.copytree(block.images_dir, project / "images")
+    shutil.copytree(block.root / "sparse", project / "sparse")
+    if names is not None:
+        keep_images(project, names)
+
+
+def keep_images(project: Path, names: Sequence[str]) -> None:
     """Leave only images `names` registered in a project's model."""
     model = pycolmap.Reconstruction(project / "sparse" / "0")
     for image_id in list(model.reg_image_ids()):

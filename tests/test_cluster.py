@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import keep_images
+from conftest import copy_block, keep_images
 from distributed import LocalCluster
 
 import colmap_sph
@@ -64,9 +63,7 @@ class Whole:
 def whole(block: DemoBlock, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     """Six images of the block; not to be changed."""
     folder = tmp_path_factory.mktemp("whole")
-    shutil.copytree(block.images_dir, folder / "images")
-    shutil.copytree(block.root / "sparse", folder / "sparse")
-    keep_images(folder, MORE_IMAGES)
+    copy_block(block, folder, MORE_IMAGES)
     model, dense = folder / "sparse/0", folder / "dense"
     return Whole(model, dense, colmap_sph.run(model, output=dense))
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from conftest import SCRIPTS, keep_images
+from conftest import SCRIPTS, copy_block, keep_images
 from projects import render_four_images
 
 from colmap_sph.app import cli
@@ -248,9 +248,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 def uninterrupted(block, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Finished workspace of four images."""
     project = tmp_path_factory.mktemp("uninterrupted")
-    shutil.copytree(block.images_dir, project / "images")
-    shutil.copytree(block.root / "sparse", project / "sparse")
-    keep_images(project, NAMES)
+    copy_block(block, project, NAMES)
     complete("--model", project / "sparse/0")
     return project / "dense"
 

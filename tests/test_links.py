@@ -6,7 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from conftest import keep_images
+from conftest import copy_block
 from projects import read_picture
 
 from colmap_sph.app import cli
@@ -20,9 +20,7 @@ FAST = ["--threads", "2", "--num-pairs", "2"]
 def made(block, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project of three images with its finished workspace; not to be changed."""
     root = tmp_path_factory.mktemp("made")
-    shutil.copytree(block.images_dir, root / "images")
-    shutil.copytree(block.root / "sparse", root / "sparse")
-    keep_images(root, IMAGES)
+    copy_block(block, root, IMAGES)
     assert cli.main(["run", "--model", str(root / "sparse/0"), *FAST]) == 0
     return root
 

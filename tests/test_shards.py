@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from conftest import keep_images
+from conftest import copy_block
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -52,9 +52,7 @@ class Whole:
 def whole(block: DemoBlock, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     """Five images of the block; not to be changed."""
     folder = tmp_path_factory.mktemp("whole")
-    shutil.copytree(block.images_dir, folder / "images")
-    shutil.copytree(block.root / "sparse", folder / "sparse")
-    keep_images(folder, IMAGES)
+    copy_block(block, folder, IMAGES)
     colmap_sph.run(folder / "sparse/0", output=folder / "dense", options=OPTIONS)
     return Whole(folder / "sparse/0", folder / "dense")
 
