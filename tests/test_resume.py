@@ -1,5 +1,6 @@
 """A second run redoes what is missing or would differ, nothing else; damage and failures cost what they hit."""
 
+import errno
 import json
 import os
 import pkgutil
@@ -22,6 +23,7 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
 from colmap_sph.pipeline.report import RunReport, Silent
+from colmap_sph.project import files
 from colmap_sph.project.claim import claimed
 from colmap_sph.project.files import remove as remove_path
 from colmap_sph.project.project import Project
@@ -422,6 +424,26 @@ DAMAGED = {
     "record of maps": ("colmap_sph/state/*.geometric.json", {"confirm depth": 1}),
     "record of the cloud": ("colmap_sph/cloud.json", {"fuse": 1}),
 }
+
+
+def test_a_marker_that_the_system_refuses_is_not_damaged(
+    finished: Finished, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To start afresh, as after damage, would cost all that is there."""
+    marker = Workspace(finished.dense).marker_path
+    real = files.open_descriptor
+
+    def refuse(path: Path, flags: int, *, follow: bool = True) -> int:
+        if path == marker:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, flags, follow=follow)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "open_descriptor", refuse)
+        for overwrite in (False, True):
+            with pytest.raises(InputError, match=r"undistortion\.json cannot be read \(Permission denied\)"):
+                colmap_sph.run(finished.project / "sparse/0", options=OPTIONS, overwrite=overwrite)
+    assert finished.rerun().made == NOTHING
 
 
 @pytest.mark.parametrize("damage", [cut, empty, remove, garble])
