@@ -105,8 +105,12 @@ def reason_of(error: BaseException | None) -> str:
 
 def unwritable(path: object, error: OSError | RuntimeError) -> OutputError:
     """The error of a file that cannot be written, with what may help."""
-    is_folder = isinstance(error, IsADirectoryError)
-    remedy = "remove the folder, the file goes there" if is_folder else "check space and permissions"
+    if isinstance(error, IsADirectoryError):
+        remedy = "remove the folder, the file goes there"
+    elif isinstance(error, FileNotFoundError):
+        remedy = "its folder is not there, or not any more: leave it in place while the program is at work"
+    else:
+        remedy = "check space and permissions"
     return OutputError(f"{path} cannot be written ({reason_of(error)}); {remedy}.")
 
 

@@ -19,7 +19,7 @@ from projects import render_four_images
 from colmap_sph.app import cli
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
-STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143)]
+STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
 
 
 def start(*arguments: object) -> "subprocess.Popen[str]":
@@ -145,7 +145,7 @@ def test_stages_of_file_operations(scripts_on_path: None) -> None:
     [
         ("colmap_sph/pairs/*/*.sph", *STOPS[0]),
         ("colmap_sph/photometric/*.sph", *STOPS[1]),
-        ("stereo/depth_maps/*.geometric.bin", *STOPS[0]),
+        ("stereo/depth_maps/*.geometric.bin", *STOPS[2]),
     ],
 )
 def test_signals_stop_a_run_which_then_goes_on(

@@ -452,8 +452,8 @@ def test_a_system_that_says_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_signals_of_windows(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert processes.ENDING == (signal.SIGINT, signal.SIGTERM)
-    assert [processes.exit_code_of(number) for number in processes.ENDING] == [130, 143]
+    assert processes.ENDING == (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    assert [processes.exit_code_of(number) for number in processes.ENDING] == [130, 143, 129]
     monkeypatch.setattr(processes, "_BREAK", 21)
     assert processes.exit_code_of(21) == 143
     monkeypatch.delattr(signal, "pthread_sigmask")

@@ -1,6 +1,8 @@
 """A second run redoes what is missing or would differ, nothing else; damage and failures cost what they hit."""
 
+import errno
 import json
+import os
 import pkgutil
 import shutil
 from collections.abc import Callable, Iterator
@@ -20,7 +22,8 @@ from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
-from colmap_sph.pipeline.report import RunReport
+from colmap_sph.pipeline.report import RunReport, Silent
+from colmap_sph.project import files
 from colmap_sph.project.claim import claimed
 from colmap_sph.project.files import remove as remove_path
 from colmap_sph.project.project import Project
@@ -239,6 +242,97 @@ def test_a_changed_image_redoes_its_pairs(finished: Finished) -> None:
     assert counted(files) == expected_files(pairs=3, votes=4, geometric=4, cloud=True)
 
 
+@pytest.mark.parametrize(
+    ("place", "stage"),
+    [
+        ("images", "undistort"),
+        ("dense/images", "match pairs"),
+        ("dense/images", "confirm depth"),
+        ("dense/images", "fuse"),
+    ],
+)
+def test_an_image_that_changes_during_a_run(place: str, stage: str, pristine: Finished, tmp_path: Path) -> None:
+    """It is told; and with the former image the next run makes what an undisturbed one makes, and that once."""
+    shutil.copytree(pristine.project, tmp_path / "project", ignore=shutil.ignore_patterns("dense"))
+    image = tmp_path / "project" / place / NAMES[0]
+    kept = tmp_path / "kept"
+
+    class Exchange(Silent):
+        def start(self, stage_begun: str, total: int) -> None:
+            if stage_begun == stage:
+                shutil.copyfile(image, kept)
+                shutil.copyfile(image.with_name(NAMES[1]), image)
+
+    report = colmap_sph.run(tmp_path / "project/sparse/0", options=OPTIONS, progress=Exchange())
+    assert report.incomplete[NAMES[0]] == f"{image} was changed while the run was at work; run again"
+    shutil.copyfile(kept, image)
+    again = Finished(tmp_path / "project", report)
+    assert again.rerun().incomplete == {}
+    assert {name: content for name, (_, content) in results(again.dense).items() if "colmap_sph" not in name} == {
+        name: content for name, (_, content) in results(pristine.dense).items() if "colmap_sph" not in name
+    }
+    assert again.rerun().made == NOTHING
+
+
+def test_an_image_that_changes_before_a_run_fails(pristine: Finished, tmp_path: Path) -> None:
+    shutil.copytree(pristine.project, tmp_path / "project", ignore=shutil.ignore_patterns("dense"))
+    image = tmp_path / "project/dense/images" / NAMES[0]
+    former: list[bytes] = []
+
+    class Exchange(Silent):
+        def start(self, stage: str, total: int) -> None:
+            if stage == "match pairs":
+                former.append(image.read_bytes())
+                shutil.copyfile(image.with_name(NAMES[1]), image)
+            if stage == "confirm depth":
+                raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        colmap_sph.run(tmp_path / "project/sparse/0", options=OPTIONS, progress=Exchange())
+    image.write_bytes(former[0])
+    again = Finished(tmp_path / "project", RunReport())
+    assert again.rerun().made["match pairs"] == 3
+    assert Workspace(again.dense).fused_path.read_bytes() == Workspace(pristine.dense).fused_path.read_bytes()
+
+
+def test_a_mask_that_changes_during_a_run(pristine: Finished, tmp_path: Path) -> None:
+    """It is told; and with the former mask the next run makes what an undisturbed one makes."""
+    clouds = []
+    for disturbed in (False, True):
+        dense = tmp_path / str(disturbed) / "dense"
+        shutil.copytree(pristine.dense, dense)
+        mask = dense.parent / "masks" / f"{NAMES[0]}.png"
+        mask.parent.mkdir()
+        half = np.full((HEIGHT, WIDTH), 255, np.uint8)
+        half[:, : WIDTH // 2] = 0
+        cv2.imwrite(str(mask), half)
+
+        class Exchange(Silent):
+            def start(self, stage: str, total: int, mask: Path = mask, half: np.ndarray = half) -> None:
+                if stage == "match pairs":
+                    cv2.imwrite(str(mask), half[:, ::-1])
+
+        def rerun(progress: Silent | None, dense: Path = dense, masks: Path = mask.parent) -> RunReport:
+            return colmap_sph.run(workspace=dense, masks=masks, options=OPTIONS, progress=progress)
+
+        if disturbed:
+            told = rerun(Exchange()).incomplete
+            assert told == {NAMES[0]: f"{mask} was changed while the run was at work; run again"}
+            cv2.imwrite(str(mask), half)
+        assert rerun(None).incomplete == {}
+        clouds.append(Workspace(dense).fused_path.read_bytes())
+    assert clouds[0] == clouds[1] != Workspace(pristine.dense).fused_path.read_bytes()
+
+
+def test_an_image_that_is_only_touched_during_a_run(finished: Finished) -> None:
+    class Touch(Silent):
+        def start(self, stage: str, total: int) -> None:
+            os.utime(finished.dense / "images" / NAMES[0], (5, 5))
+
+    report = colmap_sph.run(finished.project / "sparse/0", options=OPTIONS, progress=Touch())
+    assert (report.incomplete, report.made) == ({}, NOTHING)
+
+
 def test_a_changed_mask_redoes_the_pairs_of_its_image(finished: Finished) -> None:
     """As a changed image does; and without it everything is as before."""
     masks = finished.project / "masks"
@@ -330,6 +424,26 @@ DAMAGED = {
     "record of maps": ("colmap_sph/state/*.geometric.json", {"confirm depth": 1}),
     "record of the cloud": ("colmap_sph/cloud.json", {"fuse": 1}),
 }
+
+
+def test_a_marker_that_the_system_refuses_is_not_damaged(
+    finished: Finished, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To start afresh, as after damage, would cost all that is there."""
+    marker = Workspace(finished.dense).marker_path
+    real = files.open_descriptor
+
+    def refuse(path: Path, flags: int, *, follow: bool = True) -> int:
+        if path == marker:
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, flags, follow=follow)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "open_descriptor", refuse)
+        for overwrite in (False, True):
+            with pytest.raises(InputError, match=r"undistortion\.json cannot be read \(Permission denied\)"):
+                colmap_sph.run(finished.project / "sparse/0", options=OPTIONS, overwrite=overwrite)
+    assert finished.rerun().made == NOTHING
 
 
 @pytest.mark.parametrize("damage", [cut, empty, remove, garble])

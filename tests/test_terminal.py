@@ -14,7 +14,7 @@ import pytest
 from conftest import keep_images
 from rich.cells import cell_len
 
-from colmap_sph.app import cli, display
+from colmap_sph.app import cli, display, log_file, run_command
 from colmap_sph.app.display import Display
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.terminal import Terminal, shortened, warnings_shown, wrapped
@@ -105,6 +105,24 @@ def test_the_log_has_a_line_for_each_record(name: str, tmp_path: Path, caplog: p
 def log_in(workspace: Workspace) -> None:
     with workspace_log(workspace, "header"):
         logging.getLogger("colmap_sph.test").warning("words")
+
+
+def test_a_disk_that_is_full_before_the_log_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """That is told by a record, which itself is for the log; and told once."""
+
+    def refuse(_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(log_file._LogFile, "flush", refuse, raising=False)
+    workspace = Workspace(tmp_path)
+    workspace.state_dir.mkdir()
+    workspace.sparse_dir.mkdir()
+    log_in(workspace)
+    said = [record.getMessage() for record in caplog.records]
+    told = f"{workspace.log_path} cannot be written (No space left on device); the log is incomplete"
+    assert sorted(said) == sorted([told, "words"])
 
 
 def test_a_log_that_is_a_link_is_not_followed(tmp_path: Path) -> None:

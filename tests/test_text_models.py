@@ -1,6 +1,7 @@
 """Text models: COLMAP's own numbers for what it reads, and everything that it would lose without a word."""
 
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from projects import prepare
 from test_undistortion import NAMES, make_project
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, OutputError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
@@ -52,6 +53,15 @@ def test_images_without_second_lines_are_all_read(text: Path, caplog: pytest.Log
     assert len(pycolmap.Reconstruction(text).images) == 2  # what is guarded against
     assert poses(load_model(text)) == truth
     assert "images.txt has no second line for 4 of its 4 images" in caplog.text
+
+
+def test_no_place_for_temporary_files(text: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What COLMAP reads wrongly is given to it as a copy; no place for that is no fault of the model."""
+    without_points(text)
+    change(text / "images.txt", lambda lines: [line for line in lines if line])
+    monkeypatch.setattr(tempfile, "tempdir", str(text / "none"))
+    with pytest.raises(OutputError, match=r"sparse/0 .* cannot be written \(No such file .*\); .* TMPDIR"):
+        load_model(text)
 
 
 @pytest.mark.parametrize("end", ["", "\n"])

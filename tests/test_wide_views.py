@@ -12,9 +12,10 @@ from projects import prepare
 
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError
+from colmap_sph.project.files import remove_temporary_files
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
-from colmap_sph.project.wide import layout
+from colmap_sph.project.wide import layout, range_maps
 from colmap_sph.project.wide.cuts import cuts_of
 from colmap_sph.project.wide.layout import faces_of
 from colmap_sph.project.wide.projection import Lens, camera_rays
@@ -462,6 +463,23 @@ def test_range_is_the_mean_of_the_views_that_agree() -> None:
     error = np.abs(distance.ravel() - expected)
     assert (error < 1e-3).mean() > 0.97  # but for the outermost half of a pixel of a view
     assert np.einsum("ni,ni->n", normals.reshape(-1, 3), rays).max() < -0.999
+
+
+def test_a_kill_while_a_range_map_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next run removes what it left: such maps are large."""
+    killed = tmp_path / "killed"
+
+    def kill(path: Path, **_: object) -> None:
+        shutil.copytree(path.parent, killed)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(range_maps, "atomic_file", kill)
+    maps = (np.ones((4, 6), np.float32), np.ones((4, 6, 3), np.float32))
+    with pytest.raises(KeyboardInterrupt):
+        range_maps.write_range_map(tmp_path / "maps" / "a.exr", *maps)
+    assert [path.name for path in killed.rglob("*.exr")] == ["made.exr"]
+    remove_temporary_files(killed)
+    assert list(killed.iterdir()) == []
 
 
 @pytest.mark.parametrize("courtyard", ["fisheye", "panorama"], indirect=True)

@@ -34,7 +34,7 @@ for model in "${models[@]}"; do
     { "$program" run --model "$model" --output "$dense" "$@" 2>&1 >&3 | tee -i "$scratch/messages" >&2; } 3>&1
     code=${PIPESTATUS[0]}
     case $code in
-        130 | 143) echo "interrupted at $model; the same command goes on there" >&2; exit "$code" ;;
+        129 | 130 | 143) echo "interrupted at $model; the same command goes on there" >&2; exit "$code" ;;
     esac
     reason=$(sed -n 's/^error: //p' "$scratch/messages" | tail -n 1)
     printf '%s\0' "$model" "$dense" "$code" "$reason" >>"$scratch/results"

@@ -1,4 +1,4 @@
-"""Ctrl-C, SIGTERM and Windows' SIGBREAK end the program within two seconds, whatever it is at.
+"""Ctrl-C, SIGTERM and the end of the terminal end the program within two seconds, whatever it is at.
 
 Python tells the main thread of a signal only between two steps of Python code, and a worker cannot be stopped in
 the middle of a kernel. As all files appear only when they are complete, the process may be ended at any moment.

@@ -83,6 +83,9 @@ class _WorkspaceLog(logging.Handler):
         """Write a record, or keep it for later."""
         if self._file is None and self._workspace.state_dir.is_dir() and self._workspace.sparse_dir.is_dir():
             self._file = self._open()
+            # Not before: where the disk is full, that is told by a record, which comes here again.
+            for each in self._early:
+                self._file.emit(each)
         if self._file is None:
             self._early.append(record)
         else:
@@ -94,12 +97,9 @@ class _WorkspaceLog(logging.Handler):
         if path.exists() and not path.is_file():
             raise OutputError(f"{path} cannot be written: it is not a regular file; remove it.")
         try:
-            file = _LogFile(path)
+            return _LogFile(path)
         except OSError as error:
             raise unwritable(path, error) from error
-        for record in self._early:
-            file.emit(record)
-        return file
 
     def flush(self) -> None:
         """Write what is buffered."""

@@ -66,21 +66,30 @@ class Keys:
         self._options = options
         self._images = images or {}
         self._programs = program_digests()
-        self._masks: dict[str, str | None] = {}
+        self._masks: dict[Path, str | None] = {}
         self._cameras: dict[View, str] = {}
         self._matching = digest(options.matching)
 
     def of(self, options: RunOptions) -> "Keys":
         """The same for a run with other options."""
-        return Keys(self._workspace, options, self._images, fresh=self.fresh)
+        keys = Keys(self._workspace, options, self._images, fresh=self.fresh)
+        keys._masks = self._masks
+        return keys
 
     def _image(self, name: str) -> str | None:
         return self._images.get(name)
 
     def _mask(self, name: str) -> str | None:
-        if name not in self._masks:  # by two threads at a time, at worst
-            self._masks[name] = None if self.fresh else _digest_if_there(self._workspace.mask_path(name))
-        return self._masks[name]
+        return self._mask_digest(self._workspace.mask_path(name))
+
+    def _mask_digest(self, path: Path) -> str | None:
+        if path not in self._masks:  # by two threads at a time, at worst
+            self._masks[path] = None if self.fresh else _digest_if_there(path)
+        return self._masks[path]
+
+    def is_mask_changed(self, path: Path) -> bool:
+        """Whether a mask is not as it was when a key was asked for."""
+        return path in self._masks and self._masks[path] != _digest_if_there(path)
 
     def _camera(self, view: View) -> str:
         """Digest of all that its camera is: of each there are many pairs."""
@@ -122,7 +131,7 @@ class Keys:
         mask : Path or None
             Of the original, where there is one.
         """
-        mask_digest = None if mask is None or self.fresh else file_digest(mask)
+        mask_digest = None if mask is None else self._mask_digest(mask)
         size = self._options.undistortion.max_image_size
         return self._key("undistorted", image, camera, values, mask_digest, size)
 

@@ -16,7 +16,7 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts, ImagePlaces
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts, ImagePlaces, tell_changed
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, keys_of
 from colmap_sph.pipeline.stages.undistort import UndistortStage
@@ -115,6 +115,7 @@ class Preparation:
         self.workspace = Workspace(project.root)
         self._originals = read_originals(project, options.undistortion)
         self._originals.check_outside(self.workspace)
+        self._places = ImagePlaces("originals", self._originals.model_dir, self._originals.image_dir)
         self.options = options
         self._report = report or RunReport()
         self._overwrite = overwrite
@@ -174,7 +175,11 @@ class Preparation:
     def _make(self, executor: "Executor") -> None:
         images = self.check(executor)
         self.begin(images)
-        self.finish(self.undistort(executor, images))
+        try:
+            undistorted = self.undistort(executor, images)
+        finally:
+            tell_changed(self._context, self._places, images, self._originals.mask_of)
+        self.finish(undistorted)
 
     def check(self, executor: "Executor") -> dict[str, Result]:
         """Go through the first stage: check the original images; return the results of the good ones."""
@@ -182,8 +187,7 @@ class Preparation:
         cameras = cameras_of_images(originals.model)
         names = sorted(set(map(originals.cuts.original, self.names)))
         sizes = {name: (cameras[name].width, cameras[name].height) for name in names if name in cameras}
-        places = ImagePlaces("originals", originals.model_dir, originals.image_dir)
-        return executor(CheckStage(self._context, sizes, places, verify=self._verify or self._overwrite))
+        return executor(CheckStage(self._context, sizes, self._places, verify=self._verify or self._overwrite))
 
     def begin(self, images: Collection[str]) -> None:
         """Declare the workspace this program's, and with `overwrite` remove what is as this program made it."""

@@ -17,6 +17,7 @@ from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.forecast.sizes import with_affordable_size
 from colmap_sph.pipeline.forecast.time_limit import TimeLimit, time_limit
 from colmap_sph.pipeline.forecast.within import Within, widest
+from colmap_sph.pipeline.input.good_images import telling_changed
 from colmap_sph.pipeline.input.prepared import prepare
 from colmap_sph.pipeline.input.start import Request, start
 from colmap_sph.pipeline.keys import program_digests
@@ -194,13 +195,14 @@ def reconstruct(
     with room_for_workers():
         context, selection = start(workspace, options, executor, request)
         misplaced = judge_reprojection(report, context.scene)
-        if limit is None:
-            request.progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
-            go_through_stages(context, selection.unique_pairs(), executor, until=until)
-        else:
-            context = go_through_stages_within(
-                Within(limit, context, selection, goes_on=not request.overwrite), executor
-            )
+        with telling_changed(context):
+            if limit is None:
+                request.progress.foresee(foreseen_stages(context, selection.unique_pairs(), until=until))
+                go_through_stages(context, selection.unique_pairs(), executor, until=until)
+            else:
+                context = go_through_stages_within(
+                    Within(limit, context, selection, goes_on=not request.overwrite), executor
+                )
         judge_agreement(report, misplaced=misplaced, in_sight=share_in_sight(context.scene))
     write_report(context)
     keep_or_make_page(context)

@@ -12,9 +12,10 @@ from contextlib import contextmanager
 from typing import Any
 
 _IS_WINDOWS = sys.platform == "win32"
-# Windows sends no SIGTERM. Ctrl-Break, the end of its window and of the session come as SIGBREAK.
+# Windows sends no SIGTERM. Ctrl-Break and the end of its window or session come as SIGBREAK; others have SIGHUP.
 _BREAK: int | None = getattr(signal, "SIGBREAK", None)
-ENDING: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, *([] if _BREAK is None else [_BREAK]))
+_OF_SYSTEM = [getattr(signal, name) for name in ("SIGHUP", "SIGBREAK") if hasattr(signal, name)]
+ENDING: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, *_OF_SYSTEM)
 """Numbers of the signals that ask for the end."""
 
 

@@ -30,6 +30,8 @@ from colmap_sph.platforms.locks import holding
 # that a thread writes at a time; processes of other machines may have the same number. Earlier versions did not
 # name the machine.
 _TEMPORARY_NAME = ".{process}-{thread}-{depth}.tmp"
+SCRATCH_ENDING = "-0-0.tmp"
+"""Of a scratch folder's name, which begins with a dot, so that `remove_temporary_files` takes it for one."""
 _TEMPORARY = re.compile(r"\.([\w-]{1,48}-)?\d+-\d+\.tmp")
 _open_files = threading.local()
 _check_before_writing: ContextVar[Callable[[], None] | None] = ContextVar("check_before_writing", default=None)
@@ -211,11 +213,11 @@ def folder_locked(folder: Path) -> Iterator[None]:
 
 
 def remove_temporary_files(folder: Path) -> None:
-    """Remove what `atomic_file` left half-written below a folder, in a process that was killed."""
-    for path in folder.rglob(".*.tmp"):
+    """Remove what `atomic_file` left half-written below a folder, in a process that was killed; folders, too."""
+    for path in list(folder.rglob(".*.tmp")):
         if _TEMPORARY.fullmatch(path.name):
-            with suppress(OSError):  # nothing takes it for the file itself
-                path.unlink()
+            with suppress(OutputError):  # nothing takes it for the file itself
+                remove(path)
 
 
 def remove(path: Path) -> None:

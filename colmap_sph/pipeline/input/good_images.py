@@ -1,7 +1,8 @@
 """The undistorted images that can be worked with, and what they hold."""
 
 import logging
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from statistics import mean
 from typing import TYPE_CHECKING
@@ -10,8 +11,9 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.self_check import misplaced_views, refuse_cameras
-from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of
+from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of, tell_changed
 from colmap_sph.pipeline.stages.stage import keys_of
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.rectification import sampling_of
 
 if TYPE_CHECKING:
@@ -48,7 +50,7 @@ def with_good_images(
     there = [view for view in context.scene.views if view.name not in to_come]
     sizes = {view.name: view.file_size for view in there}
     worked_at = {view.name: (view.width, view.height) for view in there}
-    places = ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
+    places = _places(workspace)
     checked = executor(CheckStage(context, sizes, places, worked_at, verify=verify)) if there else {}
     images = keys_of(checked)
     details = {
@@ -60,6 +62,20 @@ def with_good_images(
     keys = Keys(workspace, context.options, images, fresh=context.keys.fresh)
     good = replace(context, scene=context.scene.only({*images, *to_come}), keys=keys, details=details)
     return with_still_pixels(good, images)
+
+
+@contextmanager
+def telling_changed(context: Context) -> Iterator[None]:
+    """Report images that were changed while something was made of them, however that ends; see `tell_changed`."""
+    try:
+        yield
+    finally:
+        workspace = context.workspace
+        tell_changed(context, _places(workspace), context.scene.index_of, workspace.mask_path)
+
+
+def _places(workspace: Workspace) -> ImagePlaces:
+    return ImagePlaces("images", workspace.sparse_dir, workspace.images_dir)
 
 
 def without_misplaced(context: Context) -> Context:

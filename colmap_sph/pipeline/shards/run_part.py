@@ -17,6 +17,7 @@ from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.engine.lag import PATIENCE
 from colmap_sph.pipeline.execute import execute, made_by_threads, tell_counts
 from colmap_sph.pipeline.forecast.foresight import estimate
+from colmap_sph.pipeline.input.good_images import telling_changed
 from colmap_sph.pipeline.input.prepared import find_prepared, prepare
 from colmap_sph.pipeline.input.start import Request, start
 from colmap_sph.pipeline.keys import program_digests
@@ -246,7 +247,7 @@ def _make(stage: RememberingStage[Any, Any], part: Part, what: str) -> PartRepor
     items = part.of(stage.items)
     before = {**report.skipped_images, **report.incomplete}
     context.progress.foresee([estimate(stage, items=items)])
-    with stage.opened(), context.stage(stage.name, len(items)):
+    with telling_changed(context), stage.opened(), context.stage(stage.name, len(items)):
         results = made_by_threads(stage, items)
         stage.remember(results)
     tell_counts(stage, results)

@@ -4,7 +4,8 @@ A file whose size, times and place on the disk are as they were is not read agai
 its digest, and decoded only if that is new.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -13,7 +14,7 @@ import msgspec
 import xxhash
 
 from colmap_sph.errors import InputError
-from colmap_sph.pipeline.digests import file_digest
+from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.project.files import atomic_file, make_dir
@@ -71,7 +72,10 @@ def check_image(task: ImageFile) -> ImageFacts:
 
 @dataclass(frozen=True)
 class Known:
-    """Of an image that was found good: its size, the digest of its content, when that was read, and its facts."""
+    """Of an image that was found good: its size, the digest of its content, when that was read, and its facts.
+
+    `doubt` is empty but for an image that was changed while a run worked with it, see `tell_changed`.
+    """
 
     size: Size
     digest: str
@@ -79,6 +83,12 @@ class Known:
     sample: ValueSample | None = None
     detail: float | None = None
     detail_size: Size | None = None
+    doubt: str = ""
+
+    @property
+    def key(self) -> str:
+        """What stands for its content in the keys of all that is made of it."""
+        return digest(self.digest, self.doubt) if self.doubt else self.digest
 
 
 class KnownFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -139,6 +149,10 @@ class ImagePlaces:
         """File of an image; need not exist."""
         return self.folder / checked_name(name)
 
+    def known_file(self, context: "Context") -> Path:
+        """File of what is known of them from run to run."""
+        return context.workspace.state_dir / f"{self.what}.json"
+
 
 class CheckStage(Stage[str, ImageFile]):
     """Checks images, and measures the detail of undistorted ones. Its keys are the digests of their contents.
@@ -172,7 +186,7 @@ class CheckStage(Stage[str, ImageFile]):
         self._sizes = sizes
         self._places = places
         self._bad: dict[str, str] = {}
-        self._file = context.workspace.state_dir / f"{places.what}.json"
+        self._file = places.known_file(context)
         self._key = context.keys.known_images()
         self._known = {} if context.keys.fresh or verify else read_known(self._file, self._key)
         self._seen: dict[str, Known] = {}
@@ -191,13 +205,14 @@ class CheckStage(Stage[str, ImageFile]):
         stamp = _stamp_of(image.path)
         known = self._known.get(item)
         is_read = known is not None and known.stamp == stamp
-        digest = known.digest if known is not None and is_read else file_digest(image.path)
-        self._seen[item] = Known(image.size, digest, stamp, detail_size=image.detail_size)
+        content = known.digest if known is not None and is_read else file_digest(image.path)
+        doubt = "" if known is None else known.doubt
+        self._seen[item] = seen = Known(image.size, content, stamp, detail_size=image.detail_size, doubt=doubt)
         facts = None
-        wanted = (digest, image.size, image.detail_size)
+        wanted = (content, image.size, image.detail_size)
         if known is not None and (known.digest, known.size, known.detail_size) == wanted:
             facts = ImageFacts(sample=known.sample, detail=known.detail)
-        return Job(digest, facts, self._cost(image), image)
+        return Job(seen.key, facts, self._cost(image), image)
 
     def _cost(self, image: ImageFile) -> Cost:
         pixels = image.size[0] * image.size[1]
@@ -221,8 +236,10 @@ class CheckStage(Stage[str, ImageFile]):
             for name, result in results.items()
             if isinstance(result.facts, ImageFacts)
         }
-        if good != self._known:
-            write_known(self._file, self._key, good)
+        # A doubt stays, also where an image is bad today, or not among those that are asked for.
+        known = {name: each for name, each in self._known.items() if each.doubt} | good
+        if known != self._known:
+            write_known(self._file, self._key, known)
 
     def tell_problems(self) -> None:
         """Tell what is wrong with bad images; `InputError` where there is no other."""
@@ -247,6 +264,43 @@ def details_of(results: Mapping[str, Result]) -> dict[str, float]:
         for name, result in results.items()
         if isinstance(result.facts, ImageFacts) and result.facts.detail is not None
     }
+
+
+def tell_changed(
+    context: "Context", places: ImagePlaces, names: Collection[str], mask_of: Callable[[str], Path | None]
+) -> None:
+    """Report images that are not as they were checked, or whose masks are not: either may be in what was made.
+
+    Their keys change, so that the next run makes all of it anew, also where the former content is there again.
+
+    Parameters
+    ----------
+    context : Context
+    places : ImagePlaces
+    names : collection of str
+        Images that were found good. One that is gone was there when it was read, or was reported then.
+    mask_of : callable
+        Name → where its mask is, or would be.
+    """
+    file, key = places.known_file(context), context.keys.known_images()
+    known = read_known(file, key)
+    changed = {}
+    for name in sorted(known.keys() & {*names}):
+        image, mask = places.path(name), mask_of(name)
+        with suppress(OSError, InputError):
+            if _is_changed(image, known[name]):
+                changed[name] = image
+            elif mask is not None and context.keys.is_mask_changed(mask):
+                changed[name] = mask
+    if changed:
+        doubted = {name: replace(known[name], doubt=digest(known[name].doubt, "doubt")) for name in changed}
+        write_known(file, key, known | doubted)
+    for name, path in changed.items():
+        context.leave_incomplete(name, f"{path} was changed while the run was at work; run again")
+
+
+def _is_changed(path: Path, known: Known) -> bool:
+    return _stamp_of(path) != known.stamp and file_digest(path) != known.digest
 
 
 def _stamp_of(path: Path) -> tuple[int, ...]:

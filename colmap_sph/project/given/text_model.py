@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from colmap_sph.errors import InputError, reason_of
+from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.files import open_regular
 from colmap_sph.project.given.poses import normalize_rotations
 
@@ -117,7 +117,7 @@ def read_text_model(files: list[Path]) -> pycolmap.Reconstruction:
         if is_whole and not any(_has_mark(path) for path in files):
             model.read_text(files[0].parent)
         else:
-            _read_mended(model, lines, images)
+            _read_mended(model, lines, images, files[0].parent)
     except (IndexError, KeyError):
         _check_tracks(lines["points3D.txt"], images)
         raise
@@ -233,7 +233,9 @@ def _pairs_of_lines(lines: list[_Line]) -> Iterator[tuple[_Line, re.Match[bytes]
             raise lines[place].refusal(f"this is not {_FEATURES_LINE}")
 
 
-def _read_mended(model: pycolmap.Reconstruction, lines: dict[str, list[_Line]], images: list[_Image]) -> None:
+def _read_mended(
+    model: pycolmap.Reconstruction, lines: dict[str, list[_Line]], images: list[_Image], original: Path
+) -> None:
     """Let COLMAP read a copy of the files that it reads rightly."""
     pairs = [
         (b"%d%b %d %d" % (image.image_id, image.pose, image.camera_id, image.image_id), image.features)
@@ -241,10 +243,16 @@ def _read_mended(model: pycolmap.Reconstruction, lines: dict[str, list[_Line]], 
     ]
     texts = {name: [line.text for line in lines[name]] for name in lines}
     texts["images.txt"] = [text for pair in pairs for text in pair]
-    with tempfile.TemporaryDirectory() as folder:
-        for name, each in texts.items():
-            (Path(folder) / name).write_bytes(b"".join(text + b"\n" for text in each))
-        model.read_text(folder)
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            for name, each in texts.items():
+                (Path(folder) / name).write_bytes(b"".join(text + b"\n" for text in each))
+            model.read_text(folder)
+    except OSError as error:
+        raise OutputError(
+            f"A copy of the model in {original} that COLMAP reads rightly cannot be written ({reason_of(error)}); "
+            "make space where temporary files go, or name another folder by the variable TMPDIR."
+        ) from error
 
 
 def _check_tracks(lines: list[_Line], images: list[_Image]) -> None:

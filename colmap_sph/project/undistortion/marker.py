@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.platforms.files import move_into_place
-from colmap_sph.project.files import atomic_file, make_dir, remove, set_aside
+from colmap_sph.project.files import atomic_file, make_dir, open_regular, remove, set_aside
 from colmap_sph.project.pair_lists import read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, image_names, load_model
 from colmap_sph.project.state.ownership import fusion_cfg_place
@@ -145,10 +145,16 @@ def check_ours(workspace: Workspace) -> Marker | None:
     Raises
     ------
     InputError
-        The folder has none, and holds a workspace of something else.
+        The folder has none, and holds a workspace of something else; or the system does not let it be read.
     """
     found = read_marker(workspace)
     if found is None and workspace.marker_path.is_file():
+        try:
+            open_regular(workspace.marker_path).close()
+        except OSError as error:  # to begin anew would cost what is there
+            raise InputError(
+                f"{workspace.marker_path} cannot be read ({reason_of(error)}); check permissions, or run again."
+            ) from error
         return _DAMAGED
     there = [part for part in _PARTS if (workspace.root / part).exists()]
     if found is None and there:

@@ -14,7 +14,7 @@ import OpenImageIO as oiio  # noqa: N813
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError, unwritable
-from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.files import SCRATCH_ENDING, atomic_file, make_dir
 from colmap_sph.project.wide.projection import Lens, camera_rays
 
 Pixels = NDArray[np.float32]
@@ -181,7 +181,7 @@ def write_range_map(path: Path, distance: Pixels, normals: Pixels) -> str:
     image = oiio.ImageBuf(spec)
     image.set_pixels(image.roi, np.ascontiguousarray(np.dstack([distance, normals]), np.float32))
     try:
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".range-") as folder:
+        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".range-", suffix=SCRATCH_ENDING) as folder:
             made = Path(folder) / "made.exr"
             if not image.write(str(made)):
                 raise OutputError(f"{path} cannot be written ({image.geterror()}); check space and permissions.")
