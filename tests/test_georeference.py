@@ -243,11 +243,41 @@ def test_what_cannot_be_is_refused(workspace: Workspace, tmp_path: Path) -> None
         (GeoreferenceOptions(crs="EPSG:32633"), InputError, "--align"),
         (GeoreferenceOptions(crs="EPSG:32733"), InputError, "--align"),
         (GeoreferenceOptions(crs="EPSG:4978"), InputError, "--align"),
+        (GeoreferenceOptions(crs="EPSG:2056+5728"), InputError, "--align"),
+        # Feet in plan and metres in height; axes to the south and the west.
+        (GeoreferenceOptions(crs="EPSG:2263+5703"), OptionError, "one unit"),
+        (GeoreferenceOptions(crs="EPSG:5513"), OptionError, "EPSG:5514"),
     ]
     for options, kind, words in refused:
         with pytest.raises(kind, match=words):
             georeferenced(workspace, options)
         assert not workspace.georeference_path.exists()
+
+
+def test_places_far_from_their_system_are_refused(workspace: Workspace, tmp_path: Path) -> None:
+    """What lies in New York has no place in the UTM zone of Sydney, nor a site grid at its own origin in any."""
+    to_gps = pytest.importorskip("pyproj").Transformer.from_crs("EPSG:32618", "EPSG:4979")
+    degrees = np.column_stack(to_gps.transform(*(centers() + np.array([500_000, 4_500_000, 0])).T))
+    far = write_lines(tmp_path / "far.csv", "image,latitude,longitude,height", *position_lines(degrees))
+    site = write_lines(tmp_path / "site.csv", "image,x,y,z", *position_lines(on_map(centers()) - SHIFT + 1000))
+    for table, crs in ((far, "EPSG:32756"), (site, "EPSG:25832"), (site, "EPSG:25832+7837")):
+        with pytest.raises(InputError, match=rf"{table.name} the cameras are at .* check --crs"):
+            align(workspace, table, crs)
+        assert not workspace.georeference_path.exists()
+    assert align(workspace, site).crs == "" and align(workspace, far).crs == "EPSG:32618"
+
+
+def test_upright_in_a_geocentric_system_is_not_along_its_axis(
+    workspace: Workspace, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In the south images that look down look along the axis of the earth, to the north."""
+    pyproj = pytest.importorskip("pyproj")
+    to_earth = pyproj.Transformer.from_crs("EPSG:32734", "EPSG:4978", always_xy=True)
+    x, y, z = to_earth.transform(*(centers() + np.array([400_000, 5_800_000, 0])).T)
+    table = write_lines(tmp_path / "cape.csv", "image,x,y,z", *position_lines(np.column_stack([x, y, z])))
+    found = align(workspace, table, "EPSG:4978")
+    assert max(each.length for each in found.residuals) < 1e-3
+    assert "head" not in caplog.text
 
 
 def test_another_model_does_not_get_the_place_of_the_last(workspace: Workspace) -> None:
@@ -269,7 +299,8 @@ def test_what_was_said_is_kept_until_something_else_is_said(workspace: Workspace
     table = write_lines(tmp_path / "cameras.csv", "image,x,y,z", *position_lines(on_map(centers())))
     aligned = align(workspace, table, "EPSG:25832")
     assert georeferenced(workspace, GeoreferenceOptions()).scale == aligned.scale
-    assert georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25832")).scale == aligned.scale
+    for name in ("EPSG:25832", "epsg:25832"):
+        assert georeferenced(workspace, GeoreferenceOptions(crs=name)).scale == aligned.scale
     with pytest.raises(OptionError, match="align again"):
         georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25833"))
     model = pycolmap.Reconstruction(workspace.sparse_dir)
