@@ -529,7 +529,11 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
     workspace.fused_path.unlink()
     with pytest.raises(InputError, match="no fused cloud"):
         exported(workspace, tmp_path / "other", "las")
-    assert not list((tmp_path / "other").glob("*"))
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "other").mkdir()
+    with pytest.raises(InputError, match="no fused cloud"):
+        exported(workspace, tmp_path / "other", "las")
+    assert (tmp_path / "other").is_dir()  # which was there before
 
 
 def test_an_earlier_export_is_replaced_on_request(workspace: Workspace, tmp_path: Path) -> None:
