@@ -512,8 +512,9 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
         export(made, lambda _: nullcontext(), overwrite=True)
     assert (folder / "splats" / "thesis.txt").read_text() == "mine"
     assert (folder / "cloud.laz").read_text() == "mine"
-    with pytest.raises(OptionError, match="las_scale"):
-        exported(workspace, tmp_path / "other", "las", las_scale=1e-9)
+    for scale, words in ((1e-9, "too fine"), (1000.0, "no less than the whole cloud")):
+        with pytest.raises(OptionError, match=f"las_scale.*{words}"):
+            exported(workspace, tmp_path / "other", "las", las_scale=scale)
     write_far_cloud(workspace.fused_path, make_cloud(1)[0], [])
     for seen, words in (([1, 9], "more than"), ([0xFFFFFFFF, 0], "damaged"), ([2, 0], "cut off")):
         data = struct.pack("<Q", 1) + np.array(seen, "<u4").tobytes()
