@@ -15,6 +15,10 @@ from colmap_sph.products.georeference import Georeference, read_georeference, wr
 from colmap_sph.products.georeferencing import GeoreferenceOptions, georeferenced, report_lines
 from colmap_sph.project.alignment.gps import read_gps
 from colmap_sph.project.alignment.similarity import estimate_similarity
+from colmap_sph.project.wide.cuts import Cut
+from colmap_sph.project.wide.layout import Face
+from colmap_sph.project.wide.projection import Lens
+from colmap_sph.project.wide.table import write_cuts
 from colmap_sph.project.workspace import Workspace
 
 NAMES = [f"a/{number}.png" for number in range(6)]
@@ -142,6 +146,42 @@ def test_control_points_give_the_similarity(workspace: Workspace, tmp_path: Path
     found = align(workspace, table, "EPSG:25832", tmp_path / "photographs")
     np.testing.assert_allclose(found.to_map(centers()), on_map(centers()), atol=1e-4)
     assert {each.name for each in found.residuals} == set(POINTS)
+    assert max(each.pixels or 0.0 for each in found.residuals) < 1e-5
+
+
+def test_control_points_may_be_marked_in_panoramas(workspace: Workspace, tmp_path: Path) -> None:
+    """Also behind their middle, though the workspace has a view to one side of each alone."""
+    width, height = 800, 400
+    turned = Rotation.from_euler("yx", [70, 20], degrees=True).as_matrix()
+    model, originals = pycolmap.Reconstruction(), pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=90, height=90, params=[40, 40, 45, 45])
+    )
+    originals.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="EQUIRECTANGULAR", width=width, height=height, params=[width, height])
+    )
+    lines, cuts = [], {}
+    for number, center in enumerate(centers()):
+        R = Rotation.from_euler("y", 60 * number, degrees=True).as_matrix() @ LOOKING_DOWN
+        for each, name, turn in ((model, f"left/{number}.png", turned), (originals, NAMES[number], np.eye(3))):
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn @ R), -turn @ R @ center)
+            each.add_image_with_trivial_frame(pycolmap.Image(name, np.empty((0, 2)), 1, number + 1), pose)
+        face = Face("left", tuple(map(tuple, turned.tolist())), 90, 90, 40.0, 45.0, 45.0)
+        cuts[f"left/{number}.png"] = Cut(
+            NAMES[number], Lens("EQUIRECTANGULAR", (width, height), width, height), face
+        )
+        for label, point in POINTS.items():
+            x, y, z = R @ (point - center)
+            column = float((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width)
+            row = float((np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height)
+            lines.append(f"{label},{','.join(map(repr, on_map(point).tolist()))},{NAMES[number]},{column},{row}")
+    model.write_binary(workspace.sparse_dir)
+    write_cuts(cuts, workspace.sparse_dir)
+    (tmp_path / "originals").mkdir()
+    originals.write_binary(tmp_path / "originals")
+    table = write_lines(tmp_path / "gcp.csv", "point,x,y,z,image,column,row", *lines)
+    found = align(workspace, table, marked_in=tmp_path / "originals")
+    np.testing.assert_allclose(found.to_map(centers()), on_map(centers()), atol=1e-4)
     assert max(each.pixels or 0.0 for each in found.residuals) < 1e-5
 
 
