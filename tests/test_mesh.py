@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import trimesh
@@ -26,6 +27,7 @@ from colmap_sph.products.mesh.options import MeshOptions
 from colmap_sph.products.mesh.preview import write_preview
 from colmap_sph.products.mesh.texture.textured import plain
 from colmap_sph.products.mesh.triangles import Triangles, read_ply, write_ply
+from colmap_sph.project.cloud_tiles import INDEX, TileIndex
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
 
@@ -271,8 +273,13 @@ def test_a_mesh_coarser_than_the_pixels_is_told(cloudy, tmp_path, monkeypatch, c
 
 
 def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
-    with pytest.raises(InputError, match=r"fused\.ply is missing"):
+    with pytest.raises(InputError, match=r"fused\.ply is missing, .* run colmap_sph run first"):
         made(workspace, tmp_path, method="poisson")
+    other = surveyed_workspace(tmp_path / "other")
+    other.tiles_dir.mkdir()
+    (other.tiles_dir / INDEX).write_bytes(msgspec.json.encode(TileIndex("colmap_sph tiles 1", 0, ())))
+    with pytest.raises(InputError, match=r"fused\.ply is missing, .* --fusion\.max-points-per-file 0 first"):
+        made(other, tmp_path, method="poisson")
 
 
 @pytest.mark.parametrize(

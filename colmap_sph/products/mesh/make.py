@@ -23,6 +23,7 @@ from colmap_sph.products.mesh.tsdf import Volume, open3d
 from colmap_sph.products.places import check_places
 from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.surface.seen import SeenView, seen_views
+from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.meshing import poisson_mesh, simplify
 from colmap_sph.project.workspace import Workspace
@@ -154,7 +155,10 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
     workspace = request.workspace
     cloud = (workspace.local_dir / "fused.ply") if scene.origin.any() else workspace.fused_path
     if not cloud.is_file():
-        raise InputError(f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run first.")
+        option = " --fusion.max-points-per-file 0" if index_of(workspace) else ""
+        raise InputError(
+            f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run{option} first."
+        )
     _check_cloud(cloud, measured_cloud(workspace))  # which refuses one of other poses
     wanted = round(math.log2(max(_size(seen) / cell, 1.0)))
     depth = int(np.clip(wanted, *_DEPTHS))
@@ -174,7 +178,7 @@ def _check_cloud(path: Path, cloud: Cloud) -> None:
     """Raise `InputError` or `NoResultError` for a cloud of which COLMAP would make nothing, or crash."""
     sound = 0
     if cloud.has_normals:
-        sound = sum(np.count_nonzero(np.any(piece.normals, axis=1)) for piece in cloud.pieces())
+        sound = sum(int(np.any(piece.normals, axis=1).sum()) for piece in cloud.pieces())
     if sound < cloud.count:
         raise InputError(
             f"{path} has {cloud.count - sound:,} points without a normal, or without possible coordinates, and "
