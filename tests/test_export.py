@@ -512,8 +512,9 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
         export(made, lambda _: nullcontext(), overwrite=True)
     assert (folder / "splats" / "thesis.txt").read_text() == "mine"
     assert (folder / "cloud.laz").read_text() == "mine"
-    with pytest.raises(OptionError, match="las_scale"):
-        exported(workspace, tmp_path / "other", "las", las_scale=1e-9)
+    for scale, words in ((1e-9, "too fine"), (1000.0, "no less than the whole cloud")):
+        with pytest.raises(OptionError, match=f"las_scale.*{words}"):
+            exported(workspace, tmp_path / "other", "las", las_scale=scale)
     write_far_cloud(workspace.fused_path, make_cloud(1)[0], [])
     for seen, words in (([1, 9], "more than"), ([0xFFFFFFFF, 0], "damaged"), ([2, 0], "cut off")):
         data = struct.pack("<Q", 1) + np.array(seen, "<u4").tobytes()
@@ -529,7 +530,11 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
     workspace.fused_path.unlink()
     with pytest.raises(InputError, match="no fused cloud"):
         exported(workspace, tmp_path / "other", "las")
-    assert not list((tmp_path / "other").glob("*"))
+    assert not (tmp_path / "other").exists()
+    (tmp_path / "other").mkdir()
+    with pytest.raises(InputError, match="no fused cloud"):
+        exported(workspace, tmp_path / "other", "las")
+    assert (tmp_path / "other").is_dir()  # which was there before
 
 
 def test_an_earlier_export_is_replaced_on_request(workspace: Workspace, tmp_path: Path) -> None:

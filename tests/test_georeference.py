@@ -15,6 +15,10 @@ from colmap_sph.products.georeference import Georeference, read_georeference, wr
 from colmap_sph.products.georeferencing import GeoreferenceOptions, georeferenced, report_lines
 from colmap_sph.project.alignment.gps import read_gps
 from colmap_sph.project.alignment.similarity import estimate_similarity
+from colmap_sph.project.wide.cuts import Cut
+from colmap_sph.project.wide.layout import Face
+from colmap_sph.project.wide.projection import Lens
+from colmap_sph.project.wide.table import write_cuts
 from colmap_sph.project.workspace import Workspace
 
 NAMES = [f"a/{number}.png" for number in range(6)]
@@ -145,6 +149,42 @@ def test_control_points_give_the_similarity(workspace: Workspace, tmp_path: Path
     assert max(each.pixels or 0.0 for each in found.residuals) < 1e-5
 
 
+def test_control_points_may_be_marked_in_panoramas(workspace: Workspace, tmp_path: Path) -> None:
+    """Also behind their middle, though the workspace has a view to one side of each alone."""
+    width, height = 800, 400
+    turned = Rotation.from_euler("yx", [70, 20], degrees=True).as_matrix()
+    model, originals = pycolmap.Reconstruction(), pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=90, height=90, params=[40, 40, 45, 45])
+    )
+    originals.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="EQUIRECTANGULAR", width=width, height=height, params=[width, height])
+    )
+    lines, cuts = [], {}
+    for number, center in enumerate(centers()):
+        R = Rotation.from_euler("y", 60 * number, degrees=True).as_matrix() @ LOOKING_DOWN
+        for each, name, turn in ((model, f"left/{number}.png", turned), (originals, NAMES[number], np.eye(3))):
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn @ R), -turn @ R @ center)
+            each.add_image_with_trivial_frame(pycolmap.Image(name, np.empty((0, 2)), 1, number + 1), pose)
+        face = Face("left", tuple(map(tuple, turned.tolist())), 90, 90, 40.0, 45.0, 45.0)
+        cuts[f"left/{number}.png"] = Cut(
+            NAMES[number], Lens("EQUIRECTANGULAR", (width, height), width, height), face
+        )
+        for label, point in POINTS.items():
+            x, y, z = R @ (point - center)
+            column = float((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width)
+            row = float((np.arctan2(y, np.hypot(x, z)) / np.pi + 0.5) * height)
+            lines.append(f"{label},{','.join(map(repr, on_map(point).tolist()))},{NAMES[number]},{column},{row}")
+    model.write_binary(workspace.sparse_dir)
+    write_cuts(cuts, workspace.sparse_dir)
+    (tmp_path / "originals").mkdir()
+    originals.write_binary(tmp_path / "originals")
+    table = write_lines(tmp_path / "gcp.csv", "point,x,y,z,image,column,row", *lines)
+    found = align(workspace, table, marked_in=tmp_path / "originals")
+    np.testing.assert_allclose(found.to_map(centers()), on_map(centers()), atol=1e-4)
+    assert max(each.pixels or 0.0 for each in found.residuals) < 1e-5
+
+
 def test_check_points_do_not_take_part(workspace: Workspace, tmp_path: Path) -> None:
     lines = [f"{line},{'check' if line.startswith('P4') else 'control'}" for line in mark_lines(POINTS)]
     lines = [line.replace(repr(on_map(POINTS["P4"])[2].item()), "1000") for line in lines]
@@ -243,11 +283,41 @@ def test_what_cannot_be_is_refused(workspace: Workspace, tmp_path: Path) -> None
         (GeoreferenceOptions(crs="EPSG:32633"), InputError, "--align"),
         (GeoreferenceOptions(crs="EPSG:32733"), InputError, "--align"),
         (GeoreferenceOptions(crs="EPSG:4978"), InputError, "--align"),
+        (GeoreferenceOptions(crs="EPSG:2056+5728"), InputError, "--align"),
+        # Feet in plan and metres in height; axes to the south and the west.
+        (GeoreferenceOptions(crs="EPSG:2263+5703"), OptionError, "one unit"),
+        (GeoreferenceOptions(crs="EPSG:5513"), OptionError, "EPSG:5514"),
     ]
     for options, kind, words in refused:
         with pytest.raises(kind, match=words):
             georeferenced(workspace, options)
         assert not workspace.georeference_path.exists()
+
+
+def test_places_far_from_their_system_are_refused(workspace: Workspace, tmp_path: Path) -> None:
+    """What lies in New York has no place in the UTM zone of Sydney, nor a site grid at its own origin in any."""
+    to_gps = pytest.importorskip("pyproj").Transformer.from_crs("EPSG:32618", "EPSG:4979")
+    degrees = np.column_stack(to_gps.transform(*(centers() + np.array([500_000, 4_500_000, 0])).T))
+    far = write_lines(tmp_path / "far.csv", "image,latitude,longitude,height", *position_lines(degrees))
+    site = write_lines(tmp_path / "site.csv", "image,x,y,z", *position_lines(on_map(centers()) - SHIFT + 1000))
+    for table, crs in ((far, "EPSG:32756"), (site, "EPSG:25832"), (site, "EPSG:25832+7837")):
+        with pytest.raises(InputError, match=rf"{table.name} the cameras are at .* check --crs"):
+            align(workspace, table, crs)
+        assert not workspace.georeference_path.exists()
+    assert align(workspace, site).crs == "" and align(workspace, far).crs == "EPSG:32618"
+
+
+def test_upright_in_a_geocentric_system_is_not_along_its_axis(
+    workspace: Workspace, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """In the south images that look down look along the axis of the earth, to the north."""
+    pyproj = pytest.importorskip("pyproj")
+    to_earth = pyproj.Transformer.from_crs("EPSG:32734", "EPSG:4978", always_xy=True)
+    x, y, z = to_earth.transform(*(centers() + np.array([400_000, 5_800_000, 0])).T)
+    table = write_lines(tmp_path / "cape.csv", "image,x,y,z", *position_lines(np.column_stack([x, y, z])))
+    found = align(workspace, table, "EPSG:4978")
+    assert max(each.length for each in found.residuals) < 1e-3
+    assert "head" not in caplog.text
 
 
 def test_another_model_does_not_get_the_place_of_the_last(workspace: Workspace) -> None:
@@ -269,7 +339,8 @@ def test_what_was_said_is_kept_until_something_else_is_said(workspace: Workspace
     table = write_lines(tmp_path / "cameras.csv", "image,x,y,z", *position_lines(on_map(centers())))
     aligned = align(workspace, table, "EPSG:25832")
     assert georeferenced(workspace, GeoreferenceOptions()).scale == aligned.scale
-    assert georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25832")).scale == aligned.scale
+    for name in ("EPSG:25832", "epsg:25832"):
+        assert georeferenced(workspace, GeoreferenceOptions(crs=name)).scale == aligned.scale
     with pytest.raises(OptionError, match="align again"):
         georeferenced(workspace, GeoreferenceOptions(crs="EPSG:25833"))
     model = pycolmap.Reconstruction(workspace.sparse_dir)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 import trimesh
@@ -15,7 +16,7 @@ from scipy.spatial import cKDTree
 from surveyed import BLUE, BOX, GREEN, GSD, RED, ROOF, surveyed_workspace
 
 from colmap_sph.app import cli
-from colmap_sph.errors import InputError, OptionError
+from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.evaluation import read_geometry
 from colmap_sph.evaluation.geometry_io import Mesh
 from colmap_sph.products.georeference import Georeference
@@ -26,6 +27,7 @@ from colmap_sph.products.mesh.options import MeshOptions
 from colmap_sph.products.mesh.preview import write_preview
 from colmap_sph.products.mesh.texture.textured import plain
 from colmap_sph.products.mesh.triangles import Triangles, read_ply, write_ply
+from colmap_sph.project.cloud_tiles import INDEX, TileIndex
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
 
@@ -271,8 +273,42 @@ def test_a_mesh_coarser_than_the_pixels_is_told(cloudy, tmp_path, monkeypatch, c
 
 
 def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
-    with pytest.raises(InputError, match=r"fused\.ply is missing"):
+    with pytest.raises(InputError, match=r"fused\.ply is missing, .* run colmap_sph run first"):
         made(workspace, tmp_path, method="poisson")
+    other = surveyed_workspace(tmp_path / "other")
+    other.tiles_dir.mkdir()
+    (other.tiles_dir / INDEX).write_bytes(msgspec.json.encode(TileIndex("colmap_sph tiles 1", 0, ())))
+    with pytest.raises(InputError, match=r"fused\.ply is missing, .* --fusion\.max-points-per-file 0 first"):
+        made(other, tmp_path, method="poisson")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        ("no normals", r"fused\.ply has 20,000 points without a normal"),
+        ("one normal of 0", r"fused\.ply has 1 points without a normal"),
+        ("one place unknown", r"without possible coordinates"),
+        ("two points", r"has only 2 points"),
+    ],
+)
+def test_a_cloud_that_poisson_would_crash_on_is_refused(wrong, words, cloudy, tmp_path):
+    """Others may have written it; COLMAP ends the whole program at some."""
+    head, data = cloudy.fused_path.read_bytes().split(b"end_header\n")
+    points = np.frombuffer(data, POINT).copy()
+    if wrong == "no normals":
+        head = re.sub(rb"property float n.\n", b"", head)
+        points = points[["xyz", "rgb"]].astype([("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    elif wrong == "one normal of 0":
+        points["normal"][7] = 0
+    elif wrong == "one place unknown":
+        points["xyz"][7, 1] = np.nan
+    else:
+        head, points = head.replace(b"vertex 20000", b"vertex 2"), points[:2]
+    other = surveyed_workspace(tmp_path / "other")
+    other.fused_path.write_bytes(head + b"end_header\n" + points.tobytes())
+    with pytest.raises((InputError, NoResultError), match=words):
+        made(other, tmp_path / "made", method="poisson", trim=8.0)
+    assert not (tmp_path / "made").exists()
 
 
 @pytest.mark.parametrize("voxel", [1e-9, 1e9])

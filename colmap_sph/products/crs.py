@@ -45,6 +45,16 @@ def read_crs(name: str) -> "pyproj.CRS":
             f"--crs {name} ({crs.name}) counts in degrees, and a model cannot; give a projected system, such as "
             "a UTM zone."
         )
+    if len({axis.unit_conversion_factor for axis in crs.axis_info}) > 1:
+        raise OptionError(
+            f"--crs {name} ({crs.name}) counts heights in another unit than places, and a model cannot; give a "
+            "system with one unit."
+        )
+    if [axis.direction for axis in crs.axis_info[:2]] == ["south", "west"]:
+        raise OptionError(
+            f"--crs {name} ({crs.name}) counts to the south and the west, in which a model would be mirrored; "
+            "give one that counts to the east and the north, such as EPSG:5514 for EPSG:5513."
+        )
     return crs
 
 
@@ -108,7 +118,8 @@ def from_gps(crs: "pyproj.CRS", positions: NDArray[np.float64]) -> NDArray[np.fl
 def is_in_area(crs: "pyproj.CRS", place: NDArray[np.float64]) -> bool:
     """Whether a place in a coordinate system lies where that is meant for, or not much beyond; True where its area
     is not known."""
-    area = crs.area_of_use
+    # PROJ knows none of a system that is put together, as "EPSG:25832+7837" is.
+    area = crs.area_of_use or next((part.area_of_use for part in crs.sub_crs_list), None)
     if area is None:
         return True
     try:

@@ -77,7 +77,7 @@ def _in_own_coordinates(workspace: Workspace, name: str | None) -> Georeference:
     except InputError:  # of another model, or damaged: it is written anew
         kept = Georeference()
     if kept.aligned_by:
-        if kept.crs == name:
+        if kept.wkt == wkt_of(crs):
             return kept
         raise OptionError(
             f"crs {name} is not {kept.crs or 'the unnamed system'}, to which {workspace.root} was aligned; give "
@@ -86,14 +86,25 @@ def _in_own_coordinates(workspace: Workspace, name: str | None) -> Georeference:
             "align",
         )
     scene = read_scene(workspace.sparse_dir)
-    middle = np.median([view.center for view in scene.views], axis=0) + scene.origin
+    found = Georeference(crs=name, wkt=wkt_of(crs))
+    _refuse_far(
+        scene,
+        found,
+        crs,
+        f"The cameras of {workspace.sparse_dir}",
+        "give --align if the model is in a frame of its own",
+    )
+    return found
+
+
+def _refuse_far(scene: Scene, found: Georeference, crs: "pyproj.CRS", what: str, remedy: str) -> None:
+    """Raise `InputError` where a scene's cameras would lie far from where a coordinate system is used."""
+    x, y, z = middle = found.to_map(np.median([view.center for view in scene.views], axis=0) + scene.origin)
     if not is_in_area(crs, middle):
-        x, y, z = middle
         raise InputError(
-            f"The cameras of {workspace.sparse_dir} are at {x:.6g}, {y:.6g}, {z:.6g}, which is far from where "
-            f"{name} ({crs.name}) is used; check --crs, or give --align if the model is in a frame of its own."
+            f"{what} are at {x:.6g}, {y:.6g}, {z:.6g}, which is far from where {found.crs} ({crs.name}) is used; "
+            f"check --crs, or {remedy}."
         )
-    return Georeference(crs=name, wkt=wkt_of(crs))
 
 
 def _aligned(workspace: Workspace, options: GeoreferenceOptions, source: Path) -> Georeference:
@@ -112,8 +123,12 @@ def _aligned(workspace: Workspace, options: GeoreferenceOptions, source: Path) -
             )
         name = options.crs or ""
         found = align_by_points(workspace, table, options.marked_in, source)
-    _tell_head_stand(scene, found, source)
-    return replace(found, crs=name, wkt="" if crs is None else wkt_of(crs))
+    found = replace(found, crs=name, wkt="" if crs is None else wkt_of(crs))
+    if crs is not None:
+        _refuse_far(scene, found, crs, f"By {source} the cameras", "leave it out for a site grid without a name")
+    if crs is None or not crs.is_geocentric:  # whose third axis is not upright
+        _tell_head_stand(scene, found, source)
+    return found
 
 
 def _tell_head_stand(scene: Scene, found: Georeference, source: Path) -> None:

@@ -41,8 +41,11 @@ def alone_in(folder: Path) -> Iterator[None]:
     OutputError
         Another command is at work there, or the folder cannot be made.
     """
+    is_new = not os.path.lexists(folder)
     make_dir(folder)
     with ExitStack() as held:
+        if is_new:
+            held.callback(_remove_empty, folder)
         held.callback(remove_lock, folder)
         try:
             held.enter_context(holding(folder))
@@ -53,6 +56,12 @@ def alone_in(folder: Path) -> Iterator[None]:
         except OSError as error:
             raise OutputError(f"{folder} cannot be used ({reason_of(error)}); choose another --output.") from error
         yield
+
+
+def _remove_empty(folder: Path) -> None:
+    """Remove a folder in which nothing was made."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 @contextmanager

@@ -15,6 +15,7 @@ from colmap_sph.project.alignment.gps import read_gps
 from colmap_sph.project.alignment.similarity import estimate_similarity
 from colmap_sph.project.lens.files import read_lens_fields
 from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.wide.table import read_cuts
 from colmap_sph.project.workspace import Workspace, checked_name
 from colmap_sph.scene import Scene
 
@@ -93,7 +94,8 @@ def align_by_points(
     """
     if read_lens_fields(photographs):
         logger.warning("%s has lens fields, which marks of control points do not take into account", photographs)
-    images = marked_images(load_model(workspace.sparse_dir), load_model(photographs))
+    cuts = read_cuts(workspace.sparse_dir)
+    images = marked_images(load_model(workspace.sparse_dir), cuts, load_model(photographs))
     mentioned = dict.fromkeys(image for point in points for image, *_ in point.marks)
     called = _matched(mentioned, images, source)
     found = {point.name: _triangulated(point, images, called, source) for point in points}

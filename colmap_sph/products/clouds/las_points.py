@@ -93,7 +93,7 @@ def las_header(cloud: Cloud, extent: Extent, georeference: Georeference, scale: 
     Raises
     ------
     OptionError
-        The scale is too fine for the cloud's size.
+        The scale is too fine for the cloud's size, or as coarse as the cloud is large.
     """
     half = float((extent.high - extent.low).max()) / 2
     if scale is not None and half > 0 and 2 * half / scale > _LARGEST:
@@ -102,6 +102,8 @@ def las_header(cloud: Cloud, extent: Extent, georeference: Georeference, scale: 
             "more.",
             "las_scale",
         )
+    if scale is not None and 0 < half <= scale / 2:
+        raise OptionError(f"las_scale {scale:g} is no less than the whole cloud, {2 * half:.6g}.", "las_scale")
     header = laspy.LasHeader(point_format=_POINT_FORMAT, version="1.4")
     header.system_identifier = "dense image matching"
     header.generating_software = f"colmap_sph {version('colmap_sph')}"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, NoResultError, OptionError
+from colmap_sph.products.clouds.source import Cloud
 from colmap_sph.products.clouds.spread import measured_cloud
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.mesh.glb import write_glb
@@ -22,6 +23,7 @@ from colmap_sph.products.mesh.tsdf import Volume, open3d
 from colmap_sph.products.places import check_places
 from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.surface.seen import SeenView, seen_views
+from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.meshing import poisson_mesh, simplify
 from colmap_sph.project.workspace import Workspace
@@ -31,6 +33,8 @@ from colmap_sph.stereo.region.map_axes import map_axes
 logger = logging.getLogger(__name__)
 
 _DEPTHS = (6, 13)
+# COLMAP's poisson crashes where it cuts off all of a surface, as it does of a few points that lie apart.
+_FEWEST_POINTS = 100
 # Depths of one surface, as the mesh and a view have it, differ by no more than this many pixels on it.
 _TOLERANCE = 6.0
 
@@ -151,8 +155,11 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
     workspace = request.workspace
     cloud = (workspace.local_dir / "fused.ply") if scene.origin.any() else workspace.fused_path
     if not cloud.is_file():
-        raise InputError(f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run first.")
-    measured_cloud(workspace)  # refuses one of other poses
+        option = " --fusion.max-points-per-file 0" if index_of(workspace) else ""
+        raise InputError(
+            f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run{option} first."
+        )
+    _check_cloud(cloud, measured_cloud(workspace))  # which refuses one of other poses
     wanted = round(math.log2(max(_size(seen) / cell, 1.0)))
     depth = int(np.clip(wanted, *_DEPTHS))
     if wanted > depth:
@@ -165,6 +172,20 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
     mesh = scratch / "poisson.ply"
     poisson_mesh(cloud, mesh, depth=depth, trim=request.options.trim, threads=request.threads)
     return read_ply(mesh)
+
+
+def _check_cloud(path: Path, cloud: Cloud) -> None:
+    """Raise `InputError` or `NoResultError` for a cloud of which COLMAP would make nothing, or crash."""
+    sound = 0
+    if cloud.has_normals:
+        sound = sum(int(np.any(piece.normals, axis=1).sum()) for piece in cloud.pieces())
+    if sound < cloud.count:
+        raise InputError(
+            f"{path} has {cloud.count - sound:,} points without a normal, or without possible coordinates, and "
+            "--method poisson needs both; fuse again, or give --method tsdf."
+        )
+    if sound < _FEWEST_POINTS:
+        raise NoResultError(f"{path} has only {sound} points, too few for a surface; try --method tsdf.")
 
 
 def _simplified(mesh: Triangles, request: MeshRequest, scratch: Path) -> Triangles:
