@@ -79,6 +79,9 @@ class View:
     unexplained_error : float
         The same once the observations are scaled and shifted to fit: what is left of it if they were made in an
         image of another size, or in one that was cropped since.
+    focal_factors : (float, float), optional
+        By what `fx` and `fy` would have to be multiplied for the points to project near to where the view observes
+        them; None where they do as it is, or no factors make them.
     full_size : (int, int), optional
         Width and height of its image's file, where the view is smaller: the image is reduced when it is read.
     original : str
@@ -96,6 +99,7 @@ class View:
     point_indices: NDArray[np.int64]
     reprojection_error: float = math.nan
     unexplained_error: float = math.nan
+    focal_factors: tuple[float, float] | None = None
     full_size: tuple[int, int] | None = None
     original: str = ""
 

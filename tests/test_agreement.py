@@ -26,6 +26,7 @@ from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.self_check import (
     judge_agreement,
     judge_reprojection,
+    misplaced_views,
     refuse_cameras,
     refuse_disagreement,
     share_in_sight,
@@ -402,48 +403,75 @@ def test_maps_of_an_image_that_comes_to_be_in_a_wrong_place_are_removed(project)
     assert maps == [name != wrong.name for name in FOUR_NAMES]
 
 
-def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):
-    """All focal lengths are wrong by a third: the maps may agree with each other all the same."""
+def test_points_that_are_not_where_they_are_observed_are_told(project):
+    """Their image coordinates are those of images of twice the size."""
     model = pycolmap.Reconstruction(project / "sparse/0")
-    for camera in model.cameras.values():
-        camera.params = [0.7 * camera.params[0], 0.7 * camera.params[1], *camera.params[2:]]
-    wrong = project / "wrong"
-    wrong.mkdir()
-    model.write_binary(wrong)
-    report = RunReport()
-    assert judge_reprojection(report, read_scene(wrong)) == 1
-    assert all(name in report.doubts for name in FOUR_NAMES)
-    sound = RunReport()
-    scene = read_scene(project / "sparse/0")
-    assert max(view.reprojection_error for view in scene.views) < 1
-    assert judge_reprojection(sound, scene) == 0
+    sound, report = RunReport(), RunReport()
+    assert judge_reprojection(sound, scene_of_model(model, project)) == 0
     assert sound.doubts == ""
-    with pytest.raises(NoResultError, match="cameras or poses of the model are not those"):
-        colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)
+    for image in model.images.values():
+        for point in image.points2D:
+            point.xy = 2 * point.xy
+    assert judge_reprojection(report, scene_of_model(model, project)) == 1
+    assert all(name in report.doubts for name in FOUR_NAMES)
 
 
-def with_cameras(project, change):
-    """A folder with the project's model, whose cameras were changed."""
-    model = pycolmap.Reconstruction(project / "sparse/0")
-    for camera in model.cameras.values():
-        camera.params = list(np.multiply(camera.params, change))
-    changed = project / "changed"
-    changed.mkdir()
-    model.write_binary(changed)
+def with_focal_lengths(model, fx, fy, number):
+    """So many images of a model get another camera, with so many times the focal lengths."""
+    changed = pycolmap.Reconstruction()
+    for index, image in enumerate(sorted(model.images.values(), key=lambda image: image.name)):
+        camera = pycolmap.Camera(model.cameras[image.camera_id].todict())
+        camera.camera_id = 100 + index
+        if index < number:
+            camera.params = np.multiply(camera.params, [fx, fy, 1, 1])
+        changed.add_camera_with_trivial_rig(camera)
+        copy = pycolmap.Image(image.name, [point.xy for point in image.points2D], 100 + index, image.image_id)
+        changed.add_image_with_trivial_frame(copy, image.cam_from_world())
+    for point_id, point in model.points3D.items():
+        changed.add_point3D_with_id(point_id, point)
     return changed
 
 
-def test_a_camera_with_one_wrong_focal_length_is_refused_before_anything_is_matched(project):
-    """Most points agreed with depth maps made with it, in which only one direction was wrong."""
-    wrong = with_cameras(project, [0.1, 1, 1, 1])
-    folders = {"images": project / "images", "output": project / "dense"}
+@pytest.mark.parametrize(("fx", "fy"), [(1.1, 1.1), (0.9, 0.9), (0.7, 0.7), (0.8, 1), (1, 1.1), (0.1, 1)])
+@pytest.mark.parametrize("number", [4, 2])
+def test_other_focal_lengths_than_those_of_the_points_are_refused(fx, fy, number, project):
+    """Depth is wrong by as much, in all images alike, and so agreed with that of others."""
+    model = with_focal_lengths(pycolmap.Reconstruction(project / "sparse/0"), fx, fy, number)
+    expected = rf"{number} of 4 images .* with {1 / fx:.3g} times the horizontal and {1 / fy:.3g} times the"
+    with pytest.raises(NoResultError, match=expected):
+        refuse_cameras(scene_of_model(model, project))
+
+
+def test_the_one_image_with_another_focal_length_is_left_out(project):
+    sound = pycolmap.Reconstruction(project / "sparse/0")
+    assert misplaced_views(scene_of_model(with_focal_lengths(sound, 1.02, 1.02, 1), project)) == {}
+    scene = scene_of_model(with_focal_lengths(sound, 1.04, 1.04, 1), project)
+    refuse_cameras(scene)
+    assert scene.view(FOUR_NAMES[0]).reprojection_error < 4  # no more than roughly adjusted poses leave
+    assert misplaced_views(scene) == {FOUR_NAMES[0]: scene.view(FOUR_NAMES[0]).reprojection_error}
+
+
+def test_a_camera_that_is_not_that_of_its_points_is_refused_before_anything_is_matched(project):
+    wrong, folders = project / "wrong", {"images": project / "images", "output": project / "dense"}
+    wrong.mkdir()
+    with_focal_lengths(pycolmap.Reconstruction(project / "sparse/0"), 0.9, 0.9, 4).write_binary(wrong)
     for run in (
         lambda: colmap_sph.run(wrong, options=OPTIONS, **folders),
         lambda: make_plan(Project(wrong, folders["images"], output=folders["output"]), OPTIONS),
     ):
-        with pytest.raises(NoResultError, match=r"no other size or crop .*one of two focal lengths"):
+        with pytest.raises(NoResultError, match="Give the model as it was adjusted"):
             run()
     assert not list((project / "dense/stereo").rglob("*.bin"))
+
+
+def test_poses_that_are_not_those_of_the_points_are_refused_before_anything_is_matched(project):
+    """Every image is turned about the direction in which it looks: no other camera explains that."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d([0, 0, np.radians(20)]), np.zeros(3))
+    for image in model.images.values():
+        image.frame.rig_from_world = turn * image.cam_from_world()
+    with pytest.raises(NoResultError, match="no other size or crop"):
+        refuse_cameras(scene_of_model(model, project))
 
 
 @pytest.mark.parametrize(

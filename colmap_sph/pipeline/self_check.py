@@ -4,10 +4,12 @@ import logging
 from collections.abc import Mapping
 from statistics import median
 
+import numpy as np
+
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Agreement
-from colmap_sph.scene import Scene
+from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.partners.pairing import Pair
 
@@ -33,9 +35,10 @@ _FEWEST_OF_IMAGE = 10
 # Sparse points lie a pixel or so from their observations, be they ever so roughly adjusted.
 _FAR_PIXELS = 4.0
 _FAR_SHARE = 0.01
-# Of the longer side, beyond what another size and crop explain: of sound models points lie a thousandth off, with
-# one of two focal lengths halved a thirtieth.
+# Of the longer side, beyond what another size and crop explain: of sound models points lie a thousandth off.
 _IMPOSSIBLE_SHARE = 0.03
+# Points tell focal lengths to some thousandths, even of bent images; depth is wrong by as much as they are.
+_OTHER_FOCAL_LENGTH = 0.03
 _MAX_NAMED = 10
 # Rows of pairs with good poses and lenses disagree by no more; by twice as much, the results suffer.
 _EXPECTED_PIXELS = 0.2
@@ -88,7 +91,15 @@ def misplaced_views(scene: Scene) -> dict[str, float]:
         view.name: view.reprojection_error
         for view in scene.views
         if view.reprojection_error > max(_FAR_PIXELS, _FAR_SHARE * max(view.width, view.height))
+        or _has_other_focal_length(view)
     }
+
+
+def _has_other_focal_length(view: View) -> bool:
+    """Whether its points project to where they are observed with other focal lengths than it has."""
+    return view.focal_factors is not None and bool(
+        np.abs(np.subtract(view.focal_factors, 1)).max() > _OTHER_FOCAL_LENGTH
+    )
 
 
 def judge_reprojection(report: RunReport, scene: Scene) -> float:
@@ -118,8 +129,9 @@ def judge_reprojection(report: RunReport, scene: Scene) -> float:
 
 
 def refuse_cameras(scene: Scene) -> None:
-    """Raise `NoResultError` where in most images points project so far off that hours of work would be in vain.
+    """Raise `NoResultError` where points contradict so many images that hours of work would be in vain.
 
+    That is half of them with other focal lengths than their points have, or most with points that project far off.
     Not where the observations may be of another size or crop: depth may be right then, and is judged by itself.
 
     Parameters
@@ -127,6 +139,15 @@ def refuse_cameras(scene: Scene) -> None:
     scene : Scene
     """
     telling = [view for view in scene.views if len(view.point_indices) >= _FEWEST_OF_IMAGE]
+    others = [view for view in telling if _has_other_focal_length(view)]
+    if others and 2 * len(others) >= len(telling):
+        fx, fy = np.median([view.focal_factors for view in others], axis=0)
+        raise NoResultError(
+            f"Sparse points do not project to where {len(others)} of {len(telling)} images observe them, but "
+            f"would with {fx:.3g} times the horizontal and {fy:.3g} times the vertical focal length: cameras of "
+            "the model are not those that its points were made with. Give the model as it was adjusted, with its "
+            "cameras."
+        )
     shares = [
         min(view.reprojection_error, view.unexplained_error) / max(view.width, view.height) for view in telling
     ]
@@ -134,8 +155,7 @@ def refuse_cameras(scene: Scene) -> None:
         raise NoResultError(
             "Sparse points do not project to where most images observe them, and no other size or crop of the "
             f"images explains it: {median(shares):.0%} of their longer side is left. Cameras, poses or points of "
-            "the model were changed apart from each other (one of two focal lengths, say); give the model as it "
-            "was adjusted, with its cameras."
+            "the model were changed apart from each other; give the model as it was adjusted, with its cameras."
         )
 
 

@@ -27,6 +27,8 @@ Moved = Callable[[pycolmap.Image, NDArray[np.float64]], NDArray[np.float64]]
 
 # A table has so many times as many places as there are points, at most.
 _MOST_GAPS = 8
+# Other focal lengths explain where points are observed where they leave less than this share of the distance.
+_EXPLAINED = 0.25
 
 
 def read_scene(sparse_dir: Path) -> Scene:
@@ -193,20 +195,34 @@ def _with_observations(
     with np.errstate(all="ignore"):  # an impossible pose is told later
         projected, _ = view.project(points[rows[known]])
         observed = observations.xy[known]
+        is_finite = np.isfinite(projected).all(axis=1) & np.isfinite(observed).all(axis=1)
+        projected, observed = projected[is_finite], observed[is_finite]
         return replace(
             view,
             point_indices=np.unique(rows[known]),
             reprojection_error=_median_of_finite(np.linalg.norm(projected - observed, axis=1)),
             unexplained_error=_unexplained_error(projected, observed),
+            focal_factors=_focal_factors(projected - view.K[:2, 2], observed - view.K[:2, 2]),
         )
+
+
+def _focal_factors(projected: NDArray[np.float64], observed: NDArray[np.float64]) -> tuple[float, float] | None:
+    """See `View.focal_factors`; (n, 2) finite pixels from the principal point.
+
+    Observations in an image of another size would be scaled about its corner.
+    """
+    factors = np.array([_median_of_finite(ratios) for ratios in (observed / projected).T])
+    left = _median_of_finite(np.linalg.norm(factors * projected - observed, axis=1))
+    if left < _EXPLAINED * _median_of_finite(np.linalg.norm(projected - observed, axis=1)):
+        return float(factors[0]), float(factors[1])
+    return None
 
 
 def _unexplained_error(projected: NDArray[np.float64], observed: NDArray[np.float64]) -> float:
     """Median distance in pixels, once the observed coordinates are scaled and shifted to fit; NaN without any."""
-    is_finite = np.isfinite(projected).all(axis=1) & np.isfinite(observed).all(axis=1)
-    if not is_finite.any():
+    if not len(projected):
         return math.nan
-    arms, observed = (places[is_finite] - np.median(places[is_finite], axis=0) for places in (projected, observed))
+    arms, observed = (places - np.median(places, axis=0) for places in (projected, observed))
     factor = _median_of_finite((arms * observed).sum(axis=1) / (observed**2).sum(axis=1))
     return _median_of_finite(np.linalg.norm(arms - factor * observed, axis=1))
 
