@@ -55,7 +55,7 @@ static const double LARGEST_DIFFERENCE = 4e-3;
 
 /* Pixels of one row of the depth map. Fixed sizes, so that the compiler can vectorise. */
 typedef struct {
-    ptrdiff_t count;                          /* pixels that are still asked for ... */
+    ptrdiff_t count;                          /* pixels that are asked for, then those that are still ... */
     int32_t place[BLOCK];                     /* ... and which they are, once some were left out */
     double u[BLOCK], v[BLOCK];                /* column and row in the disparity map; 0 where outside */
     int32_t column[BLOCK], row[BLOCK];        /* the nearest pixel there ... */
@@ -74,6 +74,9 @@ typedef struct {
     double parallax[BLOCK], stretch[BLOCK]; /* the parallax angle, and its change with that of columns */
     float depth[BLOCK], sigma[BLOCK];
 } block;
+
+/* Numbers of pixels that whole registers hold. */
+static inline ptrdiff_t filled_up(const block *k) { return (k->count + 15) / 16 * 16; }
 
 /* Column and row in the map of a ray of the sphere. */
 static inline void place_ray(const pair_geometry *g, double x, double y, double z, double *u, double *v) {
@@ -115,7 +118,7 @@ static inline int is_smooth(const double *nodes) {
 }
 
 /* Values of pixels from those at nodes, the first of which lies STEP columns before the first pixel. */
-static inline void interpolate_nodes(const double *nodes, double *values) {
+static inline void interpolate_nodes(const double *nodes, ptrdiff_t count, double *values) {
     double weights[4][STEP];
     for (int p = 0; p < STEP; p++) {
         const double t = (double)p / STEP;
@@ -124,7 +127,7 @@ static inline void interpolate_nodes(const double *nodes, double *values) {
         weights[2][p] = -(t + 1) * t * (t - 2) * 0.5;
         weights[3][p] = (t + 1) * t * (t - 1) * (1.0 / 6);
     }
-    for (int j = 0; j < BLOCK / STEP; j++) {
+    for (ptrdiff_t j = 0; j < count / STEP; j++) {
         for (int p = 0; p < STEP; p++) {
             values[j * STEP + p] = weights[0][p] * nodes[j] + weights[1][p] * nodes[j + 1] +
                                    weights[2][p] * nodes[j + 2] + weights[3][p] * nodes[j + 3];
@@ -136,25 +139,26 @@ static inline void interpolate_nodes(const double *nodes, double *values) {
 static inline int locate(const pair_geometry *g, const disparity_map *map, double row, double first_column,
                          block *k) {
     const double *m = g->rectified_from_pixel, end_v = (double)map->height - 0.5;
+    const ptrdiff_t count = filled_up(k);
     if (g->spherical) {
         double u[NODES], v[NODES];
         place_row(g, row, first_column - STEP, STEP, NODES, u, v);
         if (is_smooth(u) && is_smooth(v)) {
-            interpolate_nodes(u, k->u);
-            interpolate_nodes(v, k->v);
+            interpolate_nodes(u, count, k->u);
+            interpolate_nodes(v, count, k->v);
         } else {
-            place_row(g, row, first_column, 1, BLOCK, k->u, k->v);
+            place_row(g, row, first_column, 1, count, k->u, k->v);
         }
     } else {
-        for (int i = 0; i < BLOCK; i++) {
-            const double column = first_column + i, z = m[6] * column + m[7] * row + m[8];
+        for (ptrdiff_t i = 0; i < count; i++) {
+            const double column = first_column + (double)i, z = m[6] * column + m[7] * row + m[8];
             const double scale = z > 0 ? 1 / z : NAN;
             k->u[i] = (m[0] * column + m[1] * row + m[2]) * scale * g->columns_per_radian - g->column_origin;
             k->v[i] = (m[3] * column + m[4] * row + m[5]) * scale * g->rows_per_radian - g->row_origin;
         }
     }
     int any = 0;
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < count; i++) {
         any |= (k->v[i] > -0.5) & (k->v[i] < end_v);
     }
     return any;
@@ -163,7 +167,8 @@ static inline int locate(const pair_geometry *g, const disparity_map *map, doubl
 /* Finds the nearest pixels of the disparity map; false where none is inside. */
 static inline int find_nearest(const disparity_map *map, block *k) {
     const double end_u = (double)map->width - 0.5, end_v = (double)map->height - 0.5;
-    for (int i = 0; i < BLOCK; i++) {
+    const ptrdiff_t count = filled_up(k);
+    for (ptrdiff_t i = 0; i < count; i++) {
         const int inside = (k->u[i] > -0.5) & (k->v[i] > -0.5) & (k->u[i] < end_u) & (k->v[i] < end_v);
         /* From 1 on, so that cutting off the fraction rounds down; not by adding 0.5, which would round the number
          * before 0.5 up to 1. */
@@ -179,27 +184,28 @@ static inline int find_nearest(const disparity_map *map, block *k) {
         k->inside[i] = inside;
     }
     const int32_t last_column = (int32_t)map->width - 1, last_row = (int32_t)map->height - 1;
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < count; i++) {
         k->at[i] = k->row[i] * (int64_t)map->width + k->column[i];
         k->across_at[i] = k->to_below[i] * (int64_t)map->width + k->to_right[i];
         k->amid[i] = (k->column[i] > 0) & (k->column[i] < last_column) & (k->row[i] > 0) & (k->row[i] < last_row);
     }
     int any = 0;
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < count; i++) {
         any |= k->inside[i];
     }
     return any;
 }
 
 /* Leaves out the pixels whose nearest ones have no disparity. */
-static inline void keep_found(const disparity_map *map, ptrdiff_t count, block *k) {
+static inline void keep_found(const disparity_map *map, block *k) {
+    const ptrdiff_t count = k->count, filled = filled_up(k);
     ptrdiff_t n = 0;
     float value[BLOCK];
     int32_t found[BLOCK];
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < filled; i++) {
         value[i] = map->values[k->at[i]];
     }
-    for (int i = 0; i < BLOCK; i++) {
+    for (ptrdiff_t i = 0; i < filled; i++) {
         found[i] = k->inside[i] & (value[i] == value[i]);
     }
     for (ptrdiff_t i = 0; i < count; i++) {
@@ -249,9 +255,6 @@ static inline void read_around(const disparity_map *map, block *k) {
         }
     }
 }
-
-/* Numbers of pixels that whole registers hold. */
-static inline ptrdiff_t filled_up(const block *k) { return (k->count + 15) / 16 * 16; }
 
 /* Standard deviation of the disparities: they are rough by how far they lie from the mean of their neighbours,
  * along the axis where that is more; matches in foliage and at edges are less certain than those on smooth
@@ -354,10 +357,11 @@ void VERSION_OF(depth_candidates)(const float *disparity, ptrdiff_t map_height, 
             const ptrdiff_t first = y * columns + start;
             memset(depth + first, 0, (size_t)count * sizeof *depth);
             memset(sigma + first, 0, (size_t)count * sizeof *sigma);
+            k.count = count;
             if (!locate(g, &map, (double)(first_row + y), (double)start, &k) || !find_nearest(&map, &k)) {
                 continue;
             }
-            keep_found(&map, count, &k);
+            keep_found(&map, &k);
             read_around(&map, &k);
             find_spread(g, &k);
             interpolate(g->max_disparity_step, &k);
