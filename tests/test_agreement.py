@@ -433,7 +433,7 @@ def with_cameras(project, change):
     return changed
 
 
-def test_a_camera_with_one_wrong_focal_length_is_refused_before_anything_is_matched(project):
+def test_a_camera_with_one_wrong_focal_length_is_refused_before_anything_is_undistorted(project):
     """Most points agreed with depth maps made with it, in which only one direction was wrong."""
     wrong = with_cameras(project, [0.1, 1, 1, 1])
     folders = {"images": project / "images", "output": project / "dense"}
@@ -443,7 +443,13 @@ def test_a_camera_with_one_wrong_focal_length_is_refused_before_anything_is_matc
     ):
         with pytest.raises(NoResultError, match=r"no other size or crop .*one of two focal lengths"):
             run()
-    assert not list((project / "dense/stereo").rglob("*.bin"))
+    assert not (project / "dense/images").exists()
+    # Of a workspace that another program undistorted nothing is matched.
+    shutil.copytree(wrong, project / "other/sparse")
+    shutil.copytree(folders["images"], project / "other/images")
+    with pytest.raises(NoResultError, match="no other size or crop"):
+        colmap_sph.run(workspace=project / "other", options=OPTIONS)
+    assert not list((project / "other/stereo").rglob("*.bin"))
 
 
 @pytest.mark.parametrize(
