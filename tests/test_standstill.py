@@ -118,6 +118,8 @@ def test_an_object_with_eight_equal_sides_is_matched(tmp_path):
     pictures = [photograph(each, cameras[0], 0)[0] for each in eggs]
     assert not still_images(context_of(tmp_path, pictures * 8, views_of(cameras)))
     assert still_images(context_of(tmp_path, pictures[:1] * 16, views_of(cameras))) == 16
+    # And all there are, where each of its sides has one.
+    assert not still_images(context_of(tmp_path, pictures[:1] * 8, views_of(cameras[::2])))
 
 
 def test_a_masked_backdrop_is_not_told_again(tmp_path):

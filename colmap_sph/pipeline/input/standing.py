@@ -30,8 +30,8 @@ def with_still_pixels(context: Context, names: Collection[str]) -> Context:
     """Look which cameras show something that stands still: reported, and known to the context that is returned.
 
     Of each camera the images that are turned most are compared with each other. Where these have next to nothing
-    in common, the others are not looked at. Nor are they where this is not in images that are turned a little: an
-    object with eight equal sides looks alike at eight turns.
+    in common, the others are not looked at. Nor are they where this is not in images that are turned a little, or
+    where there are none: an object with eight equal sides looks alike at eight turns.
 
     Parameters
     ----------
@@ -67,10 +67,11 @@ def _still_shares(
         with suppress(InputError):  # told by the stage that needs it
             small[name] = read_small(context.workspace.image_path(name), _LOOKED_AT)
     shares = {}
-    for name in sorted(compared & turned.keys() & small.keys()):
+    for name in sorted(turned.keys() & beside.keys() & small.keys()):
+        if beside[name] not in small:
+            continue
         still = still_pixels(small[name], [small[other] for other in turned[name] if other in small])
-        if beside[name] in small:
-            still &= still_pixels(small[name], [small[beside[name]]])
+        still &= still_pixels(small[name], [small[beside[name]]])
         with suppress(InputError):
             wanted = _wanted(context, name, still.shape)
             if wanted.any():
