@@ -23,8 +23,8 @@ Mask = NDArray[np.uint8]
 
 # Images that are turned by so many degrees show no surface alike.
 _TURNED = 45.0
-# An object with equal sides looks alike at some turns, but hardly at this one. Where images are nowhere turned by less
-# than the second, all may show one of its sides.
+# An object with equal sides looks alike at some turns, but hardly at this one. Where images are nowhere turned by
+# less than the second, all may show one of its sides.
 _TURNED_LITTLE = 20.0
 _NOT_LITTLE = 35.0
 # So many images of a camera are compared with the others, those that are turned most against each other; fewer
