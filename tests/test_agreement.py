@@ -25,6 +25,7 @@ from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.self_check import (
     judge_agreement,
+    judge_copies,
     judge_reprojection,
     refuse_cameras,
     refuse_disagreement,
@@ -420,6 +421,25 @@ def test_a_camera_that_does_not_belong_to_its_points_is_told(project, capsys):
     assert sound.doubts == ""
     with pytest.raises(NoResultError, match="cameras or poses of the model are not those"):
         colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)
+
+
+def test_a_copy_at_another_pose_is_told_with_its_cause(project):
+    first, *_, last = FOUR_NAMES
+    shutil.copy(project / "images" / first, project / "images" / last)
+    report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    assert f"the same file under other names, but at other poses: {first}, {last}. Only" in report.doubts
+
+
+def test_a_copy_at_the_pose_of_its_image_does_no_harm(project):
+    """Structure from motion places it to a hundredth of a pixel or so, and not at the pose of the next image."""
+    scene = read_scene(project / "sparse/0")
+    view = scene.views[0]
+    away = 1e-5 * np.linalg.norm(scene.views[-1].center - view.center)
+    for other, is_told in ((view.center + away, False), (scene.views[1].center, True)):
+        copy = replace(view, name="copy.jpg", t=-view.R @ other)
+        report = RunReport()
+        judge_copies(report, replace(scene, views=(*scene.views, copy)), {view.name: "1", "copy.jpg": "1"})
+        assert ("copy.jpg" in report.doubts) == is_told
 
 
 def with_cameras(project, change):
