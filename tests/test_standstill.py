@@ -219,14 +219,21 @@ def test_an_object_in_the_hand_is_free_of_the_room_behind_it(model, tmp_path):
     assert report.points > 20_000
 
 
-def test_the_room_does_not_tell_of_poses(model, tmp_path):
+@pytest.mark.parametrize("keep_blank", [False, True])
+def test_the_room_does_not_tell_of_poses(model, tmp_path, keep_blank):
     """Its features lie far from their epipolar planes, as those of a model whose images were exchanged."""
     without_points = pycolmap.Reconstruction(model)
     for point in list(without_points.points3D):
         without_points.delete_point3D(point)
     (tmp_path / "sparse").mkdir()
     without_points.write(tmp_path / "sparse")
-    report = colmap_sph.run(tmp_path / "sparse", images=model.parents[1] / "images", output=tmp_path / "dense")
+    report = colmap_sph.run(
+        tmp_path / "sparse",
+        images=model.parents[1] / "images",
+        output=tmp_path / "dense",
+        options=RunOptions(matching=MatchingOptions(keep_blank=keep_blank)),
+    )
+    assert ("are matched all the same, as" in report.still) == keep_blank
     assert report.still
     assert not report.doubts
     assert report.points > 20_000
