@@ -25,6 +25,7 @@ from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.self_check import (
     judge_agreement,
+    judge_copies,
     judge_reprojection,
     misplaced_views,
     refuse_cameras,
@@ -451,7 +452,26 @@ def test_the_one_image_with_another_focal_length_is_left_out(project):
     assert misplaced_views(scene) == {FOUR_NAMES[0]: scene.view(FOUR_NAMES[0]).reprojection_error}
 
 
-def test_a_camera_that_is_not_that_of_its_points_is_refused_before_anything_is_matched(project):
+def test_a_copy_at_another_pose_is_told_with_its_cause(project):
+    first, *_, last = FOUR_NAMES
+    shutil.copy(project / "images" / first, project / "images" / last)
+    report = colmap_sph.run(project / "sparse/0", options=OPTIONS)
+    assert f"the same file under other names, but at other poses: {first}, {last}. Only" in report.doubts
+
+
+def test_a_copy_at_the_pose_of_its_image_does_no_harm(project):
+    """Structure from motion places it to a hundredth of a pixel or so, and not at the pose of the next image."""
+    scene = read_scene(project / "sparse/0")
+    view = scene.views[0]
+    away = 1e-5 * np.linalg.norm(scene.views[-1].center - view.center)
+    for other, is_told in ((view.center + away, False), (scene.views[1].center, True)):
+        copy = replace(view, name="copy.jpg", t=-view.R @ other)
+        report = RunReport()
+        judge_copies(report, replace(scene, views=(*scene.views, copy)), {view.name: "1", "copy.jpg": "1"})
+        assert ("copy.jpg" in report.doubts) == is_told
+
+
+def test_a_camera_that_is_not_that_of_its_points_is_refused_before_anything_is_undistorted(project):
     wrong, folders = project / "wrong", {"images": project / "images", "output": project / "dense"}
     wrong.mkdir()
     with_focal_lengths(pycolmap.Reconstruction(project / "sparse/0"), 0.9, 0.9, 4).write_binary(wrong)
@@ -461,7 +481,13 @@ def test_a_camera_that_is_not_that_of_its_points_is_refused_before_anything_is_m
     ):
         with pytest.raises(NoResultError, match="Give the model as it was adjusted"):
             run()
-    assert not list((project / "dense/stereo").rglob("*.bin"))
+    assert not (project / "dense/images").exists()
+    # Of a workspace that another program undistorted nothing is matched.
+    shutil.copytree(wrong, project / "other/sparse")
+    shutil.copytree(folders["images"], project / "other/images")
+    with pytest.raises(NoResultError, match="Give the model as it was adjusted"):
+        colmap_sph.run(workspace=project / "other", options=OPTIONS)
+    assert not list((project / "other/stereo").rglob("*.bin"))
 
 
 def test_poses_that_are_not_those_of_the_points_are_refused_before_anything_is_matched(project):

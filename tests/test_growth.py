@@ -121,6 +121,51 @@ def test_points_in_view_of_all_are_thinned_alike(monkeypatch: pytest.MonkeyPatch
         assert rows.tolist() == list(range(0, 200, 4))
 
 
+def strip(images: int) -> Scene:
+    """Images in a row, which see the same number of points each, turned anyhow, and points far off."""
+    rng = np.random.default_rng(images)
+    centres = np.column_stack([np.arange(images) * 3.0, *rng.uniform(-1, 1, (2, images))])
+    points = np.column_stack(
+        [rng.uniform(-5, 3 * images + 5, 10 * images), *rng.uniform(-5, 15, (2, 10 * images))]
+    )
+    points[::50] *= rng.uniform(-1e6, 1e6, (len(points[::50]), 1))
+    scene = scene_of(centres, points, [NOTHING] * images)
+    turned = []
+    for view in scene.views:
+        q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        R = q * np.sign(np.linalg.det(q)) if view.image_id % 2 else view.R
+        turned.append(replace(view, R=R, t=-R @ centres[view.image_id]))
+    turned[3] = replace(turned[3], t=np.full(3, np.nan))
+    return replace(scene, views=tuple(turned))
+
+
+def test_points_in_view_are_those_that_a_projection_of_all_finds() -> None:
+    scene = strip(60)
+    points, in_view = frusta.likely_in_view(scene)
+    for view, rows in zip(scene.views, in_view, strict=True):
+        x, y, depth = view.K @ (view.R @ points.T + view.t[:, None])
+        seen = (depth > 0) & (x > 0) & (y > 0) & (x < view.width * depth) & (y < view.height * depth)
+        assert rows.tolist() == np.flatnonzero(seen).tolist()
+    assert sum(map(len, in_view)) > 500 and not len(in_view[3])
+
+
+def test_views_are_asked_for_points_near_them_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    sees = frusta.sees
+
+    def count(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
+        asked.append(len(points))
+        return sees(view, points)
+
+    monkeypatch.setattr(frusta, "sees", count)
+    per_view = []
+    for images in (100, 800):
+        asked.clear()
+        frusta.likely_in_view(strip(images))
+        per_view.append(np.median(asked[-images:]))
+    assert 0 < per_view[1] < 2 * per_view[0]
+
+
 def test_a_camera_that_hovers_finds_who_stands_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hundreds of images stand side by side and share all points; a few others share half of them."""
     monkeypatch.setattr(pairs, "_MOST_SHARING", 20)

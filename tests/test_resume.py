@@ -213,6 +213,19 @@ def test_photometric_maps_do_not_outlive_other_normals(finished: Finished) -> No
     assert finished.rerun(**others).made == NOTHING
 
 
+def test_a_photometric_map_of_another_program_stays_and_is_told_once(
+    finished: Finished, caplog: pytest.LogCaptureFixture
+) -> None:
+    finished.rerun(fusion=FusionOptions(input="photometric"))
+    foreign, *_ = sorted(finished.dense.glob("stereo/depth_maps/*.photometric.bin"))
+    foreign.write_bytes(b"its own")
+    others: dict[str, Any] = {"normals": NormalOptions(radius=2)}
+    for made, told in ((4, 1), (0, 1)):
+        assert finished.rerun(**others).made["vote on depth"] == made
+        assert [path.read_bytes() for path in finished.dense.glob("stereo/*/*.photometric.bin")] == [b"its own"]
+        assert caplog.text.count(f"{foreign} is not what this program wrote there") == told
+
+
 def results_of_votes(dense: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in dense.glob("colmap_sph/photometric/*")}
 

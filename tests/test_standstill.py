@@ -1,5 +1,7 @@
 """What stands still while the camera turns is not of the scene: it gets no depth, and this is told."""
 
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,11 +15,14 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.stages import photo
+from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.poses.standstill import still_pixels, turned_views
+from colmap_sph.stereo.rectification import RectificationOptions
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 340.0
 RADII = np.array([0.3, 0.4, 0.45])
@@ -118,6 +123,48 @@ def test_an_object_with_eight_equal_sides_is_matched(tmp_path):
     pictures = [photograph(each, cameras[0], 0)[0] for each in eggs]
     assert not still_images(context_of(tmp_path, pictures * 8, views_of(cameras)))
     assert still_images(context_of(tmp_path, pictures[:1] * 16, views_of(cameras))) == 16
+    # And all there are, where each of its sides has one.
+    assert not still_images(context_of(tmp_path, pictures[:1] * 8, views_of(cameras[::2])))
+
+
+def test_images_that_others_are_compared_with_are_read_once(tmp_path, monkeypatch):
+    cameras = ring(IMAGES, 2, 0.7)
+    picture = photograph(egg(), cameras[0], 0)[0]
+    views = views_of(cameras)
+    context = with_still_pixels(context_of(tmp_path, [picture] * IMAGES, views), [view.name for view in views])
+    place = context.workspace.image_path
+    read: list[str] = []
+    small = photo.read_small
+
+    def count(path: Path, side: int) -> photo.Mask:
+        read.append(path.name)
+        return small(path, side)
+
+    monkeypatch.setattr(photo, "read_small", count)
+    with photo.kept_masks.holding(1 << 24):
+        for view in views:
+            assert photo.still_mask(view, place(view.name), [*map(place, context.still[view.name])]).any()
+    compared = {name for names in context.still.values() for name in names}
+    assert sorted(read) == sorted([*compared, *(view.name for view in views)])
+
+
+def test_memory_to_compare_small_images_is_counted(tmp_path):
+    """Pairs that are matched coarsely need less."""
+    cameras = ring(IMAGES, 2, 0.7)
+    views = views_of(cameras)
+    context = context_of(tmp_path, [photograph(egg(), cameras[0], 0)[0]] * IMAGES, views)
+    coarse = replace(context.options, rectification=RectificationOptions(sampling=0.2))
+    pair = (views[0].name, views[1].name)
+    needed = [
+        MatchStage(replace(context, options=coarse, still=still), [pair]).job(pair).cost.memory
+        for still in ({}, dict.fromkeys(pair, ("03.png", "04.png", "05.png")))
+    ]
+    image = np.zeros((HEIGHT, WIDTH), np.uint8)
+    tracemalloc.start()
+    still_pixels(image, [image] * 3)
+    measured = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert needed[0] < measured < needed[1]
 
 
 def test_a_masked_backdrop_is_not_told_again(tmp_path):
@@ -172,14 +219,21 @@ def test_an_object_in_the_hand_is_free_of_the_room_behind_it(model, tmp_path):
     assert report.points > 20_000
 
 
-def test_the_room_does_not_tell_of_poses(model, tmp_path):
+@pytest.mark.parametrize("keep_blank", [False, True])
+def test_the_room_does_not_tell_of_poses(model, tmp_path, keep_blank):
     """Its features lie far from their epipolar planes, as those of a model whose images were exchanged."""
     without_points = pycolmap.Reconstruction(model)
     for point in list(without_points.points3D):
         without_points.delete_point3D(point)
     (tmp_path / "sparse").mkdir()
     without_points.write(tmp_path / "sparse")
-    report = colmap_sph.run(tmp_path / "sparse", images=model.parents[1] / "images", output=tmp_path / "dense")
+    report = colmap_sph.run(
+        tmp_path / "sparse",
+        images=model.parents[1] / "images",
+        output=tmp_path / "dense",
+        options=RunOptions(matching=MatchingOptions(keep_blank=keep_blank)),
+    )
+    assert ("are matched all the same, as" in report.still) == keep_blank
     assert report.still
     assert not report.doubts
     assert report.points > 20_000

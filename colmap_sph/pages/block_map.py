@@ -3,6 +3,7 @@
 import threading
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,6 +20,8 @@ _FEWEST_CELLS = 48
 _COUNTED_CELLS = 160
 # Cloud points per cell that leave few holes.
 _POINTS_PER_CELL = 3.0
+# Gaps narrower than so many cells are not the scene's: the cloud is thinned, or only some of its points are drawn.
+_GAP = 5
 # Share of points and cameras that the frame goes around; it is then wider by so much.
 _INSIDE = 98.0
 _MARGIN = 0.04
@@ -77,7 +80,7 @@ def frame_around(points: NDArray[np.float64], centers: NDArray[np.float64], axes
 def seen_from_above(
     frame: Frame, points: NDArray[np.float64], colours: Bytes
 ) -> tuple[Bytes, Bytes, tuple[float, float]]:
-    """Draw the highest point of each cell.
+    """Draw the highest point of each cell, in small gaps that of the nearest.
 
     Parameters
     ----------
@@ -103,13 +106,25 @@ def seen_from_above(
     is_highest = up[inside] == highest[cells]
     top = np.full(len(highest), -1, np.int64)
     top[cells[is_highest]] = np.flatnonzero(inside)[is_highest]  # of several the last counts
-    there = (top >= 0).reshape(shape)
+    top = _without_gaps(top.reshape(shape))
+    there = top >= 0
     picture = np.zeros((*shape, 4), np.uint8)
     if there.any():
-        picture[there] = np.column_stack([colours[top[top >= 0]], np.full(there.sum(), 255, np.uint8)])
-    height = np.where(there, up[np.maximum(top, 0)].reshape(shape) if len(up) else 0.0, 0.0)
+        picture[there] = np.column_stack([colours[top[there]], np.full(there.sum(), 255, np.uint8)])
+    height = np.where(there, up[np.maximum(top, 0)] if len(up) else 0.0, 0.0)
     extent = max(frame.high - frame.low, 1e-12)
     return picture, shaded((height - frame.low) / extent, there, clear=True), (0.0, extent)
+
+
+def _without_gaps(top: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(h, w) numbers of points in cells, -1: none; in small gaps between them that of the nearest instead."""
+    empty = (top < 0).astype(np.uint8)
+    around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_GAP, _GAP))
+    closed = cv2.morphologyEx(1 - empty, cv2.MORPH_CLOSE, around)
+    _, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    point_of = np.full(nearest.max() + 1, -1)
+    point_of[nearest[empty == 0]] = top[empty == 0]
+    return np.where(closed > 0, point_of[nearest], top)
 
 
 def _cells(

@@ -40,6 +40,10 @@ _IMPOSSIBLE_SHARE = 0.03
 # Points tell focal lengths to some thousandths, even of bent images; depth is wrong by as much as they are.
 _OTHER_FOCAL_LENGTH = 0.03
 _MAX_NAMED = 10
+# A copy whose pose was found, too, has that of the image itself: within so much of the extent of all images, and
+# so many radians.
+_ONE_PLACE = 1e-3
+_ONE_DIRECTION = 0.01
 # Rows of pairs with good poses and lenses disagree by no more; by twice as much, the results suffer.
 _EXPECTED_PIXELS = 0.2
 _IMPRECISE_PIXELS = 0.4
@@ -126,6 +130,40 @@ def judge_reprojection(report: RunReport, scene: Scene) -> float:
         )
         add_doubt(report, words)
     return len(far) / max(len(scene.views), 1)
+
+
+def judge_copies(report: RunReport, scene: Scene, contents: Mapping[str, str]) -> None:
+    """Warn of images that are the same file under other names, at other poses: only one of these can be right.
+
+    Parameters
+    ----------
+    report : RunReport
+        Gets the doubts.
+    scene : Scene
+    contents : mapping of str to str
+        Name of an image → digest of its file.
+    """
+    same: dict[str, list[View]] = {}
+    for view in scene.views:
+        # What is cut from a wide image may be black in all of them.
+        if view.name in contents and not view.original:
+            same.setdefault(contents[view.name], []).append(view)
+    near = _ONE_PLACE * float(np.linalg.norm(np.ptp([view.center for view in scene.views], axis=0)))
+    copies = []
+    for first, *others in same.values():
+        apart = [view for view in others if not _is_one_pose(first, view, near)]
+        copies += [", ".join(view.name for view in (first, *apart))] if apart else []
+    if copies:
+        add_doubt(
+            report,
+            f"These images are the same file under other names, but at other poses: {_named(copies, '; ')}. Only "
+            "one of these poses can be right: give each image its own file, or remove the copies from the model.",
+        )
+
+
+def _is_one_pose(first: View, second: View, near: float) -> bool:
+    turned = np.linalg.norm(first.R - second.R) / np.sqrt(2)  # radians, of small angles
+    return bool(turned <= _ONE_DIRECTION and np.linalg.norm(first.center - second.center) <= near)
 
 
 def refuse_cameras(scene: Scene) -> None:
@@ -250,6 +288,6 @@ def _doubts(doubted: Mapping[str, float]) -> str:
     )
 
 
-def _named(names: list[str]) -> str:
+def _named(names: list[str], between: str = ", ") -> str:
     more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-    return ", ".join(names[:_MAX_NAMED]) + more
+    return between.join(names[:_MAX_NAMED]) + more

@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from colmap_sph.errors import InputError
 from colmap_sph.scene import Region, Scene, View
@@ -77,7 +76,9 @@ class SparseTracks:
         indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in observed])])
         indices = np.concatenate([*observed, np.empty(0, np.int64)])
         shape = (len(observed), len(scene.points))
-        seen = sparse.csr_array((np.ones(len(indices), np.int8), indices, indptr), shape=shape).T.tocsr()
+        from scipy.sparse import csr_array  # which takes long to load
+
+        seen = csr_array((np.ones(len(indices), np.int8), indices, indptr), shape=shape).T.tocsr()
         seen.sort_indices()
         self._first, self._views = seen.indptr.astype(np.int64), seen.indices
         self._cameras = np.array([view.K @ view.cam_from_world for view in scene.views])

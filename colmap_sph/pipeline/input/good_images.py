@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.self_check import misplaced_views, refuse_cameras
+from colmap_sph.pipeline.self_check import judge_copies, misplaced_views, refuse_cameras
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of, tell_changed
 from colmap_sph.pipeline.stages.stage import keys_of
 from colmap_sph.project.workspace import Workspace
@@ -53,6 +53,7 @@ def with_good_images(
     places = _places(workspace)
     checked = executor(CheckStage(context, sizes, places, worked_at, verify=verify)) if there else {}
     images = keys_of(checked)
+    judge_copies(context.report, context.scene, images)
     details = {
         name: _CUT_DETAIL * detail if context.scene.view(name).original else detail
         for name, detail in details_of(checked).items()

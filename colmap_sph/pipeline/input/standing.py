@@ -30,8 +30,9 @@ def with_still_pixels(context: Context, names: Collection[str]) -> Context:
     """Look which cameras show something that stands still: reported, and known to the context that is returned.
 
     Of each camera the images that are turned most are compared with each other. Where these have next to nothing
-    in common, the others are not looked at. Nor are they where this is not in images that are turned a little: an
-    object with eight equal sides looks alike at eight turns.
+    in common, the others are not looked at. Nor are they where this is not in images that are turned a little, or
+    where there are none: an object with eight equal sides looks alike at eight turns. Where such pixels are to be
+    matched all the same, they matter to models without points: features there tell nothing of the poses.
 
     Parameters
     ----------
@@ -39,7 +40,8 @@ def with_still_pixels(context: Context, names: Collection[str]) -> Context:
     names : collection of str
         Images that are there.
     """
-    if context.options.matching.keep_blank:
+    keep = context.options.matching.keep_blank
+    if keep and context.scene.has_tracks:
         return context
     views = [context.scene.view(name) for name in sorted(names)]
     turned = turned_views(views)
@@ -51,7 +53,7 @@ def with_still_pixels(context: Context, names: Collection[str]) -> Context:
             still[name] = others
     if still:
         looked_at = [shares[name] for name in still if name in shares]
-        context.report.still = _words(len(still), float(np.mean(looked_at)))
+        context.report.still = _words(len(still), float(np.mean(looked_at)), keep=keep)
         logger.warning("%s", context.report.still)
     return replace(context, still=still)
 
@@ -67,10 +69,11 @@ def _still_shares(
         with suppress(InputError):  # told by the stage that needs it
             small[name] = read_small(context.workspace.image_path(name), _LOOKED_AT)
     shares = {}
-    for name in sorted(compared & turned.keys() & small.keys()):
+    for name in sorted(turned.keys() & beside.keys() & small.keys()):
+        if beside[name] not in small:
+            continue
         still = still_pixels(small[name], [small[other] for other in turned[name] if other in small])
-        if beside[name] in small:
-            still &= still_pixels(small[name], [small[beside[name]]])
+        still &= still_pixels(small[name], [small[beside[name]]])
         with suppress(InputError):
             wanted = _wanted(context, name, still.shape)
             if wanted.any():
@@ -86,9 +89,15 @@ def _wanted(context: Context, name: str, shape: tuple[int, ...]) -> NDArray[np.b
     return np.asarray(cv2.erode(small, np.ones((_SIDE, _SIDE), np.uint8))) > 0
 
 
-def _words(images: int, share: float) -> str:
+def _words(images: int, share: float, *, keep: bool) -> str:
+    ignored = (
+        "ignored. Masks (--masks) are more exact; --matching.keep-blank True matches these pixels all the same."
+    )
+    kept = (
+        "matched all the same, as --matching.keep-blank asks. They have no part in the check of the poses; masks "
+        "(--masks) would leave them out."
+    )
     return (
         f"{share:.0%} of the pixels of {images} images stand still while the camera turns, as a backdrop, a time "
-        "stamp or a part of the vehicle would: they are not of the scene, and are ignored. Masks (--masks) are "
-        "more exact; --matching.keep-blank True matches these pixels all the same."
+        f"stamp or a part of the vehicle would: they are not of the scene, and are {kept if keep else ignored}"
     )

@@ -1,5 +1,6 @@
 """A view's depth and normal map on disk, vouched for by a record."""
 
+import logging
 import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +15,7 @@ from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.state.ownership import Place, remove_place
 from colmap_sph.project.state.records import (
+    altered_files,
     begin,
     read_record,
     recorded_facts,
@@ -21,6 +23,8 @@ from colmap_sph.project.state.records import (
     vouched_facts,
     whole_digests,
 )
+
+logger = logging.getLogger(__name__)
 
 MAP_BYTES = 16.0
 """Bytes on disk per pixel, of a depth and a normal map."""
@@ -106,12 +110,16 @@ class MapFiles:
     def are_outdated(self, key: str) -> bool:
         """Whether there are maps of ours that were made under another key."""
         record = read_record(self.record)
-        return record is not None and record.state == "done" and record.key != key
+        if record is None or record.state != "done" or record.key == key:
+            return False
+        files = [path for path in (self.depth, self.normals) if os.path.lexists(path)]
+        return not files or len(altered_files(record, files)) < len(files)
 
     def remove(self) -> None:
-        """Remove maps that this program made, where there are any."""
+        """Remove maps that this program made, where there are any; those that others put there stay."""
         if os.path.lexists(self.record):
-            remove_place(Place(self.record, (self.depth, self.normals)))
+            for path in remove_place(Place(self.record, (self.depth, self.normals))):
+                logger.warning("%s is not what this program wrote there; it stays", path)
 
     def partners(self) -> tuple[str, ...]:
         """Names of the images that the view was matched with, as far as that is known."""

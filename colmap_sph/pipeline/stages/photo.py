@@ -22,8 +22,11 @@ Mask = NDArray[np.uint8]
 
 # What stands still is looked for with so many pixels along an image's longest side.
 _STILL_SIDE = 960
+# Largest bytes in use then, per pixel of that size.
+_STILL_BYTES = 75.0
 
 kept_masks: LoadCache[Mask | None] = LoadCache(lambda mask: 0 if mask is None else mask.nbytes)
+"""What `PhotoFile.kept_pixels` returned, and the small images of many views that others are compared with."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +95,21 @@ class PhotoFile:
 
 def still_mask(view: View, image: Path, turned: Sequence[Path]) -> Mask:
     """1 where an image of a view and those that it is compared with show the same, see `still_pixels`, else 0."""
-    still = still_pixels(read_small(image, _STILL_SIDE), (read_small(path, _STILL_SIDE) for path in turned))
+    still = still_pixels(read_small(image, _STILL_SIDE), map(_compared, turned))
     return np.asarray(cv2.resize(still, (view.width, view.height), interpolation=cv2.INTER_NEAREST), np.uint8)
+
+
+def still_bytes(*views: View) -> tuple[float, float]:
+    """Bytes of a view's small image, of all views, and largest bytes in use while `still_mask` looks at one."""
+    pixels = [view.num_pixels * min(_STILL_SIDE / max(view.width, view.height), 1.0) ** 2 for view in views]
+    return sum(pixels), _STILL_BYTES * max(pixels, default=0.0)
+
+
+def _compared(path: Path) -> Mask:
+    """A small image that many are compared with."""
+    small = kept_masks.get(f"{file_stamp(path)} small", lambda: read_small(path, _STILL_SIDE))
+    assert small is not None
+    return small
 
 
 def read_small(path: Path, longest: int) -> Mask:

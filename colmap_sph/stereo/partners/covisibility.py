@@ -6,15 +6,17 @@ these, and without matches the overlap of the viewing frusta.
 
 import logging
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse
 
 from colmap_sph.scene import Photograph, Scene
 from colmap_sph.stereo.partners.frusta import likely_in_view, points_in_view
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles, worth_of
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +66,7 @@ class Covisibility:
         points: NDArray[np.float64],
         observed: list[NDArray[np.int64]],
         least: int,
-        matches: sparse.csr_array | None = None,
+        matches: "csr_array | None" = None,
     ) -> None:
         self.photographs = photographs
         self.source = source
@@ -232,16 +234,20 @@ def _together(observed: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     return observed[0] if len(observed) == 1 else np.unique(np.concatenate(observed))
 
 
-def _incidence(observed: list[NDArray[np.int64]], num_points: int) -> sparse.csr_array:
+def _incidence(observed: list[NDArray[np.int64]], num_points: int) -> "csr_array":
     """(V, N) matrix of ones where a photograph sees a point."""
+    from scipy.sparse import csr_array  # which takes long to load, here and below
+
     indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
     indices = np.concatenate([*observed, np.empty(0, np.int64)]).astype(np.int32)
     ones = np.ones(len(indices), dtype=np.int8)
-    return sparse.csr_array((ones, indices, indptr), shape=(len(observed), num_points))
+    return csr_array((ones, indices, indptr), shape=(len(observed), num_points))
 
 
-def _match_counts(photographs: Sequence[Photograph], matches: Mapping[tuple[str, str], int]) -> sparse.csr_array:
+def _match_counts(photographs: Sequence[Photograph], matches: Mapping[tuple[str, str], int]) -> "csr_array":
     """Numbers of verified matches between photographs, as a (V, V) matrix."""
+    from scipy.sparse import csr_array
+
     index_of = {photograph.name: index for index, photograph in enumerate(photographs)}
     known = [
         (index_of[a], index_of[b], n)
@@ -250,4 +256,4 @@ def _match_counts(photographs: Sequence[Photograph], matches: Mapping[tuple[str,
     ]
     first, second, counts = np.array(known, dtype=np.int64).reshape(-1, 3).T
     both = (np.tile(counts, 2), (np.concatenate([first, second]), np.concatenate([second, first])))
-    return sparse.csr_array(both, shape=(len(photographs),) * 2)
+    return csr_array(both, shape=(len(photographs),) * 2)

@@ -7,7 +7,7 @@ of these distances away. So every view's frustum is sampled at a few multiples o
 and whoever sees most of each other's samples overlaps most. Occlusion is not considered.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import wraps
 from weakref import WeakKeyDictionary
 
@@ -31,6 +31,8 @@ _MAX_POINTS = 20_000
 _LEAST_IN_VIEW = 512
 _IN_VIEW_OF_ALL = 1 << 24
 _NUM_ASKED = 64
+# Points that lie beside each other are asked together first, so many at most.
+_BLOCK_POINTS = 64
 
 Sights = tuple[NDArray[np.float64], list[NDArray[np.int64]]]
 """(N, 3) points, world frame, and for every view the ascending rows of those that it has in view."""
@@ -122,7 +124,48 @@ def observe_points(scene: Scene) -> Sights:
         step *= -(-int(seen) // most) or 1
     rows = np.arange(0, len(points), step, dtype=np.int64)
     used = points[rows]
-    return points, [rows[sees(view, used)] for view in views]
+    blocks = _Blocks(used)
+    near = (blocks.near(view) for view in views)
+    return points, [rows[few[sees(view, used[few])]] for view, few in zip(views, near, strict=True)]
+
+
+class _Blocks:
+    """Points in blocks of such that lie beside each other: few blocks are near what a view has in sight.
+
+    Parameters
+    ----------
+    points : (N, 3) float64 ndarray
+        Finite.
+    """
+
+    def __init__(self, points: NDArray[np.float64]) -> None:
+        self._rows = list(_halved(points, np.arange(len(points))))
+        ends = np.array([(points[rows].min(axis=0), points[rows].max(axis=0)) for rows in self._rows])
+        low, high = np.moveaxis(ends.reshape(-1, 2, 3), 1, 0)
+        self._middles = (low + high) / 2
+        # Half their diagonals, and some more for what is lost in rounding.
+        self._radii = 0.501 * np.linalg.norm(high - low, axis=1) + 1e-9 * np.abs(points).max(initial=0.0)
+
+    def near(self, view: View) -> NDArray[np.int64]:
+        """Ascending rows of all points that a view has in sight, and some more."""
+        across, down, depth = view.K @ view.cam_from_world
+        inside = np.array([depth, across, down, view.width * depth - across, view.height * depth - down])
+        with np.errstate(invalid="ignore", over="ignore"):  # of impossible poses
+            reach = np.linalg.norm(inside[:, :3], axis=1)[:, None] * self._radii
+            near = (inside[:, :3] @ self._middles.T + inside[:, 3:] >= -reach).all(axis=0)
+        found = [self._rows[block] for block in np.flatnonzero(near)]
+        return np.sort(np.concatenate([*found, np.empty(0, np.int64)]))
+
+
+def _halved(points: NDArray[np.float64], rows: NDArray[np.int64]) -> Iterator[NDArray[np.int64]]:
+    """Halves of rows of points across where these reach farthest, again and again, until few are left."""
+    if len(rows) <= _BLOCK_POINTS:
+        yield from [rows] if len(rows) else []
+        return
+    along = points[rows, int(np.ptp(points[rows], axis=0).argmax())]
+    order = rows[np.argpartition(along, len(rows) // 2)]
+    yield from _halved(points, order[: len(rows) // 2])
+    yield from _halved(points, order[len(rows) // 2 :])
 
 
 @_once

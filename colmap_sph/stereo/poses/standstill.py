@@ -23,8 +23,10 @@ Mask = NDArray[np.uint8]
 
 # Images that are turned by so many degrees show no surface alike.
 _TURNED = 45.0
-# An object with equal sides looks alike at some turns, but hardly at this one.
+# An object with equal sides looks alike at some turns, but hardly at this one. Where images are nowhere turned by
+# less than the second, all may show one of its sides.
 _TURNED_LITTLE = 20.0
+_NOT_LITTLE = 35.0
 # So many images of a camera are compared with the others, those that are turned most against each other; fewer
 # than so many turned ones tell nothing.
 _COMPARED = 9
@@ -86,15 +88,20 @@ def turned_views(views: Sequence[View]) -> dict[str, tuple[str, ...]]:
 
 
 def slightly_turned_views(views: Sequence[View], names: Collection[str]) -> dict[str, str]:
-    """Find of each of some views another of the same camera, turned by about 20 degrees; names → names."""
+    """Find of each of some views another of the same camera, turned by about 20 degrees; names → names.
+
+    Views of which no other is turned by less than 35 degrees are left out.
+    """
     found = {}
     for members in _by_camera(views):
         rotations = np.array([view.R for view in members])
         for index, view in enumerate(members):
-            if view.name in names and len(members) > 1:
-                off = np.abs(_degrees(view.R, rotations) - _TURNED_LITTLE)
-                off[index] = np.inf
-                found[view.name] = members[int(off.argmin())].name
+            if view.name in names:
+                turns = _degrees(view.R, rotations)
+                turns[index] = np.inf
+                nearest = int(np.abs(turns - _TURNED_LITTLE).argmin())
+                if turns[nearest] < _NOT_LITTLE:
+                    found[view.name] = members[nearest].name
     return found
 
 
