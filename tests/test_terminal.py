@@ -14,7 +14,7 @@ import pytest
 from conftest import keep_images
 from rich.cells import cell_len
 
-from colmap_sph.app import cli, display, log_file, run_command
+from colmap_sph.app import cli, display, log_file
 from colmap_sph.app.display import Display
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.terminal import Terminal, shortened, warnings_shown, wrapped

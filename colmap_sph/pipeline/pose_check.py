@@ -230,7 +230,7 @@ def _doubt_images(context: Context, matched: Mapping[Pair, Result], compared: Se
         own, _ = _compare(context, [pair for pair in sorted(matched) if name in pair][:_MOST_ASKED])
         if not others or len(own) < _FEWEST_OF_IMAGE:
             continue
-        distance = median(float(np.median(pair.distances())) for pair in own)
+        distance = median(float(np.median(pair.distances)) for pair in own)
         if distance > max(_USUAL_DISTANCE, _FAR_OF_USUAL * distance_of_pairs(others)):
             doubted.append(f"{name} ({distance:.1f} %)")
     if doubted:
