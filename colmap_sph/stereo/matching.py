@@ -63,7 +63,7 @@ class MatchingOptions:
     the whole range, and the finest; a multiple of 32."""
     max_coarsest_disparities: int = 128
     """The pyramid grows until the whole range has no more disparities than this at the coarsest level."""
-    range_radius: int = 4
+    range_radius: int = 2
     """Radius, in pixels of the coarser level, of the neighbourhood whose disparities a pixel searches, too, where
     they fit."""
     max_slant: int = 3
