@@ -512,6 +512,35 @@ def test_observations_of_another_size_or_crop_are_no_wrong_cameras(project, fact
     refuse_cameras(scene_of_model(model, project))
 
 
+@pytest.mark.parametrize("rows", [40, -20])
+def test_of_points_on_one_side_a_crop_is_no_focal_length(project, rows):
+    """As on the street in front of a vehicle: farther down they would be shifted more."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        for index, point in enumerate(image.points2D):
+            if point.has_point3D() and not 0.75 < point.xy[1] / camera.height < 0.95:
+                image.reset_point3D_for_point2D(index)
+            else:
+                point.xy += (0, rows)
+    scene = scene_of_model(model, project)
+    assert min(len(view.point_indices) for view in scene.views) > 10
+    refuse_cameras(scene)
+
+
+def test_few_points_tell_no_focal_length(project):
+    """A single one always has another that explains it."""
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    image = model.images[min(model.images)]
+    middle = model.cameras[image.camera_id].params[2:]
+    seen = [index for index, point in enumerate(image.points2D) if point.has_point3D()]
+    kept, *others = sorted(seen, key=lambda index: np.linalg.norm(image.points2D[index].xy - middle))
+    for index in others:
+        image.reset_point3D_for_point2D(index)
+    image.points2D[kept].xy += 1
+    assert misplaced_views(scene_of_model(model, project)) == {}
+
+
 def test_wild_tracks_are_no_wrong_cameras(project):
     """Two in five observations are anywhere in the image."""
     model = pycolmap.Reconstruction(project / "sparse/0")

@@ -101,9 +101,9 @@ def misplaced_views(scene: Scene) -> dict[str, float]:
 
 def _has_other_focal_length(view: View) -> bool:
     """Whether its points project to where they are observed with other focal lengths than it has."""
-    return view.focal_factors is not None and bool(
-        np.abs(np.subtract(view.focal_factors, 1)).max() > _OTHER_FOCAL_LENGTH
-    )
+    if view.focal_factors is None or len(view.point_indices) < _FEWEST_OF_IMAGE:
+        return False
+    return bool(np.abs(np.subtract(view.focal_factors, 1)).max() > _OTHER_FOCAL_LENGTH)
 
 
 def judge_reprojection(report: RunReport, scene: Scene) -> float:

@@ -27,7 +27,8 @@ Moved = Callable[[pycolmap.Image, NDArray[np.float64]], NDArray[np.float64]]
 
 # A table has so many times as many places as there are points, at most.
 _MOST_GAPS = 8
-# Other focal lengths explain where points are observed where they leave less than this share of the distance.
+# Other focal lengths explain where points are observed where they leave less than this share of what is left once
+# all are shifted alike, as a crop or a turned camera does.
 _EXPLAINED = 0.25
 
 
@@ -209,11 +210,15 @@ def _with_observations(
 def _focal_factors(projected: NDArray[np.float64], observed: NDArray[np.float64]) -> tuple[float, float] | None:
     """See `View.focal_factors`; (n, 2) finite pixels from the principal point.
 
-    Observations in an image of another size would be scaled about its corner.
+    Observations in an image of another size would be scaled about its corner. Of points on one side of the image
+    alone, such as its lower third, factors explain shifts nearly as well.
     """
+    if not len(projected):
+        return None
     factors = np.array([_median_of_finite(ratios) for ratios in (observed / projected).T])
     left = _median_of_finite(np.linalg.norm(factors * projected - observed, axis=1))
-    if left < _EXPLAINED * _median_of_finite(np.linalg.norm(projected - observed, axis=1)):
+    moved = observed - projected
+    if left < _EXPLAINED * _median_of_finite(np.linalg.norm(moved - np.median(moved, axis=0), axis=1)):
         return float(factors[0]), float(factors[1])
     return None
 
