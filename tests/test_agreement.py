@@ -17,6 +17,7 @@ from colmap_sph.app import cli
 from colmap_sph.app.run_command import print_summary
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
+from colmap_sph.pipeline import preparation
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.good_images import without_misplaced
 from colmap_sph.pipeline.keys import Keys
@@ -450,6 +451,16 @@ def test_the_one_image_with_another_focal_length_is_left_out(project):
     refuse_cameras(scene)
     assert scene.view(FOUR_NAMES[0]).reprojection_error < 4  # no more than roughly adjusted poses leave
     assert misplaced_views(scene) == {FOUR_NAMES[0]: scene.view(FOUR_NAMES[0]).reprojection_error}
+
+
+def test_images_that_are_asked_first_are_not_all(project, monkeypatch):
+    """Every second one is asked: half of these have another focal length, of all only a quarter."""
+    monkeypatch.setattr(preparation, "_MOST_ASKED", 2)
+    wrong = project / "wrong"
+    wrong.mkdir()
+    with_focal_lengths(pycolmap.Reconstruction(project / "sparse/0"), 0.9, 0.9, 1).write_binary(wrong)
+    report = colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)
+    assert [*report.skipped_images] == FOUR_NAMES[:1]
 
 
 def test_a_copy_at_another_pose_is_told_with_its_cause(project):

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
@@ -68,7 +68,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-# So many images of a model tell whether its cameras are possible at all.
+# So many images of a model are asked whether its cameras are possible at all; more only where these refuse.
 _MOST_ASKED = 64
 
 
@@ -145,7 +145,7 @@ class Preparation:
         names = tuple(self._originals.cuts.names(image_names(self._originals.model)))
         if not self.options.region:
             return names
-        scene = anchored(foreseen_scene(self._originals, names, self.options.undistortion))
+        scene = anchored(self._foreseen(names))
         keys = Keys(self.workspace, self.options)
         whole = Context(self.workspace, scene, self.options, keys, report=self._report)
         part = whole.in_region()
@@ -178,10 +178,16 @@ class Preparation:
             self._child.close()
 
     def _refuse_cameras(self) -> None:
-        """Refuse impossible cameras before hours of undistortion; `with_good_images` asks all images again."""
+        """Refuse impossible cameras before hours of undistortion; `without_misplaced` asks all images again."""
         asked = self.names[:: -(-len(self.names) // _MOST_ASKED) or 1]
-        with suppress(InputError):  # of these few images; of all it is told where they are read
-            refuse_cameras(foreseen_scene(self._originals, asked, self.options.undistortion))
+        with suppress(InputError):  # of these images; it is told where they are read
+            try:
+                refuse_cameras(self._foreseen(asked))
+            except NoResultError:  # these may all be of one camera of a rig
+                refuse_cameras(self._foreseen(self.names))
+
+    def _foreseen(self, names: Collection[str]) -> Scene:
+        return foreseen_scene(self._originals, names, self.options.undistortion)
 
     def _make(self, executor: "Executor") -> None:
         images = self.check(executor)
@@ -293,7 +299,7 @@ class Preparation:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
         if not self._overwrite and self._is_model_there(sorted(results)):
             return None
-        return foreseen_scene(self._originals, results, self.options.undistortion)
+        return self._foreseen(results)
 
     def _is_model_there(self, names: Sequence[str]) -> bool:
         """Whether the workspace has the model of these images, or one that the user has changed."""
