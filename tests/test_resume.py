@@ -256,15 +256,19 @@ def test_a_changed_image_redoes_its_pairs(finished: Finished) -> None:
 
 
 @pytest.mark.parametrize(
-    ("place", "stage"),
+    ("place", "stage", "verify"),
     [
-        ("images", "undistort"),
-        ("dense/images", "match pairs"),
-        ("dense/images", "confirm depth"),
-        ("dense/images", "fuse"),
+        ("images", "undistort", False),
+        ("images", "undistort", True),
+        ("dense/images", "match pairs", False),
+        ("dense/images", "match pairs", True),
+        ("dense/images", "confirm depth", False),
+        ("dense/images", "fuse", False),
     ],
 )
-def test_an_image_that_changes_during_a_run(place: str, stage: str, pristine: Finished, tmp_path: Path) -> None:
+def test_an_image_that_changes_during_a_run(
+    place: str, stage: str, verify: bool, pristine: Finished, tmp_path: Path
+) -> None:
     """It is told; and with the former image the next run makes what an undisturbed one makes, and that once."""
     shutil.copytree(pristine.project, tmp_path / "project", ignore=shutil.ignore_patterns("dense"))
     image = tmp_path / "project" / place / NAMES[0]
@@ -280,7 +284,7 @@ def test_an_image_that_changes_during_a_run(place: str, stage: str, pristine: Fi
     assert report.incomplete[NAMES[0]] == f"{image} was changed while the run was at work; run again"
     shutil.copyfile(kept, image)
     again = Finished(tmp_path / "project", report)
-    assert again.rerun().incomplete == {}
+    assert again.rerun(verify=verify).incomplete == {}
     assert {name: content for name, (_, content) in results(again.dense).items() if "colmap_sph" not in name} == {
         name: content for name, (_, content) in results(pristine.dense).items() if "colmap_sph" not in name
     }

@@ -166,7 +166,7 @@ class CheckStage(Stage[str, ImageFile]):
     detail_sizes : mapping of str to (int, int), optional
         Width and height at which each image's detail is measured; without it, it is not.
     verify : bool
-        Whether what is known does not count.
+        Whether what is known does not count, but for doubts.
     """
 
     make = staticmethod(check_image)
@@ -188,7 +188,11 @@ class CheckStage(Stage[str, ImageFile]):
         self._bad: dict[str, str] = {}
         self._file = places.known_file(context)
         self._key = context.keys.known_images()
-        self._known = {} if context.keys.fresh or verify else read_known(self._file, self._key)
+        self._known = {} if context.keys.fresh else read_known(self._file, self._key)
+        if verify:
+            self._known = {
+                name: replace(each, digest="", stamp=()) for name, each in self._known.items() if each.doubt
+            }
         self._seen: dict[str, Known] = {}
 
     @property
