@@ -14,13 +14,15 @@ from typing import Any
 _IS_WINDOWS = sys.platform == "win32"
 # Windows sends no SIGTERM. Ctrl-Break and the end of its window or session come as SIGBREAK; others have SIGHUP.
 _BREAK: int | None = getattr(signal, "SIGBREAK", None)
-_OF_SYSTEM = [getattr(signal, name) for name in ("SIGHUP", "SIGBREAK") if hasattr(signal, name)]
-ENDING: tuple[int, ...] = (signal.SIGINT, signal.SIGTERM, *_OF_SYSTEM)
+_HANGUP: int | None = getattr(signal, "SIGHUP", None)
+ENDING: tuple[int, ...] = tuple(
+    number for number in (signal.SIGINT, signal.SIGTERM, _HANGUP, _BREAK) if number is not None
+)
 """Numbers of the signals that ask for the end."""
 
 
 def exit_code_of(number: int) -> int:
-    """What a shell reports of a program that a signal ended: 130, or 143 for all but Ctrl-C."""
+    """What a shell reports of a program that a signal ended: 130 of Ctrl-C, 143 of SIGTERM or SIGBREAK."""
     return 128 + (signal.SIGTERM if number == _BREAK else number)
 
 
