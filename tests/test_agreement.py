@@ -425,7 +425,7 @@ def with_focal_lengths(model, fx, fy, number):
         camera = pycolmap.Camera(model.cameras[image.camera_id].todict())
         camera.camera_id = 100 + index
         if index < number:
-            camera.params = np.multiply(camera.params, [fx, fy, 1, 1])
+            camera.params = list(np.multiply(camera.params, [fx, fy, 1, 1]))
         changed.add_camera_with_trivial_rig(camera)
         copy = pycolmap.Image(image.name, [point.xy for point in image.points2D], 100 + index, image.image_id)
         changed.add_image_with_trivial_frame(copy, image.cam_from_world())
@@ -544,11 +544,12 @@ def test_few_points_tell_no_focal_length(project):
     model = pycolmap.Reconstruction(project / "sparse/0")
     image = model.images[min(model.images)]
     middle = model.cameras[image.camera_id].params[2:]
-    seen = [index for index, point in enumerate(image.points2D) if point.has_point3D()]
-    kept, *others = sorted(seen, key=lambda index: np.linalg.norm(image.points2D[index].xy - middle))
+    points = list(image.points2D)
+    seen = [index for index, point in enumerate(points) if point.has_point3D()]
+    kept, *others = sorted(seen, key=lambda index: np.linalg.norm(points[index].xy - middle))
     for index in others:
         image.reset_point3D_for_point2D(index)
-    image.points2D[kept].xy += 1
+    points[kept].xy += 1
     assert misplaced_views(scene_of_model(model, project)) == {}
 
 
