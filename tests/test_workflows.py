@@ -76,7 +76,14 @@ def add_model(root: Path, name: str, code: int, message: str = "") -> Path:
 
 
 def called(*arguments: object, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(list(map(str, arguments)), capture_output=True, text=True, timeout=120, cwd=cwd)
+    return subprocess.run(
+        list(map(str, arguments)),
+        capture_output=True,
+        encoding="utf-8",
+        errors="surrogateescape",
+        timeout=120,
+        cwd=cwd,
+    )
 
 
 def test_a_batch_of_all_kinds(tmp_path: Path, stub: Path) -> None:
@@ -115,6 +122,20 @@ def test_a_batch_of_all_kinds(tmp_path: Path, stub: Path) -> None:
     assert '<a href="./one/dense-1/colmap_sph/report.json">' in page
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names of any bytes")
+@pytest.mark.parametrize("root", ["-root", "link"])
+def test_a_batch_of_odd_names(root: str, tmp_path: Path, stub: Path) -> None:
+    """None is left out for its name, which was written on another system, and none is taken for an option."""
+    names = {b"-q", "Straße".encode("latin-1"), b"two\nlines", "Übung".encode()}
+    (tmp_path / "link").symlink_to("-root")
+    for name in names:
+        add_model(tmp_path / "-root", f"{os.fsdecode(name)}/sparse/0", 0)
+    done = called(WORKFLOWS / "batch.sh", root, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "==== 4 projects, 0 failed" in done.stdout
+    assert {name for name in names if (tmp_path / root / os.fsdecode(name) / "dense/colmap_sph").is_dir()} == names
+
+
 def test_a_batch_lists_products(tmp_path: Path, stub: Path) -> None:
     root = tmp_path / "survey"
     add_model(root, "one/sparse/0", 0)
@@ -143,9 +164,10 @@ def test_an_interrupted_batch_ends(tmp_path: Path, stub: Path) -> None:
     assert len(stub.read_text().splitlines()) == 1
 
 
-def test_an_array_of_slurm(tmp_path: Path, stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    models = [add_model(tmp_path, f"p{number}/sparse/0", number) for number in (0, 5, 2)]
-    (tmp_path / "models.txt").write_text("".join(f"{model}\n" for model in models))
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_an_array_of_slurm(end: str, tmp_path: Path, stub: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    models = [add_model(tmp_path, f"p\x85{number}/sparse/0", number) for number in (0, 5, 2)]
+    (tmp_path / "models.txt").write_text("".join(f"{model}{end}" for model in models), newline="")
     codes = []
     for task in (1, 2, 3, 4):
         monkeypatch.setenv("SLURM_ARRAY_TASK_ID", str(task))
@@ -153,7 +175,10 @@ def test_an_array_of_slurm(tmp_path: Path, stub: Path, monkeypatch: pytest.Monke
             called(WORKFLOWS / "slurm_array.sh", tmp_path / "models.txt", "--output", tmp_path).returncode
         )
     assert codes == [0, 0, 2, 2]
-    assert [line.split()[2] for line in stub.read_text().splitlines()] == [str(model) for model in models]
+    assert stub.read_text().split("\n")[:-1] == [f"run --model {model} --output {tmp_path}" for model in models]
+    called(WORKFLOWS / "batch_summary.py", tmp_path / "models.txt", "--output", tmp_path / "models")
+    rows = (tmp_path / "models.tsv").read_text().splitlines()[1:]
+    assert [row.partition("\t")[0] for row in rows] == [str(model).replace("\x85", "\\x85") for model in models]
 
 
 def test_batch_and_summary_of_real_projects(

@@ -12,6 +12,7 @@ set -u
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 root=${1:?usage: batch.sh ROOT [options of colmap_sph run]}
 shift
+[[ $root != -* ]] || root=./$root # not an option of the programs below
 
 # The program on the PATH, or that of the README's virtual environment beside this folder.
 program=$(command -v colmap_sph) || program=$here/../.venv/bin/colmap_sph
@@ -19,7 +20,9 @@ program=$(command -v colmap_sph) || program=$here/../.venv/bin/colmap_sph
 
 has_model() { [ -e "$1/images.bin" ] || [ -e "$1/images.txt" ]; }
 
-mapfile -d '' models < <(find "$root" -type d -regex '.*/sparse/[0-9]+' -print0 | sort -zV)
+# As bytes: in other languages' sets of characters, names of an older one would not match.
+find_models() { LC_ALL=C find -H "$root" -regextype posix-extended -regex '.*/sparse/[0-9]+' -print0; }
+mapfile -d '' models < <(find_models | LC_ALL=C sort -zV)
 for index in "${!models[@]}"; do has_model "${models[index]}" || unset "models[index]"; done
 [ "${#models[@]}" -gt 0 ] || { echo "no folder with sparse/0 below $root" >&2; exit 2; }
 

@@ -104,7 +104,8 @@ def read_projects(path: Path) -> list[Project]:
             Project(model, Path(dense), code, message)
             for model, dense, code, message in zip(*(texts[first::4] for first in range(4)), strict=True)
         ]
-    models = [line for line in data.decode(errors="surrogateescape").splitlines() if line]
+    lines = [line.removesuffix(b"\r").decode(errors="surrogateescape") for line in data.split(b"\n")]
+    models = [line for line in lines if line]
     return [Project(model, default_output(Path(model))) for model in models]
 
 

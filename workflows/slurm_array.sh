@@ -21,7 +21,8 @@ set -eu
 list=${1:?usage: sbatch --array=1-N slurm_array.sh models.txt [options of colmap_sph run]}
 shift
 
-model=$(sed -n "${SLURM_ARRAY_TASK_ID:?submit with sbatch --array}p" "$list")
+# Lines may end as on Windows.
+model=$(sed -n "${SLURM_ARRAY_TASK_ID:?submit with sbatch --array}{s/\r\$//;p}" "$list")
 [ -n "$model" ] || { echo "$list has no line $SLURM_ARRAY_TASK_ID" >&2; exit 2; }
 
 program=$(command -v colmap_sph) || program=${SLURM_SUBMIT_DIR:-.}/.venv/bin/colmap_sph
