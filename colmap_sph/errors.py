@@ -135,17 +135,18 @@ def _visible(character: str) -> str:
     return character
 
 
-def shell_word(text: str) -> str:
-    r"""Text as one word for bash or zsh, in which nothing is hidden: a line of a log can be copied from it.
+def shell_word(text: object) -> str:
+    r"""Text or a path as one word for bash or zsh, in which nothing is hidden: it can be copied from a message.
 
     Examples
     --------
     >>> print(shell_word("my block"), shell_word("a\x1bb"))
     'my block' $'a\x1bb'
     """
-    if printable(text) == text:
-        return shlex.quote(text)
-    return f"$'{''.join(map(_escaped, text))}'"
+    word = str(text)
+    if printable(word) == word:
+        return shlex.quote(word)
+    return f"$'{''.join(map(_escaped, word))}'"
 
 
 def _escaped(character: str) -> str:

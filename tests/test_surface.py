@@ -1,6 +1,7 @@
 """Surface models and orthophotos of exact maps against the solids that were rendered, and what is refused."""
 
 import json
+import shlex
 import sys
 import tracemalloc
 from pathlib import Path
@@ -446,11 +447,13 @@ def test_a_raster_without_end_is_refused(workspace, tmp_path):
 
 
 def test_a_workspace_without_maps_is_told_what_to_do(tmp_path):
-    bare = surveyed_workspace(tmp_path / "dense")
+    bare = surveyed_workspace(tmp_path / "w" / "mö ved")
     for path in (bare.stereo_dir / "depth_maps").iterdir():
         path.unlink()
-    with pytest.raises(NoResultError, match=r"colmap_sph run"):
+    with pytest.raises(NoResultError) as error:
         made(bare, tmp_path / "out")
+    command = str(error.value).split("`")[1]
+    assert shlex.split(command) == ["colmap_sph", "run", "--workspace", str(bare.root)]
 
 
 def test_a_missing_gdal_is_one_sentence(workspace, tmp_path, monkeypatch):

@@ -294,7 +294,7 @@ def _facts(report: RunReport, workspace: Workspace) -> Iterator[tuple[str, str]]
     yield "seconds", f"{report.total_seconds:.1f} ({times})"
     yield "peak memory", f"{report.peak_memory / 2**30:.2f} GiB"
     if workspace.page_path.is_file():
-        shown = shell_word(str(workspace.root))
+        shown = shell_word(workspace.root)
         yield "look at", f"{workspace.page_path}, in a browser: colmap_sph view {shown}"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, shell_word
 from colmap_sph.project.map_files import depth_if_readable, has_depth, map_size, read_depth_map, read_normal_planes
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -79,8 +79,8 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
             views.append(at_map_size(view, path))
     if not views:
         raise InputError(
-            f"{workspace.root} has no geometric depth map; run `colmap_sph run --workspace {workspace.root}` "
-            "first."
+            f"{workspace.root} has no geometric depth map; run `colmap_sph run --workspace "
+            f"{shell_word(workspace.root)}` first."
         )
     if len(views) < len(scene.views):
         logger.warning("%d of %d images have no depth; left out", len(scene.views) - len(views), len(scene.views))

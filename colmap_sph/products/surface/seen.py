@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.errors import InputError, NoResultError, shell_word
 from colmap_sph.project.images.reading import read_colours
 from colmap_sph.project.map_files import map_size, read_some_pixels
 from colmap_sph.project.scene_reader import read_scene
@@ -71,8 +71,8 @@ def seen_views(workspace: Workspace) -> tuple[Scene, list[SeenView]]:
     if not found:
         lack = "no geometric depth maps" if len(missing) == len(scene.views) else "no depth in its geometric maps"
         raise NoResultError(
-            f"{workspace.root} has {lack}, of which products are made; run colmap_sph run --workspace "
-            f"{workspace.root} first."
+            f"{workspace.root} has {lack}, of which products are made; run `colmap_sph run --workspace "
+            f"{shell_word(workspace.root)}` first."
         )
     if missing:
         logger.warning("%d of %d images have no geometric depth map; left out", len(missing), len(scene.views))

@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, shell_word
 from colmap_sph.project.files import real_path
 from colmap_sph.project.images.reading import Damaged, Problem, Unreadable, WrongSize
 
@@ -208,7 +208,7 @@ def _other_folder(model_dir: Path, folder: Path, files: Sequence[str], names: Se
         if len(parts) > 1 and "/".join(parts[1:]) in there and _may_be_file(folder.parent / name):
             return (
                 f"The model {model_dir} calls an image {name!r}, and {folder} has {'/'.join(parts[1:])!r}; "
-                f"give --images {folder.parent}."
+                f"give --images {shell_word(folder.parent)}."
             )
     below = {file.partition("/")[0] for file in files if file.partition("/")[2] in wanted}
     if len(below) == 1:
