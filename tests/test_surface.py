@@ -471,6 +471,10 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
         made(workspace, tmp_path, overwrite=False)
     assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
     assert (tmp_path / "dsm.tif").read_text() == "earlier"
+    (tmp_path / "there").mkdir()
+    with pytest.raises(OutputError, match=r"make room"):
+        made(workspace, tmp_path / "there" / "a" / "b" / "c")
+    assert list((tmp_path / "there").iterdir()) == []
 
 
 def test_space_is_asked_for_without_what_a_killed_process_left(workspace, tmp_path, monkeypatch):
