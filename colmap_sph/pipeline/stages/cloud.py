@@ -208,7 +208,20 @@ def facts_of_cloud(
         share = masked / with_depth
         return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {share:.0%}.")
     many = points > 0 and losses.kept > _MOSTLY
-    return CloudFacts(points, "" if many else losses.sentence(options, poses_fit=_poses_fit(context)))
+    if many:
+        return CloudFacts(points, "")
+    lacking = _lacking(context, len(names))
+    return CloudFacts(points, losses.sentence(options, poses_fit=_poses_fit(context), lacking=lacking))
+
+
+def _lacking(context: "Context", num_fused: int) -> str:
+    """How many images are without maps, with the first's reason; empty where more were fused."""
+    skipped = context.report.skipped_images
+    if len(skipped) <= num_fused:
+        return ""
+    name, reason = next(iter(skipped.items()))
+    images = f"{len(skipped)} of {len(skipped) + num_fused} images"
+    return f"{images} without maps: {name}, as {reason.removesuffix('.')}"
 
 
 def _poses_fit(context: "Context") -> bool:
