@@ -94,6 +94,17 @@ class RectificationError(ColmapSphError):
     """A pair that cannot be rectified on the chosen surface; the pair is skipped and reported."""
 
 
+def counted(count: int, what: str) -> str:
+    """So many of something, as in a sentence.
+
+    Examples
+    --------
+    >>> print(counted(1, "image"), counted(1234, "image"), sep=", ")
+    1 image, 1,234 images
+    """
+    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
+
+
 def reason_of(error: BaseException | None) -> str:
     """Say in one line why something failed, for the brackets of a message that names the file itself.
 

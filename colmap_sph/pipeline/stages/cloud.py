@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta
 
+from colmap_sph.errors import counted
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.project.cloud_tiles import missing_tiles, read_index, retire_tiles
 from colmap_sph.project.files import read_small, whole_digest
@@ -151,7 +152,7 @@ def report_cloud(context: "Context", facts: CloudFacts, names: Sequence[str] = (
         context.report.points_of = dict(zip(names, facts.of_images, strict=True))
     context.report.advice = facts.advice
     if facts.advice:
-        logger.warning("Only %d points survived fusion. %s", facts.points, facts.advice)
+        logger.warning("Only %s survived fusion. %s", counted(facts.points, "point"), facts.advice)
 
 
 def facts_of_cloud(
