@@ -94,6 +94,17 @@ class RectificationError(ColmapSphError):
     """A pair that cannot be rectified on the chosen surface; the pair is skipped and reported."""
 
 
+def counted(count: int, what: str) -> str:
+    """So many of something, as in a sentence.
+
+    Examples
+    --------
+    >>> print(counted(1, "image"), counted(1234, "image"), sep=", ")
+    1 image, 1,234 images
+    """
+    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
+
+
 def reason_of(error: BaseException | None) -> str:
     """Say in one line why something failed, for the brackets of a message that names the file itself.
 
@@ -135,17 +146,18 @@ def _visible(character: str) -> str:
     return character
 
 
-def shell_word(text: str) -> str:
-    r"""Text as one word for bash or zsh, in which nothing is hidden: a line of a log can be copied from it.
+def shell_word(text: object) -> str:
+    r"""Text or a path as one word for bash or zsh, in which nothing is hidden: it can be copied from a message.
 
     Examples
     --------
     >>> print(shell_word("my block"), shell_word("a\x1bb"))
     'my block' $'a\x1bb'
     """
-    if printable(text) == text:
-        return shlex.quote(text)
-    return f"$'{''.join(map(_escaped, text))}'"
+    word = str(text)
+    if printable(word) == word:
+        return shlex.quote(word)
+    return f"$'{''.join(map(_escaped, word))}'"
 
 
 def _escaped(character: str) -> str:

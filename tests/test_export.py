@@ -2,6 +2,7 @@
 
 import json
 import resource
+import shlex
 import struct
 import sys
 from collections.abc import Iterator
@@ -530,6 +531,16 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
     workspace.fused_path.unlink()
     with pytest.raises(InputError, match="no fused cloud"):
         exported(workspace, tmp_path / "other", "las")
+    named = Workspace(workspace.root.rename(tmp_path / "mö ved"))
+    for path in named.stereo_dir.glob("depth_maps/**/*.bin"):
+        path.unlink()
+    kinds: tuple[ExportFormat, ...] = ("las", "exr")
+    for kind in kinds:
+        with pytest.raises(InputError) as told:
+            exported(named, tmp_path / "other", kind)
+        command = str(told.value).split("`")[1]
+        assert shlex.split(command) == ["colmap_sph", "run", "--workspace", str(named.root)]
+    workspace = named
     assert not (tmp_path / "other").exists()
     (tmp_path / "other").mkdir()
     with pytest.raises(InputError, match="no fused cloud"):

@@ -440,6 +440,7 @@ def test_no_point(workspace):
         ("normal", {"max_normal_error": 1e-3}, "loosen --fusion.max-normal-error"),
         ("apart", {}, "check the poses, or try --fusion.input photometric"),
         ("apart, with poses that fit", {}, "; try --fusion.input photometric"),
+        ("maps lost", {}, "; mend first what left 5 of 6 images without maps: b.png, as it is gone; run again."),
         ("mask", {}, "--fusion.mask-path leaves out 100%"),
     ],
 )
@@ -458,6 +459,9 @@ def test_the_advice_names_the_cause(workspace, tmp_path, cause, options, advice)
             options = {"mask_path": tmp_path}
     context = context_of(workspace, fusion=FusionOptions(**options))
     context.report.overall_agreement = 0.95 if "poses that fit" in cause else None
+    if cause == "maps lost":
+        context.report.skipped_images.update(dict.fromkeys(NAMES[1:], "it is gone; run again."))
+        context.report.coverage.update(dict.fromkeys(NAMES[1:], 0.0))
     execute(stage_of(context))
     assert context.report.points < 20
     assert advice in context.report.advice

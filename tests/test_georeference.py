@@ -241,6 +241,24 @@ def test_photographs_with_gps_place_a_model_in_their_utm_zone(workspace: Workspa
     np.testing.assert_allclose(found.to_map(centers()), places, atol=0.02)
 
 
+def test_positions_on_both_sides_of_the_180th_meridian_are_in_a_zone_beside_it(
+    workspace: Workspace, tmp_path: Path
+) -> None:
+    """Their plain median lies anywhere: half way around the earth, where as many are east of it as west."""
+    pyproj = pytest.importorskip("pyproj")
+    to_gps = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4979", always_xy=True)
+    longitudes, latitudes, heights = to_gps.transform(*on_map(centers()).T)
+    longitudes = (longitudes - np.median(longitudes)) % 360 - 180  # turned around the earth's axis
+    assert min(longitudes) < -179.99 and max(longitudes) > 179.99 and abs(np.median(longitudes)) < 1
+    rows = zip(NAMES, latitudes, longitudes, heights, strict=True)
+    lines = [f"{name},{latitude:.12f},{longitude:.12f},{height:.6f}" for name, latitude, longitude, height in rows]
+    found = align(workspace, write_lines(tmp_path / "gps.csv", "image,latitude,longitude,height", *lines))
+    assert found.crs in {"EPSG:32660", "EPSG:32601"}
+    to_zone = pyproj.Transformer.from_crs("EPSG:4979", found.crs, always_xy=True)
+    expected = np.column_stack(to_zone.transform(longitudes, latitudes, heights))
+    np.testing.assert_allclose(found.to_map(centers()), expected, atol=0.05)
+
+
 @pytest.mark.parametrize(
     ("lines", "words"),
     [

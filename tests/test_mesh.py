@@ -286,7 +286,7 @@ def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
     ("wrong", "words"),
     [
         ("no normals", r"fused\.ply has 20,000 points without a normal"),
-        ("one normal of 0", r"fused\.ply has 1 points without a normal"),
+        ("one normal of 0", r"fused\.ply has 1 point without a normal"),
         ("one place unknown", r"without possible coordinates"),
         ("two points", r"has only 2 points"),
     ],

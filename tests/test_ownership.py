@@ -67,7 +67,7 @@ def test_maps_and_clouds_of_others_are_refused_before_anything_is_done(foreign: 
 
 def test_a_cloud_alone_is_refused_too(finished: Finished) -> None:
     finished.dense.joinpath("colmap_sph/cloud.json").unlink()
-    with pytest.raises(InputError, match=r"fused\.ply and 1 more files were not made by this program"):
+    with pytest.raises(InputError, match=r"fused\.ply and 1 more file were not made by this program"):
         finished.rerun()
 
 

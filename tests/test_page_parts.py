@@ -419,7 +419,7 @@ def test_some_points_are_of_the_cloud_and_evenly_spread(tmp_path: Path) -> None:
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 1\nproperty float x\nproperty float y\n"
             b"property float z\nend_header\n" + 24 * b"\0",
-            "goes on behind the 1 points that its header counts",
+            "goes on behind the 1 point that its header counts",
         ),
     ],
 )

@@ -1,5 +1,6 @@
 """What a run is given to work on: defaults, and every mistake told in a sentence that names the right option."""
 
+import shlex
 import shutil
 from pathlib import Path
 
@@ -135,6 +136,19 @@ def test_a_folder_around_a_model_is_given(given: str, lack: str, binary: bool, h
         Project(model=Path(given)).check()
     words = sentence(Project(workspace=Path(given)))
     assert lack in words and words.endswith("or give the sparse model as --model sparse/0.")
+
+
+@pytest.mark.parametrize("name", ["mö ved", "it's", "$HOME"])
+def test_what_to_give_can_be_copied_into_a_shell(name: str, here: Path) -> None:
+    here.joinpath("dense").rename(name)
+    here.joinpath("sparse").rename(f"{name} model")
+    given = {"model": Path(name), "workspace": Path(f"{name} model/0")}
+    for option, path in given.items():
+        words = sentence(Project(**{option: path})).removesuffix(".")
+        other = "--workspace" if option == "model" else "--model"
+        assert shlex.split(words[words.index(f"{other} ") :]) == [other, str(path)]
+    words = sentence(Project(workspace=Path(f"{name} model"))).removesuffix(".")
+    assert shlex.split(words[words.index("--model ") :]) == ["--model", f"{name} model/0"]
 
 
 def test_a_file_is_given(here: Path) -> None:

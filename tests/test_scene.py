@@ -113,7 +113,7 @@ def test_pose_that_is_not_finite_is_left_out(tmp_path: Path, caplog: pytest.LogC
     scene = read_scene(write(model, tmp_path / "sparse", text=False))
     assert [view.image_id for view in scene.views] == [4, 3, 1]
     assert scene.points.shape == (29, 3) and np.isfinite(scene.points).all()
-    assert "sub/2.png" in caplog.text and "1 sparse points have no possible coordinates" in caplog.text
+    assert "sub/2.png" in caplog.text and "1 sparse point without possible coordinates" in caplog.text
 
 
 @pytest.mark.parametrize("num_turned", [3, 4])

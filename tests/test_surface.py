@@ -1,6 +1,7 @@
 """Surface models and orthophotos of exact maps against the solids that were rendered, and what is refused."""
 
 import json
+import shlex
 import sys
 import tracemalloc
 from pathlib import Path
@@ -446,11 +447,13 @@ def test_a_raster_without_end_is_refused(workspace, tmp_path):
 
 
 def test_a_workspace_without_maps_is_told_what_to_do(tmp_path):
-    bare = surveyed_workspace(tmp_path / "dense")
+    bare = surveyed_workspace(tmp_path / "w" / "mö ved")
     for path in (bare.stereo_dir / "depth_maps").iterdir():
         path.unlink()
-    with pytest.raises(NoResultError, match=r"colmap_sph run"):
+    with pytest.raises(InputError) as error:
         made(bare, tmp_path / "out")
+    command = str(error.value).split("`")[1]
+    assert shlex.split(command) == ["colmap_sph", "run", "--workspace", str(bare.root)]
 
 
 def test_a_missing_gdal_is_one_sentence(workspace, tmp_path, monkeypatch):
@@ -468,6 +471,10 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
         made(workspace, tmp_path, overwrite=False)
     assert [path.name for path in tmp_path.iterdir()] == ["dsm.tif"]
     assert (tmp_path / "dsm.tif").read_text() == "earlier"
+    (tmp_path / "there").mkdir()
+    with pytest.raises(OutputError, match=r"make room"):
+        made(workspace, tmp_path / "there" / "a" / "b" / "c")
+    assert list((tmp_path / "there").iterdir()) == []
 
 
 def test_space_is_asked_for_without_what_a_killed_process_left(workspace, tmp_path, monkeypatch):
@@ -489,6 +496,23 @@ def test_two_commands_in_one_folder(what, workspace, tmp_path, capsys):
         assert cli.main(typed) == 3
         assert f"Another command is at work in {tmp_path / 'out'}; wait for its end" in capsys.readouterr().err
         assert not list((tmp_path / "out").iterdir())
+
+
+@pytest.mark.parametrize("what", ["surface", "mesh --method poisson", "export --formats npz"])
+def test_one_cause_has_one_exit_code(what, tmp_path, capsys):
+    """Maps that are missing are the input's fault; maps without any depth are of what cannot be reconstructed."""
+    bare = surveyed_workspace(tmp_path / "dense")
+    command, *options = what.split()
+    typed = [command, str(bare.root), *options, "--output", str(tmp_path / "out")]
+    paths = list((bare.stereo_dir / "depth_maps").iterdir())
+    for path in paths:
+        write_depth_map(path, np.zeros_like(read_depth_map(path)))
+    assert cli.main(typed) == 4
+    assert f"{bare.root} has no depth in any geometric depth map; " in capsys.readouterr().err
+    for path in paths:
+        path.unlink()
+    assert cli.main(typed) == 2
+    assert f"{bare.root} has no geometric depth map; run " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("what", ["surface", "mesh --method poisson", "export"])

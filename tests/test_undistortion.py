@@ -1,5 +1,6 @@
 """Undistorted workspaces: COLMAP's model of them holds exactly, and bad input never stops the process."""
 
+import errno
 import itertools
 import json
 import logging
@@ -639,6 +640,23 @@ def test_images_are_found(tmp_path: Path, folder: str) -> None:
     (tmp_path / folder / "cam").mkdir(parents=True)
     (tmp_path / folder / "cam" / "c.png").touch()
     assert find_images(model_dir, NAMES) == tmp_path / folder
+
+
+@pytest.mark.parametrize("refused", ["cam", "."])
+def test_images_are_found_though_a_folder_may_not_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, refused: str
+) -> None:
+    """What is in it is left out by name, as a single image is that may not be read."""
+    model_dir = make_project(tmp_path)
+    real = Path.stat
+
+    def stat(path: Path, **options: bool) -> os.stat_result:
+        if path.is_relative_to(tmp_path / "images" / refused) and path.suffix == ".png":
+            raise PermissionError(errno.EACCES, "Permission denied", str(path))
+        return real(path, **options)
+
+    monkeypatch.setattr(Path, "stat", stat)
+    assert find_images(model_dir, NAMES) == tmp_path / "images"
 
 
 def test_images_of_a_workspace_are_its_own(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from colmap_sph.app.events import Events
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE, RunCommand, header, progress_of
 from colmap_sph.app.terminal import Terminal
-from colmap_sph.errors import OptionError
+from colmap_sph.errors import OptionError, counted
 from colmap_sph.pipeline.reconstruct import check_input
 from colmap_sph.pipeline.shards.part import Part, StageName, check_part
 from colmap_sph.pipeline.shards.run_part import PartReport, run_part
@@ -54,7 +54,7 @@ def part_command(command: RunCommand, terminal: Terminal, arguments: Sequence[st
 
 def _print_part(report: PartReport, stage: StageName, part: Part, terminal: Terminal) -> None:
     if stage == "prepare":
-        facts = [("prepared", f"{report.total} images, {report.pairs} pairs to match")]
+        facts = [("prepared", f"{counted(report.total, 'image')}, {counted(report.pairs, 'pair')} to match")]
     else:
         which = f", shard {part}" if part.parts > 1 else ""
         share = f"{report.items} of {report.total} {report.what}"

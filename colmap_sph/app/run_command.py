@@ -23,7 +23,7 @@ from colmap_sph.app.option_list import option_groups, print_options
 from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.spelling import EVERYDAY
 from colmap_sph.app.terminal import Terminal
-from colmap_sph.errors import shell_word
+from colmap_sph.errors import counted, shell_word
 from colmap_sph.pipeline.forecast.time_limit import DIALS, TimeLimit, changed_dials, format_time, parse_time
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
@@ -274,7 +274,7 @@ def _facts(report: RunReport, workspace: Workspace) -> Iterator[tuple[str, str]]
         yield "originals", f"{len(report.originals)} of which these are views, mean coverage {mean:.1%}"
     if report.region is not None:
         left = f"; {len(report.out_of_region)} left out that see too little of it" if report.out_of_region else ""
-        yield "region", f"in {len(report.coverage)} images, of whose pixels in it coverage is{left}"
+        yield "region", f"in {counted(len(report.coverage), 'image')}, of whose pixels in it coverage is{left}"
     if report.drawn_region:
         yield "drawn", report.drawn_region
     if report.stretched:
@@ -286,15 +286,19 @@ def _facts(report: RunReport, workspace: Workspace) -> Iterator[tuple[str, str]]
     if report.polishing:
         yield "poses", report.polishing
     if report.points:  # there are none where only maps were asked for
-        where = f"{report.tiles} tiles in {workspace.tiles_dir}" if report.tiles else str(workspace.fused_path)
-        yield "cloud", f"{report.points:,} points in {where}"
+        where = (
+            f"{counted(report.tiles, 'tile')} in {workspace.tiles_dir}"
+            if report.tiles
+            else str(workspace.fused_path)
+        )
+        yield "cloud", f"{counted(report.points, 'point')} in {where}"
     if any(report.reused.values()):
         yield "up to date", ", ".join(f"{stage} {number}" for stage, number in report.reused.items() if number)
     times = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in report.seconds.items())
     yield "seconds", f"{report.total_seconds:.1f} ({times})"
     yield "peak memory", f"{report.peak_memory / 2**30:.2f} GiB"
     if workspace.page_path.is_file():
-        shown = shell_word(str(workspace.root))
+        shown = shell_word(workspace.root)
         yield "look at", f"{workspace.page_path}, in a browser: colmap_sph view {shown}"
 
 

@@ -21,4 +21,4 @@ def as_typed(arguments: Sequence[str]) -> str:
 
 def to_repeat(arguments: Sequence[str]) -> str:
     """The same from any folder, as paths in the arguments belong to the current one."""
-    return f"cd {shell_word(str(Path.cwd()))} && {as_typed(arguments)}"
+    return f"cd {shell_word(Path.cwd())} && {as_typed(arguments)}"

@@ -14,6 +14,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
+from colmap_sph.errors import counted
 from colmap_sph.evaluation.neighbours import Points
 
 _CHUNK_BYTES = 64 << 20
@@ -71,7 +72,7 @@ def read_las(path: Path, laspy: Any) -> tuple[Points, str | None]:
         crs = _las_crs(reader.header)
     points = np.concatenate(chunks) if chunks else np.empty((0, 3))
     if len(points) != count:
-        raise ValueError(f"its header states {count} points, it has {len(points)}")
+        raise ValueError(f"its header states {counted(count, 'point')}, it has {len(points)}")
     return points, crs
 
 
@@ -99,7 +100,7 @@ def _check(file: BinaryIO) -> int:
     if kind & _COMPRESSED:
         _check_compressed(file, start, size, count, zipped, point_bytes)
     elif start + count * point_bytes > size:
-        raise ValueError(f"its header states {count} points, and it is cut off")
+        raise ValueError(f"its header states {counted(count, 'point')}, and it is cut off")
     return int(point_bytes)
 
 

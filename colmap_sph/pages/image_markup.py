@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from typing import Any
 
+from colmap_sph.errors import counted
 from colmap_sph.pages.content import Content
 from colmap_sph.pages.image_facts import ImageFacts
 from colmap_sph.pages.map_markup import camera_path, outline
@@ -10,7 +11,7 @@ from colmap_sph.pages.pair_facts import PairFacts
 from colmap_sph.pages.pictures import colour_of
 from colmap_sph.pages.reasons import WORDS, Reason
 from colmap_sph.pages.run_facts import RunFacts
-from colmap_sph.pages.words import cell, number, percent, plain
+from colmap_sph.pages.words import cell, percent, plain
 from colmap_sph.project.wide.naming import by_originals
 from colmap_sph.scene import Photograph
 
@@ -140,10 +141,10 @@ def _image_words(image: ImageFacts, pairs: list[PairFacts], points: int | None) 
     ]
     words = f"{image.width} × {image.height} pixels: {', '.join(named)}."
     if points is not None:
-        words += f" {points:,} points of the cloud."
+        words += f" {counted(points, 'point')} of the cloud."
     angles = sorted(pair.angle for pair in pairs if pair.angle is not None)
     if angles:
-        words += f" {number(len(pairs), 'partner')}, {angles[0]:.1f}° to {angles[-1]:.1f}°."
+        words += f" {counted(len(pairs), 'partner')}, {angles[0]:.1f}° to {angles[-1]:.1f}°."
     if image.cut_into:
-        words += f" Its maps are those of {number(len(image.cut_into), 'view')}: {', '.join(image.cut_into)}."
+        words += f" Its maps are those of {counted(len(image.cut_into), 'view')}: {', '.join(image.cut_into)}."
     return words

@@ -12,12 +12,12 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 import colmap_sph
-from colmap_sph.errors import printable
+from colmap_sph.errors import counted, printable
 from colmap_sph.pages.content import Content
 from colmap_sph.pages.image_markup import MOST_LINES, image_values
 from colmap_sph.pages.map_markup import cloud_values, map_values
 from colmap_sph.pages.run_facts import RunFacts, changed_since
-from colmap_sph.pages.words import duration, number, percent, pixels
+from colmap_sph.pages.words import duration, percent, pixels
 from colmap_sph.project.files import real_path
 
 _FOLDER = Path(__file__).parent
@@ -123,7 +123,7 @@ def _where_the_cloud_is(content: Content) -> str:
 
 def _headline(content: Content, run: RunFacts) -> str:
     with_depth = sum(covered > 0 for covered in _coverage(content, run))
-    words = f"{with_depth:,} of {number(len(content.images), 'image')} with depth maps"
+    words = f"{with_depth:,} of {counted(len(content.images), 'image')} with depth maps"
     if content.cloud.total:
         words += f", {content.cloud.total:,} points"
     seconds = run.total_seconds or sum(run.seconds.values())  # earlier versions knew the stages' alone
@@ -177,7 +177,7 @@ def _facts(content: Content, run: RunFacts) -> list[tuple[str, str, str]]:
 
 def _pairs(content: Content, run: RunFacts) -> dict[str, Any]:
     pairs = content.pairs
-    words = f"{number(len(pairs), 'pair')} matched" if pairs else "It is not known which pairs were matched"
+    words = f"{counted(len(pairs), 'pair')} matched" if pairs else "It is not known which pairs were matched"
     angles = [pair.angle for pair in pairs if pair.angle is not None]
     if angles:
         words += f", with a parallax of {min(angles):.1f}° to {max(angles):.1f}° (median {median(angles):.1f}°)"
@@ -198,7 +198,7 @@ def _angle_bars(angles: list[float]) -> list[dict[str, Any]]:
     return [
         {
             "height": round(58 * int(count) / max(int(counts.max()), 1), 1),
-            "words": f"{low:.1f}° to {high:.1f}°: {number(int(count), 'pair')}",
+            "words": f"{low:.1f}° to {high:.1f}°: {counted(int(count), 'pair')}",
             "from": f"{low:.0f}",
             "to": f"{high:.0f}",
         }

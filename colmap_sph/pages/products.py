@@ -11,9 +11,8 @@ from urllib.parse import quote
 import cv2
 import numpy as np
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, counted
 from colmap_sph.pages.pictures import picture_uri
-from colmap_sph.pages.words import number
 from colmap_sph.platforms.files import is_link
 from colmap_sph.project.images.decoding import read_header
 from colmap_sph.project.images.jpeg import DamagedError
@@ -90,7 +89,7 @@ def _size(entry: os.DirEntry[str]) -> str:
             return _bytes(entry.stat(follow_symlinks=False).st_size)
         sizes = list(_sizes(Path(entry.path)))
         more = "more than " if len(sizes) == _MOST_COUNTED else ""
-        return f"{more}{number(len(sizes), 'file')}, {_bytes(sum(sizes))}"
+        return f"{more}{counted(len(sizes), 'file')}, {_bytes(sum(sizes))}"
     return "cannot be read"
 
 

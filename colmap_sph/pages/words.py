@@ -23,11 +23,6 @@ def pixels(value: float | None) -> str:
     return "–" if value is None else f"{value:.2f} px"
 
 
-def number(count: int, what: str) -> str:
-    """So many of something."""
-    return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
-
-
 def duration(seconds: float) -> str:
     """Such as 5 minutes."""
     if seconds < 120:

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.errors import counted
 from colmap_sph.pipeline.digests import digest
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
@@ -132,7 +133,7 @@ class Context:
         }
         for name, number in too_few.items():
             self.report.out_of_region[name] = (
-                f"it sees {number} sparse points in the region and near it, fewer than {least} "
+                f"it sees {counted(number, 'sparse point')} in the region and near it, fewer than {least} "
                 "(--pairs.min-shared-points)"
             )
             logger.info("%s left out: %s", name, self.report.out_of_region[name])

@@ -123,10 +123,10 @@ def make_page(context: Context) -> None:
         with suppress(OutputError):
             remove(workspace.page_path)  # one of an earlier run says what is not so any more
         logger.warning(
-            "%s could not be made (%s); everything else is there, colmap_sph report %s tries it again.",
+            "%s could not be made (%s); everything else is there, `colmap_sph report %s` tries it again.",
             workspace.page_path,
             reason_of(error),
-            workspace.root,
+            shell_word(workspace.root),
         )
         logger.info("Why there is no page", exc_info=True)
     else:

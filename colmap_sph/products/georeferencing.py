@@ -150,11 +150,17 @@ def _on_map(
     places = np.array(list(positions.places.values())).reshape(-1, 3)
     if positions.is_geographic:
         if crs is None:
-            name = utm_zone_of(*np.median(places[:, :2], axis=0).tolist())
+            name = utm_zone_of(float(np.median(places[:, 0])), _middle_longitude(places[:, 1]))
             crs = read_crs(name)
             logger.info("Map coordinates in %s (%s)", crs.name, name)
         places = from_gps(crs, places)
     return name or "", crs, dict(zip(positions.places, places, strict=True))
+
+
+def _middle_longitude(longitudes: NDArray[np.float64]) -> float:
+    """Median of (n,) longitudes, degrees, which may lie on both sides of the 180th meridian."""
+    mean = np.degrees(np.angle(np.exp(1j * np.radians(longitudes)).mean()))
+    return float(np.median(longitudes - 360 * np.round((longitudes - mean) / 360)))
 
 
 def report_lines(georeference: Georeference) -> Iterator[str]:

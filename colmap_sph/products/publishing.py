@@ -41,11 +41,11 @@ def alone_in(folder: Path) -> Iterator[None]:
     OutputError
         Another command is at work there, or the folder cannot be made.
     """
-    is_new = not os.path.lexists(folder)
-    make_dir(folder)
+    new = [each for each in (folder, *folder.parents) if not os.path.lexists(each)]
     with ExitStack() as held:
-        if is_new:
-            held.callback(_remove_empty, folder)
+        for each in reversed(new):
+            held.callback(_remove_empty, each)
+        make_dir(folder)
         held.callback(remove_lock, folder)
         try:
             held.enter_context(holding(folder))

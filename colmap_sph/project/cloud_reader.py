@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, reason_of
+from colmap_sph.errors import InputError, counted, reason_of
 from colmap_sph.project.cloud_tiles import TileIndex
 from colmap_sph.project.files import open_regular
 from colmap_sph.project.map_coordinates import is_plausible
@@ -126,7 +126,9 @@ def read_layout(path: Path, file: BufferedReader) -> PlyLayout:
     if length < 0:
         raise InputError(f"{path} is cut off; fuse again.")
     if length > 0 and [words[0] for words in lines].count("element") == 1:
-        raise InputError(f"{path} goes on behind the {count} points that its header counts; fuse again.")
+        raise InputError(
+            f"{path} goes on behind the {counted(count, 'point')} that its header counts; fuse again."
+        )
     return PlyLayout(kind, count, end.end())
 
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from colmap_sph.errors import InputError, OptionError
+from colmap_sph.errors import InputError, OptionError, shell_word
 from colmap_sph.project.database import find_database
 from colmap_sph.project.files import real_path
 from colmap_sph.project.masks import check_masks
@@ -58,7 +58,8 @@ class Project:
             raise OptionError(f"--workspace is complete in itself; leave out {' and '.join(surplus)}.")
         if has_model(workspace) and not Workspace(workspace).sparse_dir.is_dir():
             raise OptionError(
-                f"{workspace} is a sparse model, not a dense workspace; give it as --model {workspace}."
+                f"{workspace} is a sparse model, not a dense workspace; give it as --model "
+                f"{shell_word(workspace)}."
             )
 
     def absolute(self) -> "Project":
@@ -136,13 +137,17 @@ def _check_folders(workspace: Workspace) -> None:
 
 def _no_workspace(root: Path, lack: str) -> str:
     found = models_inside(root)
-    remedy = f"give the sparse model as --model {found[0]}" if found else "give the sparse model with --model"
-    return f"{root} is not a dense workspace: {lack}; run COLMAP's image_undistorter, or {remedy}."
+    how = f"as --model {shell_word(found[0])}" if found else "with --model"
+    return (
+        f"{root} is not a dense workspace: {lack}; run COLMAP's image_undistorter, or give the sparse model {how}."
+    )
 
 
 def _check_model(model: Path) -> None:
     if _is_dense_workspace(model) and not has_model(model):
-        raise OptionError(f"{model} is a dense workspace, not a sparse model; give it as --workspace {model}.")
+        raise OptionError(
+            f"{model} is a dense workspace, not a sparse model; give it as --workspace {shell_word(model)}."
+        )
     model_files(model)
 
 

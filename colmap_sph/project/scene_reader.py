@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, counted
 from colmap_sph.project.cameras import is_pinhole
 from colmap_sph.project.given.binary_arrays import Observations, read_observations, read_points
 from colmap_sph.project.given.poses import check_points_in_front
@@ -113,7 +113,7 @@ def _scene(model: pycolmap.Reconstruction, sparse_dir: Path, sparse: _Sparse, cu
     is_kept = is_plausible(sparse.points)
     if not is_kept.all():
         number = len(is_kept) - int(is_kept.sum())
-        logger.warning("%d sparse points have no possible coordinates; left out", number)
+        logger.warning("%s without possible coordinates: left out", counted(number, "sparse point"))
     rows_of = _Rows(sparse.ids[is_kept])
     points = sparse.points[is_kept] - origin
     registered = set(model.reg_image_ids())

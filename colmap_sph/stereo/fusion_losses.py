@@ -42,7 +42,7 @@ class GateLosses:
     normal: float
     kept: float
 
-    def sentence(self, options: FusionOptions, *, poses_fit: bool = False) -> str:
+    def sentence(self, options: FusionOptions, *, poses_fit: bool = False, lacking: str = "") -> str:
         """What a user should know of it.
 
         Parameters
@@ -51,20 +51,24 @@ class GateLosses:
             Those of the fusion.
         poses_fit : bool
             Whether the depth maps are known to agree with the sparse points, so that the poses are none to blame.
+        lacking : str
+            How many images are without maps, where most are, and why; else empty.
         """
         return (
             f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
             f"by no other depth map, {self.few:.0%} by too few that agree, and the rest fail the gates of "
             f"depth ({self.depth:.0%}), reprojection ({self.reprojection:.0%}) and normal ({self.normal:.0%}); "
-            f"{self._remedy(options, poses_fit)}."
+            f"{self._remedy(options, poses_fit, lacking)}."
         )
 
-    def _remedy(self, options: FusionOptions, poses_fit: bool) -> str:
+    def _remedy(self, options: FusionOptions, poses_fit: bool, lacking: str) -> str:
         gates = {
             "--fusion.max-depth-error": self.depth,
             "--fusion.max-reproj-error": self.reprojection,
             "--fusion.max-normal-error": self.normal,
         }
+        if lacking and self.few + self.unseen > sum(gates.values()):
+            return f"mend first what left {lacking}"
         if self.few >= max(self.unseen, sum(gates.values())):
             return f"lower --fusion.min-num-pixels, which is {options.min_num_pixels}"
         if self.unseen <= sum(gates.values()):

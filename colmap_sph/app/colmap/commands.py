@@ -19,6 +19,7 @@ from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE, header, print_summary
 from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.terminal import Terminal, standard_output
+from colmap_sph.errors import counted
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.project.workspace import Workspace
 
@@ -67,7 +68,9 @@ def _print_end(given: Given, report: RunReport, workspace: Workspace, terminal: 
         print_summary(report, workspace, terminal)
         return
     seconds = time.monotonic() - started
-    cloud = f"{report.points:,} points of {report.images} images in {given.plain['output_path']}"
+    cloud = (
+        f"{counted(report.points, 'point')} of {counted(report.images, 'image')} in {given.plain['output_path']}"
+    )
     terminal.facts([("cloud", cloud), ("seconds", f"{seconds:.1f}")])
     for name, reason in (*report.skipped_images.items(), *report.incomplete.items()):
         terminal.say(f"{name}: {reason}", label="incomplete:", style="yellow")

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from colmap_sph.errors import InputError, OptionError, printable, reason_of
+from colmap_sph.errors import InputError, OptionError, counted, printable, reason_of
 from colmap_sph.pages.markup import from_template, style_and_script
 from colmap_sph.pages.whole_cloud.blocks import FAN, LEAVES, CloudBlocks, CloudFrame
 from colmap_sph.platforms.surroundings import REUSES_PORTS
@@ -60,8 +60,8 @@ class CloudServer:
         index = index_of(workspace)
         if index is not None:
             raise InputError(
-                f"The cloud of {workspace.root} is in {len(index.tiles)} tiles, and --full shows one file: leave "
-                f"out --full, or open files of {workspace.tiles_dir} in CloudCompare, or run with "
+                f"The cloud of {workspace.root} is in {counted(len(index.tiles), 'tile')}, and --full shows one "
+                f"file: leave out --full, or open files of {workspace.tiles_dir} in CloudCompare, or run with "
                 "--fusion.max-points-per-file 0, which makes one file of it."
             )
         if not workspace.fused_path.exists():

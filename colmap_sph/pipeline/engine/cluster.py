@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import distributed
 from distributed.scheduler import KilledWorker
 
-from colmap_sph.errors import InputError, LostWorkersError, reason_of
+from colmap_sph.errors import InputError, LostWorkersError, counted, reason_of
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.engine import entry
 from colmap_sph.pipeline.engine.connection import connected, dashboard_of
@@ -154,7 +154,7 @@ class Cluster:
             if facts and not blind:
                 break
             if blind and time.monotonic() > deadline:
-                others = f" and {_counted(len(blind) - 1, 'other')} do" if len(blind) > 1 else " does"
+                others = f" and {counted(len(blind) - 1, 'other')} do" if len(blind) > 1 else " does"
                 raise InputError(unseen(f"The worker at {blind[0]}{others}", self._run.path.parent))
             time.sleep(0.2)
         self._announce(context)
@@ -178,7 +178,7 @@ class Cluster:
     def _announce(self, context: Context) -> None:
         """Tell who works, and where they can be watched."""
         workers, threads = len(self._threads), sum(self._threads.values())
-        words = f"{_counted(workers, 'worker')} with {_counted(threads, 'thread')}"
+        words = f"{counted(workers, 'worker')} with {counted(threads, 'thread')}"
         link = dashboard_of(self._client)
         words += f"; their dashboard: {link}" if link else ""
         context.progress.engage(threads, "" if self._is_announced else words)
@@ -235,10 +235,6 @@ class Cluster:
         with suppress(Exception):  # they do so by themselves when there is other work
             if self._client.status == "running":
                 self._client.run(entry.rest, self._run, on_error="ignore")
-
-
-def _counted(number: int, what: str) -> str:
-    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def scheduler_lost() -> LostWorkersError:

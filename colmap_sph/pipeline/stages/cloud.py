@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta
 
+from colmap_sph.errors import counted
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.project.cloud_tiles import missing_tiles, read_index, retire_tiles
 from colmap_sph.project.files import read_small, whole_digest
@@ -151,7 +152,7 @@ def report_cloud(context: "Context", facts: CloudFacts, names: Sequence[str] = (
         context.report.points_of = dict(zip(names, facts.of_images, strict=True))
     context.report.advice = facts.advice
     if facts.advice:
-        logger.warning("Only %d points survived fusion. %s", facts.points, facts.advice)
+        logger.warning("Only %s survived fusion. %s", counted(facts.points, "point"), facts.advice)
 
 
 def facts_of_cloud(
@@ -208,7 +209,20 @@ def facts_of_cloud(
         share = masked / with_depth
         return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {share:.0%}.")
     many = points > 0 and losses.kept > _MOSTLY
-    return CloudFacts(points, "" if many else losses.sentence(options, poses_fit=_poses_fit(context)))
+    if many:
+        return CloudFacts(points, "")
+    lacking = _lacking(context, len(names))
+    return CloudFacts(points, losses.sentence(options, poses_fit=_poses_fit(context), lacking=lacking))
+
+
+def _lacking(context: "Context", num_fused: int) -> str:
+    """How many images are without maps, with the first's reason; empty where more were fused."""
+    skipped = context.report.skipped_images
+    if len(skipped) <= num_fused:
+        return ""
+    name, reason = next(iter(skipped.items()))
+    images = f"{len(skipped)} of {len(skipped) + num_fused} images"
+    return f"{images} without maps: {name}, as {reason.removesuffix('.')}"
 
 
 def _poses_fit(context: "Context") -> bool:

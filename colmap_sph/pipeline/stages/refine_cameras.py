@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from colmap_sph.errors import shell_word
 from colmap_sph.project.lens.files import read_lens_fields
 from colmap_sph.project.polishing.adjustment import Observations
 from colmap_sph.project.polishing.cameras import Lenses, straightened, with_distortion, with_fields
@@ -80,11 +81,12 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
         found = f"({tried:.2f} px)" if np.isfinite(tried) else "(none could be found)"
         return f"The cameras are kept as given: refined ones are not clearly better {found}."
     best.write(target)
+    output = target.parents[1].with_name(f"{target.parents[1].name}_refined")
     return (
         f"Cameras were refined ({best.words(given)}): ties that had no part in it fit to {error:.2f} px, before "
         f"{before:.2f} px. "
-        f"Use them in another run: colmap_sph run --model {target} --images {task.image_dir} --output "
-        f"{target.parents[1].with_name(target.parents[1].name + '_refined')}"
+        f"Use them in another run: colmap_sph run --model {shell_word(target)} --images "
+        f"{shell_word(task.image_dir)} --output {shell_word(output)}"
     )
 
 

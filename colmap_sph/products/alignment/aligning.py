@@ -7,7 +7,7 @@ from pathlib import Path, PurePosixPath
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.errors import InputError, NoResultError, counted
 from colmap_sph.products.alignment.tables import ControlPoint, Positions
 from colmap_sph.products.georeference import AlignedBy, Georeference, Residual
 from colmap_sph.project.alignment.control_points import MarkedImage, marked_images, triangulated
@@ -100,9 +100,10 @@ def align_by_points(
     called = _matched(mentioned, images, source)
     found = {point.name: _triangulated(point, images, called, source) for point in points}
     known = [point for point in points if found[point.name] is not None]
-    if sum(not point.is_check for point in known) < 3:
+    used = sum(not point.is_check for point in known)
+    if used < 3:
         raise InputError(
-            f"{source} has {sum(not point.is_check for point in known)} control points that two or more images of "
+            f"{source} has {counted(used, 'control point')} that two or more images of "
             f"{workspace.sparse_dir} show, and three are needed; mark more, by the names that the images have in "
             f"the model, such as {next(iter(images), 'none')}."
         )
@@ -196,6 +197,6 @@ def _few_names(source: Path, names: Iterable[str], known: Iterable[str]) -> str:
     found = len(set(names) & set(known))
     called = f"it names {next(iter(names), 'none')}, and the model {next(iter(known), 'none')}"
     return (
-        f"{source} has positions of {found} images of the model, and three are needed; "
+        f"{source} has positions of {counted(found, 'image')} of the model, and three are needed; "
         f"{'give those of more' if found else called}."
     )

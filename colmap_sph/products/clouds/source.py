@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, NoResultError, reason_of
+from colmap_sph.errors import InputError, NoResultError, reason_of, shell_word
 from colmap_sph.project.cloud_reader import PlyLayout, read_layout
 from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import open_regular
@@ -171,7 +171,8 @@ def open_cloud(workspace: Workspace) -> Cloud:
         paths = (workspace.fused_path,)
     else:
         raise InputError(
-            f"{workspace.root} has no fused cloud; run `colmap_sph run --workspace {workspace.root}` first."
+            f"{workspace.root} has no fused cloud; run `colmap_sph run --workspace {shell_word(workspace.root)}` "
+            "first."
         )
     layouts = [_layout(path) for path in paths]
     count = sum(layout.count for layout in layouts)

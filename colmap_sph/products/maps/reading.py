@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, NoResultError, shell_word
 from colmap_sph.project.map_files import depth_if_readable, has_depth, map_size, read_depth_map, read_normal_planes
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -69,22 +69,32 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
     Raises
     ------
     InputError
-        None has, or the model cannot be read.
+        There are no maps, or the model cannot be read.
+    NoResultError
+        No map has any depth.
     """
     scene = read_scene(workspace.sparse_dir)
     views = []
+    missing = 0
     for view in scene.views:
         path = workspace.depth_map_path(view.name, "geometric")
-        if path.is_file() and has_depth(path):
+        if not path.is_file():
+            missing += 1
+        elif has_depth(path):
             views.append(at_map_size(view, path))
     if not views:
-        raise InputError(
-            f"{workspace.root} has no geometric depth map; run `colmap_sph run --workspace {workspace.root}` "
-            "first."
-        )
+        raise no_maps(workspace, are_missing=missing == len(scene.views))
     if len(views) < len(scene.views):
         logger.warning("%d of %d images have no depth; left out", len(scene.views) - len(views), len(scene.views))
     return MappedScene(workspace, replace(scene, views=tuple(views)))
+
+
+def no_maps(workspace: Workspace, *, are_missing: bool) -> InputError | NoResultError:
+    """The error of a workspace without geometric maps, or with none that has any depth."""
+    command = f"`colmap_sph run --workspace {shell_word(workspace.root)}`"
+    if are_missing:
+        return InputError(f"{workspace.root} has no geometric depth map; run {command} first.")
+    return NoResultError(f"{workspace.root} has no depth in any geometric depth map; {command} says why.")
 
 
 def at_map_size(view: View, path: Path) -> View:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, NoResultError, OptionError
+from colmap_sph.errors import InputError, NoResultError, OptionError, counted
 from colmap_sph.products.clouds.source import Cloud
 from colmap_sph.products.clouds.spread import measured_cloud
 from colmap_sph.products.georeference import Georeference
@@ -181,11 +181,13 @@ def _check_cloud(path: Path, cloud: Cloud) -> None:
         sound = sum(int(np.any(piece.normals, axis=1).sum()) for piece in cloud.pieces())
     if sound < cloud.count:
         raise InputError(
-            f"{path} has {cloud.count - sound:,} points without a normal, or without possible coordinates, and "
-            "--method poisson needs both; fuse again, or give --method tsdf."
+            f"{path} has {counted(cloud.count - sound, 'point')} without a normal, or without possible "
+            "coordinates, and --method poisson needs both; fuse again, or give --method tsdf."
         )
     if sound < _FEWEST_POINTS:
-        raise NoResultError(f"{path} has only {sound} points, too few for a surface; try --method tsdf.")
+        raise NoResultError(
+            f"{path} has only {counted(sound, 'point')}, too few for a surface; try --method tsdf."
+        )
 
 
 def _simplified(mesh: Triangles, request: MeshRequest, scratch: Path) -> Triangles:

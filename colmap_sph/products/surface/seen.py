@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.errors import InputError
+from colmap_sph.products.maps.reading import no_maps
 from colmap_sph.project.images.reading import read_colours
 from colmap_sph.project.map_files import map_size, read_some_pixels
 from colmap_sph.project.scene_reader import read_scene
@@ -56,26 +57,22 @@ def seen_views(workspace: Workspace) -> tuple[Scene, list[SeenView]]:
     Raises
     ------
     InputError
-        There is no model, or a map is damaged or not of its image's size.
+        There are no maps or no model, or a map is damaged or not of its image's size.
     NoResultError
-        There are no maps, or no depth in any.
+        No map has any depth.
     """
     scene = read_scene(workspace.sparse_dir)
     found = []
-    missing = []
+    missing = 0
     for index, view in enumerate(scene.views):
         if not workspace.depth_map_path(view.name, "geometric").exists():
-            missing.append(view.name)
+            missing += 1
         elif (seen := _seen(workspace, view, index)) is not None:
             found.append(seen)
     if not found:
-        lack = "no geometric depth maps" if len(missing) == len(scene.views) else "no depth in its geometric maps"
-        raise NoResultError(
-            f"{workspace.root} has {lack}, of which products are made; run colmap_sph run --workspace "
-            f"{workspace.root} first."
-        )
+        raise no_maps(workspace, are_missing=missing == len(scene.views))
     if missing:
-        logger.warning("%d of %d images have no geometric depth map; left out", len(missing), len(scene.views))
+        logger.warning("%d of %d images have no geometric depth map; left out", missing, len(scene.views))
     return scene, found
 
 

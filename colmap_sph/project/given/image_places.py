@@ -2,12 +2,13 @@
 
 import logging
 import os
+import stat
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, shell_word
 from colmap_sph.project.files import real_path
 from colmap_sph.project.images.reading import Damaged, Problem, Unreadable, WrongSize
 
@@ -51,7 +52,7 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     places = (Path.cwd() / model_dir, real_path(model_dir))
     parents = [p for model in places for p in (model, model.parent, model.parent.parent)]
     folders = list(dict.fromkeys(parent / "images" for parent in parents))
-    found = [sum((folder / name).is_file() for name in names) for folder in folders]
+    found = [sum(_may_be_file(folder / name) for name in names) for folder in folders]
     if max(found) > 0:
         return folders[found.index(max(found))]
     for folder in folders:
@@ -61,6 +62,16 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
             raise InputError(misspelled)
     tried = ", ".join(str(folder) for folder in folders)
     raise InputError(f"The images of {model_dir} were not found in {tried}; give their folder as --images.")
+
+
+def _may_be_file(path: Path) -> bool:
+    """Whether a path is a file, or lies in a folder that may not be looked into: it is left out for that then."""
+    try:
+        return stat.S_ISREG(path.stat().st_mode)
+    except PermissionError:
+        return True
+    except OSError:
+        return False
 
 
 def tell_problems(
@@ -194,10 +205,10 @@ def _other_folder(model_dir: Path, folder: Path, files: Sequence[str], names: Se
     for name in names:
         parts = PurePosixPath(name).parts
         # The model's names begin with folders above, or leave out folders below.
-        if len(parts) > 1 and "/".join(parts[1:]) in there and (folder.parent / name).is_file():
+        if len(parts) > 1 and "/".join(parts[1:]) in there and _may_be_file(folder.parent / name):
             return (
                 f"The model {model_dir} calls an image {name!r}, and {folder} has {'/'.join(parts[1:])!r}; "
-                f"give --images {folder.parent}."
+                f"give --images {shell_word(folder.parent)}."
             )
     below = {file.partition("/")[0] for file in files if file.partition("/")[2] in wanted}
     if len(below) == 1:

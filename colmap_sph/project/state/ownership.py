@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, counted
 from colmap_sph.platforms.files import is_link
 from colmap_sph.platforms.locks import remove_lock
 from colmap_sph.project.cloud_files import remove_local_workspace
@@ -173,7 +173,7 @@ def named(paths: Sequence[Path]) -> str:
 
 
 def _and_more(paths: Sequence[Path], shown: int) -> str:
-    return f" and {len(paths) - shown} more files" if len(paths) > shown else ""
+    return f" and {counted(len(paths) - shown, 'more file')}" if len(paths) > shown else ""
 
 
 def _were(paths: Sequence[Path]) -> str:

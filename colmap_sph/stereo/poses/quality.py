@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from colmap_sph.errors import counted
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.poses.tracks import (
     Tracks,
@@ -89,7 +90,7 @@ def refusal(tracks: Tracks, scene: Scene, least_residual: float) -> str:
     """
     number = len(scene.views)
     if len(tracks) < _TRACKS_PER_IMAGE * number:
-        return f"there are too few ties between the images ({len(tracks)} tracks for {number} images)"
+        return f"there are too few ties between the images ({counted(len(tracks), 'track')} for {number} images)"
     together = views_together(tracks, number, _CONNECTING_TIES)
     if together.mean() < _LEAST_TOGETHER:
         return f"ties connect only {together.sum()} of the {number} images with each other"
