@@ -5,8 +5,6 @@ import os
 import signal
 import sys
 from contextlib import suppress
-from importlib.util import find_spec
-from pathlib import Path
 from types import FrameType, TracebackType
 
 from colmap_sph.app.colmap.names import hand_over, is_handed_over
@@ -44,13 +42,6 @@ def main() -> int:
         return 130
     except Exception as error:
         reason = _refusal(error)
-        if reason is None and isinstance(error, ImportError):
-            print(
-                f"error: The installation is not whole ({printable(reason_of(error))}); install the program "
-                "again, with all that it needs.",
-                file=sys.stderr,
-            )
-            return InputError.exit_code
         if reason is None:
             raise
         print(
@@ -68,9 +59,6 @@ def _command() -> int:
     # NumPy's linear algebra, loaded below, would spin on all cores for products of a few columns.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.disable()  # what is loaded stays: nothing to be found
-    kernels = find_spec("colmap_sph._native")
-    if kernels is None or kernels.origin is None:  # which the folder of their sources has not
-        raise ImportError(f"no compiled kernels in {Path(__file__).parent}: not built, or in an archive")
     _load_colmap()
     from colmap_sph.app import cli
 

@@ -8,15 +8,12 @@ import resource
 import subprocess
 import sys
 import textwrap
-import zipfile
 from pathlib import Path
 
 import pytest
 from conftest import keep_images
 from rich.cells import cell_len
 
-import colmap_sph
-from colmap_sph import _native
 from colmap_sph.app import cli, display, log_file
 from colmap_sph.app.display import Display
 from colmap_sph.app.log_file import workspace_log
@@ -432,36 +429,6 @@ def test_a_library_that_cannot_be_loaded() -> None:
     done = subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 6
     assert re.fullmatch(r"error: .*libx\.so: failed to map segment.*ulimit -a\)\.\n", done.stderr)
-
-
-@pytest.mark.parametrize("lacking", ["kernels", "archive", "library"])
-def test_an_installation_that_is_not_whole(lacking: str, tmp_path: Path) -> None:
-    """Whatever the command is: a checkout that is not built, a package in an archive, a library that is gone."""
-    package = Path(colmap_sph.__file__).parent
-    files = [path for path in package.rglob("*") if path.is_file() and "__pycache__" not in path.parts]
-    place = tmp_path / ("whole.zip" if lacking == "archive" else "files")
-    with zipfile.ZipFile(tmp_path / "whole.zip", "w") as archive:
-        for path in files if lacking == "kernels" else [*files, Path(_native.__file__)]:
-            archive.write(path, f"colmap_sph/{path.relative_to(package) if path in files else path.name}")
-        if lacking != "archive":
-            archive.extractall(place)
-    gone = "pycolmap" if lacking == "library" else "nothing"
-    code = textwrap.dedent(f"""
-        import sys
-        sys.meta_path = [each for each in sys.meta_path if "editable" not in type(each).__module__]
-        sys.path.insert(0, {str(place)!r})
-        sys.modules[{gone!r}] = None
-        from colmap_sph.__main__ import main
-        sys.exit(main())
-    """)
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code, "--version"], capture_output=True, text=True, timeout=60
-    )
-    what = (
-        "import of pycolmap .*" if lacking == "library" else rf"no compiled kernels in {re.escape(str(place))}.*"
-    )
-    assert (done.returncode, done.stdout) == (2, "")
-    assert re.fullmatch(rf"error: The installation is not whole \({what}\); install the program.*\n", done.stderr)
 
 
 def test_a_traceback_does_not_steer_the_terminal() -> None:
