@@ -1,10 +1,8 @@
 """A model without points, whose poses are right or wrong: what features of its images say of them."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import cv2
 import numpy as np
@@ -19,9 +17,8 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.pose_check import Compared, distance_of_pairs, fitting_factor
 from colmap_sph.pipeline.reconstruct import run
-from colmap_sph.pipeline.report import RunReport
 from colmap_sph.project.project import Project
-from colmap_sph.scene import Photograph, Scene, View
+from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.poses.features import (
     Features,
     epipolar_distances,
@@ -219,33 +216,6 @@ def test_the_one_image_with_a_wrong_pose_without_points_is_named(project: Path) 
     doubts = run(project / "sparse/0", options=OPTIONS).doubts
     assert "Features of single images lie far from the epipolar lines" in doubts
     assert [name for name in names if name in doubts] == [names[4]]
-
-
-def test_a_photograph_that_was_cut_is_named_itself(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pairs are called by the first of its views; and no pair of its own tells what is usual."""
-    empty = np.empty(0, np.int64)
-    cut = [(f"{face}/{k}.jpg", f"{k}.jpg") for k in range(5) for face in ("left", "right")]
-    views = [View(1, name, 9, 9, np.eye(3), np.eye(3), np.zeros(3), empty, original=whole) for name, whole in cut]
-    scene = Scene(tuple(views), np.empty((0, 3)))
-
-    def compare(_: object, pairs: Iterable[tuple[str, str]]) -> tuple[list[Compared], float]:
-        features: Any = (None, None)
-        found = []
-        for left, right in pairs:
-            found.append(Compared((scene.photograph(left), scene.photograph(right)), features, empty))
-            found[-1].__dict__["distances"] = np.full(9, 0.9 if right == "left/4.jpg" else 0.1)
-        return found, 9.0
-
-    monkeypatch.setattr(pose_check, "_compare", compare)
-    pairs = [(f"left/{i}.jpg", f"left/{j}.jpg") for i in range(5) for j in range(i + 1, 5)]
-    residuals = {pair: None if pair[1] == "left/4.jpg" else 1e-4 for pair in pairs}
-    matched: Any = {
-        pair: SimpleNamespace(facts=SimpleNamespace(row_residual=residual)) for pair, residual in residuals.items()
-    }
-    context: Any = SimpleNamespace(scene=scene, report=RunReport())
-    # Most of the pairs that were compared are of this photograph.
-    pose_check._doubt_images(context, matched, compare(None, pairs[2:4] + pairs[6:7])[0])
-    assert "longer side: 4.jpg (0.9 %)." in context.report.doubts
 
 
 def test_right_poses_without_points_are_not(project: Path) -> None:

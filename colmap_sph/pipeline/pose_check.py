@@ -226,14 +226,13 @@ def _doubt_images(context: Context, matched: Mapping[Pair, Result], compared: Se
     """Put into the report which single images have features far from epipolar planes, where others have not."""
     doubted = []
     for name in suspects({pair: result.facts.row_residual for pair, result in matched.items()}):
-        photograph = context.scene.photograph(name)
-        others = [pair for pair in compared if photograph not in pair.photographs]
+        others = [pair for pair in compared if name not in (photograph.name for photograph in pair.photographs)]
         own, _ = _compare(context, [pair for pair in sorted(matched) if name in pair][:_MOST_ASKED])
         if not others or len(own) < _FEWEST_OF_IMAGE:
             continue
         distance = median(float(np.median(pair.distances)) for pair in own)
         if distance > max(_USUAL_DISTANCE, _FAR_OF_USUAL * distance_of_pairs(others)):
-            doubted.append(f"{photograph.name} ({distance:.1f} %)")
+            doubted.append(f"{name} ({distance:.1f} %)")
     if doubted:
         add_doubt(
             context.report,
