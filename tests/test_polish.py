@@ -261,11 +261,8 @@ def test_poses_without_tracks_are_polished_on_request(project: Path) -> None:
 
 def test_wrong_cameras_are_no_matter_of_poses(project: Path) -> None:
     change_model(project, long_focus)
-    with pytest.raises(NoResultError, match="cameras or poses of the model are not those"):
+    with pytest.raises(NoResultError, match="cameras of the model are not those that its points were made with"):
         run(project)
-    polishing = json.loads((project / "dense/colmap_sph/report.json").read_text())["polishing"]
-    assert "not only poses are wrong" in polishing
-    assert "check cameras" in polishing
 
 
 def test_poses_that_are_good_are_kept(project: Path) -> None:

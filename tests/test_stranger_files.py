@@ -142,7 +142,7 @@ def test_bad_obj(tmp_path: Path, case: str) -> None:
         (104, b"\xff", "point format 127"),
         (105, struct.pack("<H", 1), "with 1 bytes per point"),
         (96, struct.pack("<I", 2**31), "header is longer than the file"),
-        (247, struct.pack("<Q", 2**60), "states 1152921504606846976 points"),
+        (247, struct.pack("<Q", 2**60), "states 1,152,921,504,606,846,976 points"),
         (131, struct.pack("<d", 0.0), "scales or offsets"),
         (139, struct.pack("<d", np.nan), "scales or offsets"),
         (155, struct.pack("<d", np.inf), "scales or offsets"),

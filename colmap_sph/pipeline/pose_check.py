@@ -5,7 +5,6 @@ what they look like, and so show how far poses and focal lengths are off, where 
 """
 
 import logging
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -61,13 +60,6 @@ _FEWEST_PAIRS = 5
 # Features lie no farther from their epipolar planes (in the median, see `epipolar_distances`) with poses as
 # structure from motion leaves them: up to .24. Poses off by a quarter or half a degree make it .4 to .7.
 _USUAL_DISTANCE = 0.35
-# A single image is told whose features lie so many times farther than in the median pair, too, in so many pairs at
-# least: one turned by two degrees or moved by a fiftieth of the scene 6 times at least.
-_FAR_OF_USUAL = 3.0
-_FEWEST_OF_IMAGE = 3
-# Asked is about so many images, whose pairs have few ties, or rows that disagree so many times more than usual.
-_MOST_SUSPECTS = 5
-_SUSPICIOUS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,7 +113,6 @@ def check_poses(context: Context, matched: Mapping[Pair, Result]) -> None:
     if sound < _SOUND_SHARE * len(matched):
         _refuse_poses(compared, asked, usual_features)
     _doubt_poses(context, compared)
-    _doubt_images(context, matched, compared)
 
 
 def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[Compared], float]:
@@ -220,56 +211,6 @@ def _doubt_poses(context: Context, compared: Sequence[Compared]) -> None:
             "and depth by more. Triangulate points and adjust the model (COLMAP: point_triangulator, "
             "bundle_adjuster).",
         )
-
-
-def _doubt_images(context: Context, matched: Mapping[Pair, Result], compared: Sequence[Compared]) -> None:
-    """Put into the report which single images have features far from epipolar planes, where others have not."""
-    doubted = []
-    for name in suspects({pair: result.facts.row_residual for pair, result in matched.items()}):
-        others = [pair for pair in compared if name not in (photograph.name for photograph in pair.photographs)]
-        own, _ = _compare(context, [pair for pair in sorted(matched) if name in pair][:_MOST_ASKED])
-        if not others or len(own) < _FEWEST_OF_IMAGE:
-            continue
-        distance = median(float(np.median(pair.distances)) for pair in own)
-        if distance > max(_USUAL_DISTANCE, _FAR_OF_USUAL * distance_of_pairs(others)):
-            doubted.append(f"{name} ({distance:.1f} %)")
-    if doubted:
-        add_doubt(
-            context.report,
-            "Features of single images lie far from the epipolar lines of all others, in percent of an image's "
-            f"longer side: {', '.join(sorted(doubted))}. Their poses or cameras are wrong, and there is little "
-            "depth of them, or wrong depth; leave them out of the model.",
-        )
-
-
-def suspects(residuals: Mapping[Pair, float | None]) -> list[str]:
-    """Images whose pairs have few ties, or whose rows disagree more than usual; a few, the most suspicious first.
-
-    Parameters
-    ----------
-    residuals : mapping of (str, str) to float or None
-        Row residual of each pair, radians; None: too few ties.
-
-    Returns
-    -------
-    list of str
-
-    Examples
-    --------
-    >>> suspects({("a", "b"): 1e-4, ("b", "c"): 1e-4, ("a", "c"): 1e-4, ("a", "d"): None, ("b", "d"): 9e-4})
-    ['d']
-    """
-    of_images: dict[str, list[float]] = {}
-    for pair, residual in sorted(residuals.items()):
-        for name in pair:
-            of_images.setdefault(name, []).append(math.inf if residual is None else residual)
-    known = [residual for residual in residuals.values() if residual is not None]
-    if not known:
-        return []
-    usual = median(known)
-    found = [name for name, each in of_images.items() if median(each) > _SUSPICIOUS * usual]
-    tied = {name: float(np.isfinite(of_images[name]).mean()) for name in found}
-    return sorted(found, key=lambda name: (tied[name], -median(of_images[name]), name))[:_MOST_SUSPECTS]
 
 
 def distance_of_pairs(compared: Sequence[Compared]) -> float:

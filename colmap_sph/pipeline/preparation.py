@@ -16,7 +16,6 @@ from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
-from colmap_sph.pipeline.self_check import refuse_cameras
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImageFacts, ImagePlaces, tell_changed
 from colmap_sph.pipeline.stages.polish import GivenModel
 from colmap_sph.pipeline.stages.stage import Result, keys_of
@@ -169,25 +168,12 @@ class Preparation:
         if self.is_finished and not self._overwrite:
             self._make(executor)
             return
-        self._refuse_cameras()
         # COLMAP is likely to be asked for the model: its process loads while images are looked at.
         self._child.start_for(undistort_model)
         try:
             self._make(executor)
         finally:
             self._child.close()
-
-    def _refuse_cameras(self) -> None:
-        """Refuse impossible cameras before hours of undistortion; `without_misplaced` asks all images again."""
-        asked = self.names[:: -(-len(self.names) // _MOST_ASKED) or 1]
-        with suppress(InputError):  # of these images; it is told where they are read
-            try:
-                refuse_cameras(self._foreseen(asked))
-            except NoResultError:  # these may all be of one camera of a rig
-                refuse_cameras(self._foreseen(self.names))
-
-    def _foreseen(self, names: Collection[str]) -> Scene:
-        return foreseen_scene(self._originals, names, self.options.undistortion)
 
     def _make(self, executor: "Executor") -> None:
         images = self.check(executor)
