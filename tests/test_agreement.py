@@ -17,7 +17,6 @@ from colmap_sph.app import cli
 from colmap_sph.app.run_command import print_summary
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
-from colmap_sph.pipeline import preparation
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.good_images import without_misplaced
 from colmap_sph.pipeline.keys import Keys
@@ -453,16 +452,6 @@ def test_the_one_image_with_another_focal_length_is_left_out(project):
     assert misplaced_views(scene) == {FOUR_NAMES[0]: scene.view(FOUR_NAMES[0]).reprojection_error}
 
 
-def test_images_that_are_asked_first_are_not_all(project, monkeypatch):
-    """Every second one is asked: half of these have another focal length, of all only a quarter."""
-    monkeypatch.setattr(preparation, "_MOST_ASKED", 2)
-    wrong = project / "wrong"
-    wrong.mkdir()
-    with_focal_lengths(pycolmap.Reconstruction(project / "sparse/0"), 0.9, 0.9, 1).write_binary(wrong)
-    report = colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)
-    assert [*report.skipped_images] == FOUR_NAMES[:1]
-
-
 def test_a_copy_at_another_pose_is_told_with_its_cause(project):
     first, *_, last = FOUR_NAMES
     shutil.copy(project / "images" / first, project / "images" / last)
@@ -482,7 +471,7 @@ def test_a_copy_at_the_pose_of_its_image_does_no_harm(project):
         assert ("copy.jpg" in report.doubts) == is_told
 
 
-def test_a_camera_that_is_not_that_of_its_points_is_refused_before_anything_is_undistorted(project):
+def test_a_camera_that_is_not_that_of_its_points_is_refused_before_anything_is_matched(project):
     wrong, folders = project / "wrong", {"images": project / "images", "output": project / "dense"}
     wrong.mkdir()
     with_focal_lengths(pycolmap.Reconstruction(project / "sparse/0"), 0.9, 0.9, 4).write_binary(wrong)
@@ -492,13 +481,7 @@ def test_a_camera_that_is_not_that_of_its_points_is_refused_before_anything_is_u
     ):
         with pytest.raises(NoResultError, match="Give the model as it was adjusted"):
             run()
-    assert not (project / "dense/images").exists()
-    # Of a workspace that another program undistorted nothing is matched.
-    shutil.copytree(wrong, project / "other/sparse")
-    shutil.copytree(folders["images"], project / "other/images")
-    with pytest.raises(NoResultError, match="Give the model as it was adjusted"):
-        colmap_sph.run(workspace=project / "other", options=OPTIONS)
-    assert not list((project / "other/stereo").rglob("*.bin"))
+    assert not list((project / "dense/stereo").rglob("*.bin"))
 
 
 def test_poses_that_are_not_those_of_the_points_are_refused_before_anything_is_matched(project):

@@ -1,6 +1,5 @@
 """Polishing of poses: disturbed poses come back, good ones stay, and what cannot be polished says so."""
 
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import replace

@@ -11,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from colmap_sph.errors import InputError, NoResultError, OutputError, reason_of
+from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
@@ -66,9 +66,6 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.execute import Executor
 
 logger = logging.getLogger(__name__)
-
-# So many images of a model are asked whether its cameras are possible at all; more only where these refuse.
-_MOST_ASKED = 64
 
 
 class Preparation:
@@ -144,7 +141,7 @@ class Preparation:
         names = tuple(self._originals.cuts.names(image_names(self._originals.model)))
         if not self.options.region:
             return names
-        scene = anchored(self._foreseen(names))
+        scene = anchored(foreseen_scene(self._originals, names, self.options.undistortion))
         keys = Keys(self.workspace, self.options)
         whole = Context(self.workspace, scene, self.options, keys, report=self._report)
         part = whole.in_region()
@@ -285,7 +282,7 @@ class Preparation:
         """Return the scene of a workspace that is not there yet; None where it is there as it will be."""
         if not self._overwrite and self._is_model_there(sorted(results)):
             return None
-        return self._foreseen(results)
+        return foreseen_scene(self._originals, results, self.options.undistortion)
 
     def _is_model_there(self, names: Sequence[str]) -> bool:
         """Whether the workspace has the model of these images, or one that the user has changed."""
