@@ -1,6 +1,7 @@
 """Digests of contents: of plain values, arrays and records, and of files."""
 
 import hashlib
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -30,6 +31,14 @@ def digest(*parts: object) -> str:
     state = new_digest()
     _feed(state, parts)
     return state.hexdigest()
+
+
+def stamp_of(status: os.stat_result) -> tuple[int, ...]:
+    """What changes whenever a file's content may have: also the time of the last change of its size or times.
+
+    Not the number of its disk, which each machine that shares it gives it.
+    """
+    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
 
 
 def _feed(state: "hashlib.blake2b", value: object) -> None:

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from colmap_sph.pipeline.digests import digest, file_digest
+from colmap_sph.pipeline.digests import digest, file_digest, stamp_of
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.program import program_digest
 from colmap_sph.project.sparse_model import model_files
@@ -66,7 +66,7 @@ class Keys:
         self._options = options
         self._images = images or {}
         self._programs = program_digests()
-        self._masks: dict[Path, str | None] = {}
+        self._masks: dict[Path, tuple[tuple[int, ...] | None, str | None]] = {}
         self._cameras: dict[View, str] = {}
         self._matching = digest(options.matching)
 
@@ -84,12 +84,15 @@ class Keys:
 
     def _mask_digest(self, path: Path) -> str | None:
         if path not in self._masks:  # by two threads at a time, at worst
-            self._masks[path] = None if self.fresh else _digest_if_there(path)
-        return self._masks[path]
+            self._masks[path] = (_stamp_if_there(path), None if self.fresh else _digest_if_there(path))
+        return self._masks[path][1]
 
     def is_mask_changed(self, path: Path) -> bool:
         """Whether a mask is not as it was when a key was asked for."""
-        return path in self._masks and self._masks[path] != _digest_if_there(path)
+        if path not in self._masks:
+            return False
+        stamp, content = self._masks[path]
+        return _stamp_if_there(path) != stamp and _digest_if_there(path) != content
 
     def _camera(self, view: View) -> str:
         """Digest of all that its camera is: of each there are many pairs."""
@@ -252,6 +255,10 @@ class Keys:
             self._options.fusion,
             [_digest_if_there(mask_path(folder, name)) for name in maps] if folder else [],
         )
+
+
+def _stamp_if_there(path: Path) -> tuple[int, ...] | None:
+    return stamp_of(path.stat()) if path.is_file() else None
 
 
 def _digest_if_there(path: Path) -> str | None:

@@ -15,6 +15,7 @@ from pathlib import Path
 import msgspec
 import xxhash
 
+from colmap_sph.pipeline.digests import stamp_of
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.files import atomic_file, folder_locked, make_dir
 from colmap_sph.project.state.records import read_json
@@ -89,7 +90,7 @@ def stamp_of_files(paths: Iterable[str]) -> str:
     That is their sizes, their places on the disk, and the times of the last changes of content, and of size or
     times. Not the number of the disk, which each machine that shares it gives it.
     """
-    words = []
+    words: list[int] = []
     for path in paths:
         try:
             status = os.stat(path)  # noqa: PTH116 - of very many
@@ -97,7 +98,7 @@ def stamp_of_files(paths: Iterable[str]) -> str:
             return ""
         if not stat.S_ISREG(status.st_mode):
             return ""
-        words += [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
+        words += stamp_of(status)
     return xxhash.xxh3_64_hexdigest(repr(words).encode())
 
 

@@ -14,7 +14,7 @@ import msgspec
 import xxhash
 
 from colmap_sph.errors import InputError
-from colmap_sph.pipeline.digests import digest, file_digest
+from colmap_sph.pipeline.digests import digest, file_digest, stamp_of
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.project.files import atomic_file, make_dir
@@ -206,7 +206,7 @@ class CheckStage(Stage[str, ImageFile]):
         problem = image_problem(image.path, *image.size, decode=False)
         if problem is not None:
             raise InputError(f"{image.path} {problem}")
-        stamp = _stamp_of(image.path)
+        stamp = stamp_of(image.path.stat())
         known = self._known.get(item)
         is_read = known is not None and known.stamp == stamp
         content = known.digest if known is not None and is_read else file_digest(image.path)
@@ -304,13 +304,4 @@ def tell_changed(
 
 
 def _is_changed(path: Path, known: Known) -> bool:
-    return _stamp_of(path) != known.stamp and file_digest(path) != known.digest
-
-
-def _stamp_of(path: Path) -> tuple[int, ...]:
-    """What changes whenever a file's content may have: also the time of the last change of its size or times.
-
-    Not the number of its disk, which each machine that shares it gives it.
-    """
-    status = path.stat()
-    return status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino
+    return stamp_of(path.stat()) != known.stamp and file_digest(path) != known.digest

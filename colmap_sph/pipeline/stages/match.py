@@ -16,7 +16,7 @@ from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.load_cache import LoadCache, file_stamp
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
-from colmap_sph.pipeline.stages.photo import Photo, PhotoFile, kept_masks, still_bytes
+from colmap_sph.pipeline.stages.photo import Photo, PhotoFile, kept_masks, small_bytes, still_bytes
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
@@ -246,7 +246,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         left_pixels = geometry.height * geometry.left_width
         pixels = max(left.num_pixels, right.num_pixels)
         views = (*left.views, *right.views)
-        still = still_bytes(*(view for view in views if view.name in context.still))[1]
+        still = max((still_bytes(view) for view in views if view.name in context.still), default=0.0)
         reading = max(_READ_BYTES * pixels, bytes_to_reduce(*views), still)
         both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
@@ -334,7 +334,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         paths = (self.context.workspace.image_path(view.name) for view in views)
         whole = sum(view.num_pixels * (grey_bytes(path) + 1) for view, path in zip(views, paths, strict=True))
         compared = sorted({name for names in self.context.still.values() for name in names})
-        filled = whole + still_bytes(*map(self.context.scene.view, compared))[0]
+        filled = whole + sum(map(small_bytes, map(self.context.scene.view, compared)))
         return Kept(scratch, min(_CACHE_BYTES, spare // 6), 2, filled)
 
     @contextmanager

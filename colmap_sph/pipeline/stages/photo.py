@@ -99,10 +99,14 @@ def still_mask(view: View, image: Path, turned: Sequence[Path]) -> Mask:
     return np.asarray(cv2.resize(still, (view.width, view.height), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
-def still_bytes(*views: View) -> tuple[float, float]:
-    """Bytes of a view's small image, of all views, and largest bytes in use while `still_mask` looks at one."""
-    pixels = [view.num_pixels * min(_STILL_SIDE / max(view.width, view.height), 1.0) ** 2 for view in views]
-    return sum(pixels), _STILL_BYTES * max(pixels, default=0.0)
+def small_bytes(view: View) -> float:
+    """Bytes of a view's small image, with which others are compared."""
+    return view.num_pixels * min(_STILL_SIDE / max(view.width, view.height), 1.0) ** 2
+
+
+def still_bytes(view: View) -> float:
+    """Largest bytes in use while `still_mask` looks at a view."""
+    return _STILL_BYTES * small_bytes(view)
 
 
 def _compared(path: Path) -> Mask:
