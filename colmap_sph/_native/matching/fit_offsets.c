@@ -21,8 +21,8 @@ enum {
     COST_BITS = 6
 };
 
-/* Offsets of a row, RADIUS before the first and beyond the last block, NONE where a pixel cannot be used;
- * the least whole pixels of offset for which costs are kept; and the costs of 2 REACH + 1 target pixels around
+/* Offsets of a row, RADIUS before the first and beyond the last block, NONE where a pixel cannot be used; the
+ * least ones that round to a pixel with costs on both sides; and the costs of 2 REACH + 1 target pixels around
  * each, COST_BITS each, the leftmost lowest. */
 typedef struct {
     int32_t *offset, *least;
@@ -73,7 +73,7 @@ static inline void read_row(const int32_t *offset, const uint64_t *reference, co
                             match_size size, ptrdiff_t y, window_row row) {
     for (ptrdiff_t x = -RADIUS; x < size.width + RADIUS + LANES; x++) {
         row.offset[x] = NONE;
-        row.least[x] = 0;
+        row.least[x] = NONE;
         row.costs[x] = 0;
     }
     if (y < 0 || y >= size.height) {
@@ -94,7 +94,7 @@ static inline void read_row(const int32_t *offset, const uint64_t *reference, co
         }
         if (!invalid) {
             row.offset[x] = o;
-            row.least[x] = nearest_256(o) - (REACH - 1);
+            row.least[x] = 256 * (nearest_256(o) - (REACH - 1)) - 128;
             row.costs[x] = costs;
         }
     }
@@ -103,9 +103,11 @@ static inline void read_row(const int32_t *offset, const uint64_t *reference, co
 /* Least-squares planes through the offsets within reach of the centre's; `difference` are offsets minus that. */
 static inline offset_planes fit_offsets(int_lanes difference[SIDE][SIDE]) {
     int_lanes n = {0}, sx = {0}, sy = {0}, sxx = {0}, sxy = {0}, syy = {0}, so = {0}, sxo = {0}, syo = {0};
+#pragma GCC unroll 5
     for (int j = 0; j < SIDE; j++) {
         const int dy = j - RADIUS;
         int_lanes count = {0}, count_x = {0}, sum = {0};
+#pragma GCC unroll 5
         for (int i = 0; i < SIDE; i++) {
             const int dx = i - RADIUS, ring = abs(dx) > abs(dy) ? abs(dx) : abs(dy);
             const int_lanes kept = is_within(difference[j][i], MAX_OFFSET_STEP * ring);
@@ -155,31 +157,31 @@ static inline int_lanes fit_pixels(const window_row rows[SIDE], ptrdiff_t x, int
     }
     const offset_planes plane = fit_offsets(difference);
     int_lanes count = {0}, rounded = {0};
-    unsigned_lanes beside = {0},
-                   on = {0}; /* costs before (from bit 0) and behind (from bit 12) the plane, on it */
-    /* By adding a half beforehand, cutting off rounds to the nearest: parts of 256, and whole pixels. */
-    const int_lanes centre_and_half = centre + 128;
+    /* Costs before (from bit 0) and behind (from bit 12) the plane, and on it (from bit 6). */
+    unsigned_lanes beside = {0}, on = {0};
+    /* By adding a half beforehand, cutting off rounds to the nearest. */
     int_lanes row_value = plane.value + 128 - RADIUS * plane.dy;
+#pragma GCC unroll 5
     for (int j = 0; j < SIDE; j++, row_value += plane.dy) {
         int_lanes value = row_value - RADIUS * plane.dx;
+#pragma GCC unroll 5
         for (int i = 0; i < SIDE; i++, value += plane.dx) {
             const ptrdiff_t at = x + i - RADIUS;
-            const int_lanes predicted = (value >> 8) + centre_and_half, whole = predicted >> 8;
-            /* Whole pixels from the first of the costs. */
-            const int_lanes step = whole - load_ints(rows[j].least + at);
-            const int_lanes kept = is_within(load_ints(rows[j].offset + at) + 128 - predicted, MAX_OFFSET_STEP) &
-                                   ((unsigned_lanes)step <= 2 * (REACH - 1));
+            /* How far the plane lies above the least offset; what has no costs there is no part of the surface. */
+            const int_lanes beyond = (value >> 8) + (centre - load_ints(rows[j].least + at));
+            const int_lanes kept = (unsigned_lanes)beyond < 256u * (2 * REACH - 1);
+            const int_lanes place = beyond & kept;
             const unsigned_lanes costs = (unsigned_lanes)(load_ints(rows[j].costs + at) & kept) >>
-                                         (unsigned_lanes)(COST_BITS * step & kept);
+                                         (unsigned_lanes)(COST_BITS * (place >> 8));
             beside += costs & (63 | 63 << 2 * COST_BITS);
-            on += costs >> COST_BITS & 63;
+            on += costs & 63 << COST_BITS;
             count -= kept;
-            rounded += predicted & 255 & kept;
+            rounded += place & 255;
         }
     }
     rounded -= 128 * count;
     const int_lanes before = (int_lanes)(beside & 4095), after = (int_lanes)(beside >> 2 * COST_BITS),
-                    at = (int_lanes)on;
+                    at = (int_lanes)(on >> COST_BITS);
     const int_lanes rise = choose(before > after, before, after) - at;
     const int_lanes good = plane.found & (count >= MIN_COUNT) & (rise > 0) & (at <= before) & (at <= after);
     /* Whole pixels lie beside the plane by `rounded / count` on average. A perfect match is at whole pixels. */
