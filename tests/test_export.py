@@ -332,6 +332,32 @@ def test_depth_maps_are_read_back(workspace: Workspace, tmp_path: Path) -> None:
         np.testing.assert_allclose(np.array(each["cam_from_world"])[:, 3], arrays["t"], atol=1e-6)
 
 
+def test_impossible_depth_is_none(workspace: Workspace, tmp_path: Path) -> None:
+    """It made the steps of all PNG files so long that no depth was left, or ended the program."""
+    truth = np.full((HEIGHT, WIDTH), ALTITUDE, np.float32)
+    write_raw_map(workspace, "b.png", np.full_like(truth, np.inf))
+    damaged = truth.copy()
+    damaged[0, :4] = 1e30, np.nan, np.inf, -5
+    write_raw_map(workspace, "c.png", damaged)
+    truth[0, :4] = 0
+    (png,) = exported(workspace, tmp_path / "out", "png")
+    cameras = json.loads((png / "cameras.json").read_text())
+    assert [each["name"] for each in cameras["images"]] == ["a/0.png", "a/1.png", "c.png"]
+    steps = cv2.imread(str(png / "c.png.png"), cv2.IMREAD_UNCHANGED)
+    assert steps is not None
+    np.testing.assert_allclose(steps * cameras["model_units_per_step"], truth, atol=1e-3)
+    for name in NAMES:
+        write_raw_map(workspace, name, np.full_like(truth, np.inf))
+    with pytest.raises(NoResultError, match="has no depth in any geometric depth map"):
+        exported(workspace, tmp_path / "none", "png")
+
+
+def write_raw_map(workspace: Workspace, name: str, depth: np.ndarray) -> None:
+    """As another program may write it."""
+    head = f"{depth.shape[1]}&{depth.shape[0]}&1&".encode()
+    workspace.depth_map_path(name, "geometric").write_bytes(head + depth.astype("<f4").tobytes())
+
+
 # ---- folders for other programs -----------------------------------------------------------------------------
 
 
