@@ -88,6 +88,22 @@ def stated_system(path: Path) -> str | None:
     return cloud.crs
 
 
+@pytest.mark.parametrize("point_format", [1, 6])
+def test_points_of_las_that_do_not_count_are_left_out(
+    tmp_path: Path, point_format: int, caplog: pytest.LogCaptureFixture
+):
+    """Withheld ones and noise, which would make a cloud incomplete (ASPRS, LAS 1.4 R15, tables 7, 9 and 17)."""
+    las = laspy.create(point_format=point_format, file_version="1.4")
+    las.x, las.y, las.z = np.arange(30.0).reshape(3, 10)
+    las.classification = [2, 2, 7, 18, 2, 5, 6, 1, 0, 2]
+    las.withheld = np.arange(10) == 5
+    las.write(tmp_path / "lidar.las")
+    cloud = read_geometry(tmp_path / "lidar.las")
+    assert isinstance(cloud, PointCloud)
+    assert cloud.points[:, 0].tolist() == [0, 1, 4, 6, 7, 8, 9]
+    assert "lidar.las: 3 points of 10 are marked as withheld or as noise; left out" in caplog.text
+
+
 def test_las_states_its_coordinate_system(tmp_path: Path):
     from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 

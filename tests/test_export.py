@@ -218,7 +218,9 @@ def test_clouds_in_tiles_are_exported_whole(workspace: Workspace, tmp_path: Path
     assert np.abs(laspy.read(path).xyz - expected).max() < 1e-4
 
 
-def test_points_that_cannot_be_are_left_out(workspace: Workspace, tmp_path: Path) -> None:
+def test_points_that_cannot_be_are_left_out(
+    workspace: Workspace, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     points, images = make_cloud(100)
     points["xyz"][7] = np.nan
     points["xyz"][9, 1] = 1e300
@@ -228,6 +230,23 @@ def test_points_that_cannot_be_are_left_out(workspace: Workspace, tmp_path: Path
     kept = np.delete(np.arange(100), [7, 9])
     assert np.abs(las.xyz - points["xyz"][kept]).max() < 1e-4
     np.testing.assert_array_equal(las.Images, [len(images[index]) for index in kept])
+    assert caplog.messages == ["2 points of the cloud's 100 have no possible coordinates; left out"]
+
+
+@pytest.mark.parametrize("kind", ["float", "none"])
+def test_colours_that_are_not_read_are_told(
+    kind: str, workspace: Workspace, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Other programs write numbers from 0 to 1, or none: LAS files were black without a word."""
+    names = ["x", "y", "z", *(("red", "green", "blue") if kind == "float" else ())]
+    lines = ["ply", "format binary_little_endian 1.0", "element vertex 50"]
+    lines += [f"property float {name}" for name in names]
+    values = np.random.default_rng(0).uniform(0, 1, (50, len(names))).astype("<f4")
+    workspace.fused_path.write_bytes("\n".join([*lines, "end_header\n"]).encode() + values.tobytes())
+    workspace.visibility_path.unlink()
+    (path,) = exported(workspace, tmp_path / "out", "las")
+    assert not laspy.read(path).red.any()
+    assert f"{workspace.fused_path} has no colours as this program reads them" in caplog.text
 
 
 def test_visibility_of_another_cloud_is_not_used(workspace: Workspace, tmp_path: Path) -> None:
@@ -330,6 +349,32 @@ def test_depth_maps_are_read_back(workspace: Workspace, tmp_path: Path) -> None:
         place_of_camera = -np.array(arrays["R"]).T @ arrays["t"]
         np.testing.assert_allclose(place_of_camera, view.center + scene.origin, atol=1e-6)
         np.testing.assert_allclose(np.array(each["cam_from_world"])[:, 3], arrays["t"], atol=1e-6)
+
+
+def test_impossible_depth_is_none(workspace: Workspace, tmp_path: Path) -> None:
+    """It made the steps of all PNG files so long that no depth was left, or ended the program."""
+    truth = np.full((HEIGHT, WIDTH), ALTITUDE, np.float32)
+    write_raw_map(workspace, "b.png", np.full_like(truth, np.inf))
+    damaged = truth.copy()
+    damaged[0, :4] = 1e30, np.nan, np.inf, -5
+    write_raw_map(workspace, "c.png", damaged)
+    truth[0, :4] = 0
+    (png,) = exported(workspace, tmp_path / "out", "png")
+    cameras = json.loads((png / "cameras.json").read_text())
+    assert [each["name"] for each in cameras["images"]] == ["a/0.png", "a/1.png", "c.png"]
+    steps = cv2.imread(str(png / "c.png.png"), cv2.IMREAD_UNCHANGED)
+    assert steps is not None
+    np.testing.assert_allclose(steps * cameras["model_units_per_step"], truth, atol=1e-3)
+    for name in NAMES:
+        write_raw_map(workspace, name, np.full_like(truth, np.inf))
+    with pytest.raises(NoResultError, match="has no depth in any geometric depth map"):
+        exported(workspace, tmp_path / "none", "png")
+
+
+def write_raw_map(workspace: Workspace, name: str, depth: np.ndarray) -> None:
+    """As another program may write it."""
+    head = f"{depth.shape[1]}&{depth.shape[0]}&1&".encode()
+    workspace.depth_map_path(name, "geometric").write_bytes(head + depth.astype("<f4").tobytes())
 
 
 # ---- folders for other programs -----------------------------------------------------------------------------

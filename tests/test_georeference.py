@@ -276,6 +276,11 @@ def test_positions_on_both_sides_of_the_180th_meridian_are_in_a_zone_beside_it(
         (["point,x,y,z,image,column,row", "P,1,2,3,a/0.png,1,5", "P,1,2,4,a/1.png,1,5"], "line 3: the point 'P'"),
         (["point,x,y,z,image,column,row", "P,,,,a/0.png,1,5"], "line 2: the point 'P' has no x"),
         (["point,x,y,z,image,column,row", "P,1,2,3,b.png,1,5"], "0 control points"),
+        (
+            ["point,x,y,z,image,column,row", "P,1,2,3,a/0.png,1,5", "P,,,,a/1.png,1,5", "P,,,,0.png,9,5"],
+            "line 4: the point 'P' is marked in 0.png before",
+        ),
+        (["image,x,y,z", *(f"a/{k}.png,{k},{k * k},3" for k in range(6)), "3.png,3,9,3"], "a/3.png under two"),
         (["point,x,y,z,image,column,row,role", "P,1,2,3,b.png,1,5,chief"], "line 2: the role 'chief'"),
     ],
 )  # fmt: skip

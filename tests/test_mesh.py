@@ -264,12 +264,27 @@ def test_a_library_that_open3d_needs_is_named(workspace, tmp_path, monkeypatch):
 
 
 def test_a_mesh_coarser_than_the_pixels_is_told(cloudy, tmp_path, monkeypatch, caplog):
-    """Of a large block, or of two blocks far apart."""
+    """Of a large block, or of two blocks far apart; here a sphere of 10 units, and cells of two pixels of 0.2."""
     made(cloudy, tmp_path / "fine", method="poisson", trim=0.0)
     assert caplog.text == ""
     monkeypatch.setattr(make, "_DEPTHS", (3, 4))
     made(cloudy, tmp_path / "coarse", method="poisson", trim=0.0)
-    assert re.search(r"poisson has 16 cells along a side at most, not 1\d\d;", caplog.text)
+    assert re.search(r"poisson has 16 cells along a side at most, not 2\d;", caplog.text)
+
+
+def test_cells_of_poisson_are_as_asked_for_where_something_lies_far_off(cloudy, tmp_path):
+    """The octree is as large as all of the cloud, not as what most pixels see: cells were 8 times as large."""
+    head, data = cloudy.fused_path.read_bytes().split(b"end_header\n")
+    points = np.frombuffer(data, POINT).copy()
+    points["xyz"][:8] += [600, 0, 0]
+    other = surveyed_workspace(tmp_path / "other")
+    other.fused_path.write_bytes(head + b"end_header\n" + points.tobytes())
+    mesh = made(other, tmp_path / "made", method="poisson", voxel=0.5, trim=6.0)
+    near = np.linalg.norm(np.asarray(mesh.vertices) - [0, 0, 8], axis=1)
+    assert abs(np.median(near) - 5) < 0.05
+    edges = mesh.edges_unique_length[(np.abs(mesh.vertices[mesh.edges_unique]) < 20).all(axis=(1, 2))]
+    # Of a surface in cubes, whose side is the whole over a power of two: up to 1.5 times what is given.
+    assert 0.25 < np.median(edges) < 1.0
 
 
 def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
@@ -289,6 +304,10 @@ def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
         ("one normal of 0", r"fused\.ply has 1 point without a normal"),
         ("one place unknown", r"without possible coordinates"),
         ("two points", r"has only 2 points"),
+        ("one normal unknown", r"fused\.ply has 1 point without a normal"),
+        ("normals of no length", r"fused\.ply has 20,000 points without a normal"),
+        ("one place for all", r"All points of .*fused\.ply lie within 0, less than one cell of 0\.\d+,"),
+        ("nearly one place", r"All points of .*fused\.ply lie within 1e-30, less than one cell"),
     ],
 )
 def test_a_cloud_that_poisson_would_crash_on_is_refused(wrong, words, cloudy, tmp_path):
@@ -302,6 +321,13 @@ def test_a_cloud_that_poisson_would_crash_on_is_refused(wrong, words, cloudy, tm
         points["normal"][7] = 0
     elif wrong == "one place unknown":
         points["xyz"][7, 1] = np.nan
+    elif wrong == "one normal unknown":
+        points["normal"][7, 1] = np.nan
+    elif wrong == "normals of no length":
+        points["normal"] *= 1e-30
+    elif wrong in ("one place for all", "nearly one place"):
+        points["xyz"] = 0
+        points["xyz"][::2, 0] = 1e-30 if wrong == "nearly one place" else 0
     else:
         head, points = head.replace(b"vertex 20000", b"vertex 2"), points[:2]
     other = surveyed_workspace(tmp_path / "other")

@@ -399,8 +399,8 @@ def test_some_points_are_of_the_cloud_and_evenly_spread(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "no binary PLY"),
-        (b"", "no binary PLY"),
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "no binary little-endian PLY"),
+        (b"", "no binary little-endian PLY"),
         (b"ply\nformat binary_little_endian 1.0\nelement face 1\nend_header\n", "begin with points"),
         (
             b"ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n",

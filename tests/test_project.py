@@ -1,5 +1,6 @@
 """What a run is given to work on: defaults, and every mistake told in a sentence that names the right option."""
 
+import runpy
 import shlex
 import shutil
 from pathlib import Path
@@ -13,6 +14,8 @@ from colmap_sph.app import cli
 from colmap_sph.errors import ColmapSphError, InputError, OptionError
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.sparse_model import models_inside
+
+SUMMARY = Path(__file__).resolve().parent.parent / "workflows" / "batch_summary.py"
 
 
 @pytest.fixture
@@ -43,6 +46,27 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 )
 def test_default_output(tmp_path: Path, model: str, expected: str) -> None:
     assert Project(tmp_path / model).root == tmp_path / expected
+
+
+@pytest.mark.parametrize(
+    ("link", "target", "model", "expected"),
+    [
+        ("mine/sparse", "store/sparse", "mine/sparse/0", "mine/dense"),
+        ("mine/sparse/1", "store/sparse/0", "mine/sparse/1", "mine/dense-1"),
+        ("mine/best", "store/sparse/0", "mine/best", "store/dense"),
+    ],
+)
+def test_default_output_of_links(tmp_path: Path, link: str, target: str, model: str, expected: str) -> None:
+    """What is linked to is often not to be written to: the result goes beside `sparse` as it is typed."""
+    (tmp_path / target).mkdir(parents=True)
+    (tmp_path / "store/sparse/0").mkdir(exist_ok=True)
+    (tmp_path / link).parent.mkdir(parents=True)
+    (tmp_path / link).symlink_to(tmp_path / target)
+    (tmp_path / "mine/database.db").touch()
+    project = Project(tmp_path / model)
+    assert project.root == tmp_path / expected
+    assert runpy.run_path(str(SUMMARY))["default_output"](tmp_path / model) == tmp_path / expected
+    assert project.database() == tmp_path / "mine/database.db"
 
 
 def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:

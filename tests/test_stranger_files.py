@@ -62,6 +62,7 @@ BAD_PLY = {
     "list too long": faces("9 0 1 2\n"),
     "list of -1": faces("-1 0 1 2\n", kind="char"),
     "polygon of 100,000": faces("100000 " + "0 1 2 3 " * 25_000 + "\n", kind="int"),
+    "strips": faces("4 0 1 3 2\n", kind="int").replace(b"element face", b"element tristrips"),
     "fewer rows": faces("3 0 1 2\n", count=2),
     "no properties": header("element vertex 3") + b"1\n2\n3\n",
     "no z": header("element vertex 1\nproperty float x\nproperty float y") + b"1 2\n",

@@ -7,15 +7,19 @@ of chunks that does not fit may end the process.
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import struct
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from colmap_sph.errors import counted
 from colmap_sph.evaluation.neighbours import Points
+
+logger = logging.getLogger(__name__)
 
 _CHUNK_BYTES = 64 << 20
 _HEADER_BYTES = 375
@@ -31,6 +35,8 @@ _LASZIP_BYTES = 34
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 _EXTRA_BYTES = 14
 
+# Classes of LAS: low point and high noise.
+_NOISE = (7, 18)
 _WKT_PROJECTED = ("PROJCS", "PROJCRS", "PROJECTEDCRS")
 _WKT_GEOGRAPHIC = ("GEOGCS", "GEOGCRS", "GEODCRS", "GEOGRAPHICCRS")
 _GEOTIFF_MODEL_TYPE = 1024
@@ -51,6 +57,7 @@ def read_las(path: Path, laspy: Any) -> tuple[Points, str | None]:
     Returns
     -------
     points : (N, 3) float64 ndarray
+        Without those that are marked as withheld or as noise, which is warned of.
     crs : str or None
         The coordinate system as 'projected (NAME)' or 'geographic (NAME)'; None without one.
 
@@ -65,15 +72,27 @@ def read_las(path: Path, laspy: Any) -> tuple[Points, str | None]:
         point_bytes = _check(file)
     with laspy.open(path, laz_backend=laspy.LazBackend.Lazrs) as reader:
         count = reader.header.point_count
-        chunks = [
-            np.stack([chunk.x, chunk.y, chunk.z], axis=1)
-            for chunk in reader.chunk_iterator(max(1, _CHUNK_BYTES // point_bytes))
-        ]
+        chunks = list(map(_places, reader.chunk_iterator(max(1, _CHUNK_BYTES // point_bytes))))
         crs = _las_crs(reader.header)
-    points = np.concatenate(chunks) if chunks else np.empty((0, 3))
+    points = np.concatenate([places for places, _ in chunks]) if chunks else np.empty((0, 3))
     if len(points) != count:
         raise ValueError(f"its header states {counted(count, 'point')}, it has {len(points)}")
-    return points, crs
+    kept = np.concatenate([is_good for _, is_good in chunks]) if chunks else np.ones(0, bool)
+    if kept.all():
+        return points, crs
+    logger.warning(
+        "%s: %s of %d are marked as withheld or as noise; left out",
+        path,
+        counted(int(count - kept.sum()), "point"),
+        count,
+    )
+    return points[kept], crs
+
+
+def _places(points: Any) -> tuple[Points, NDArray[np.bool_]]:
+    """(n, 3) coordinates of some points, and which of them their file means to be used."""
+    is_noise = np.isin(np.asarray(points.classification), _NOISE)
+    return np.stack([points.x, points.y, points.z], axis=1), ~(is_noise | (np.asarray(points.withheld) != 0))
 
 
 def _check(file: BinaryIO) -> int:

@@ -97,6 +97,8 @@ def read_ply(path: Path) -> tuple[Points, Faces]:
                 points = reader.points(element)
             elif element.name == "face" and element.count:
                 polygons = reader.polygons(element, element.place(_CORNERS, in_list=True))
+            elif element.name == "tristrips" and element.count:
+                raise DamagedError("its triangles are strips: write them as faces")
             else:
                 reader.polygons(element, None)
         if reader.has_more():

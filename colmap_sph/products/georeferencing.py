@@ -87,24 +87,20 @@ def _in_own_coordinates(workspace: Workspace, name: str | None) -> Georeference:
         )
     scene = read_scene(workspace.sparse_dir)
     found = Georeference(crs=name, wkt=wkt_of(crs))
-    _refuse_far(
-        scene,
-        found,
-        crs,
-        f"The cameras of {workspace.sparse_dir}",
-        "give --align if the model is in a frame of its own",
-    )
+    if far := _far_place(scene, found, crs):
+        raise InputError(
+            f"The cameras of {workspace.sparse_dir} are at {far}; check --crs, or give --align if the model is in "
+            "a frame of its own."
+        )
     return found
 
 
-def _refuse_far(scene: Scene, found: Georeference, crs: "pyproj.CRS", what: str, remedy: str) -> None:
-    """Raise `InputError` where a scene's cameras would lie far from where a coordinate system is used."""
+def _far_place(scene: Scene, found: Georeference, crs: "pyproj.CRS") -> str:
+    """Where a scene's cameras would be, in words, if a coordinate system is not used there; empty if it is."""
     x, y, z = middle = found.to_map(np.median([view.center for view in scene.views], axis=0) + scene.origin)
-    if not is_in_area(crs, middle):
-        raise InputError(
-            f"{what} are at {x:.6g}, {y:.6g}, {z:.6g}, which is far from where {found.crs} ({crs.name}) is used; "
-            f"check --crs, or {remedy}."
-        )
+    if is_in_area(crs, middle):
+        return ""
+    return f"{x:.6g}, {y:.6g}, {z:.6g}, which is far from where {found.crs} ({crs.name}) is used"
 
 
 def _aligned(workspace: Workspace, options: GeoreferenceOptions, source: Path) -> Georeference:
@@ -124,8 +120,10 @@ def _aligned(workspace: Workspace, options: GeoreferenceOptions, source: Path) -
         name = options.crs or ""
         found = align_by_points(workspace, table, options.marked_in, source)
     found = replace(found, crs=name, wkt="" if crs is None else wkt_of(crs))
-    if crs is not None:
-        _refuse_far(scene, found, crs, f"By {source} the cameras", "leave it out for a site grid without a name")
+    if crs is not None and (far := _far_place(scene, found, crs)):
+        raise InputError(
+            f"By {source} the cameras are at {far}; check --crs, or leave it out for a site grid without a name."
+        )
     if crs is None or not crs.is_geocentric:  # whose third axis is not upright
         _tell_head_stand(scene, found, source)
     return found

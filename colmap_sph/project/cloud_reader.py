@@ -105,7 +105,7 @@ def read_layout(path: Path, file: BufferedReader) -> PlyLayout:
     header = start[: end.start()].decode("ascii", "replace").splitlines() if end else []
     lines = [line.split() for line in header if line.strip() and not line.startswith(("comment", "obj_info"))]
     if lines[:2] != [["ply"], ["format", "binary_little_endian", "1.0"]] or end is None:
-        raise InputError(f"{path} is no binary PLY file; fuse again to have this program's cloud.")
+        raise InputError(f"{path} is no binary little-endian PLY file; write it as one, or fuse again.")
     names: list[str] = []
     kinds: list[str] = []
     for words in lines[3:]:

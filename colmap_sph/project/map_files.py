@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from colmap_sph.errors import DamageError, InputError, reason_of
 from colmap_sph.project.files import atomic_file, open_regular
 
+# Depths beyond, in any unit, come from damage.
+_FARTHEST = 1e12
 _MAX_HEADER = 30
 # Of the square of a normal's length.
 _UNIT_TOLERANCE = 0.01
@@ -190,6 +192,11 @@ def has_depth(path: Path) -> bool:
     """Whether a depth map has a depth anywhere; it is read as far as the first one."""
     values = depth_on_disk(path).reshape(-1)
     return any((values[first : first + _BAND_VALUES] > 0).any() for first in range(0, len(values), _BAND_VALUES))
+
+
+def is_depth(values: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Which values of a depth map are possible depths, and neither none nor damage."""
+    return np.asarray((values > 0) & (values < _FARTHEST))
 
 
 def _start_of(path: Path) -> tuple[bytes, int]:

@@ -1,5 +1,6 @@
 """What a run works on, as the user gives it: one record, checked; a dense workspace given is opened."""
 
+import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -80,7 +81,9 @@ class Project:
         if self.output is not None:
             return self.output
         assert self.model is not None
-        project = real_path(self.model)
+        project = Path(os.path.normpath(Path.cwd() / self.model))
+        if "sparse" not in (project.name, project.parent.name):  # a link to a model says nothing of its project
+            project = real_path(self.model)
         number = project.name if project.name.isdigit() else ""
         if number:  # sparse/0, but not a project that is called 2024
             project = project.parent

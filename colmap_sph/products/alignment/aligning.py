@@ -66,6 +66,10 @@ def align_by_positions(scene: Scene, positions: Mapping[str, NDArray[np.float64]
     names = _matched(positions, centers, source)
     if len(names) < 3:
         raise InputError(_few_names(source, positions, centers))
+    if len(set(names.values())) < len(names):
+        called = list(names.values())
+        twice = next(name for name in called if called.count(name) > 1)
+        raise InputError(f"{source} has the image {twice} under two names; leave one of the two lines out.")
     places = np.array([positions[name] for name in names])
     own = np.array([centers[matched] for matched in names.values()])
     return _aligned(
@@ -131,9 +135,26 @@ def _triangulated(
                 f"{source}, line {number}: {column:g}, {row:g} lies outside of {name}, which has {camera.width} x "
                 f"{camera.height} pixels; correct it, or give the model of the images in which it was marked."
             )
+    if twice := _marked_twice(marks, called):
+        raise InputError(
+            f"{source}, line {twice[-1]}: the point {point.name!r} is marked in {twice[0]} before; leave out "
+            "one of the two lines."
+        )
     if len(marks) < 2:
         return None
     return triangulated([images[called[mark[0]]] for mark in marks], np.array([mark[1:3] for mark in marks]))
+
+
+def _marked_twice(
+    marks: Sequence[tuple[str, float, float, int]], called: Mapping[str, str]
+) -> tuple[str, float, float, int] | None:
+    """The first mark in an image that has one already: two rays of one image meet in its camera."""
+    seen: set[str] = set()
+    for mark in marks:
+        if called[mark[0]] in seen:
+            return mark
+        seen.add(called[mark[0]])
+    return None
 
 
 def _aligned(

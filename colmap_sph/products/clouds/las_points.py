@@ -8,6 +8,7 @@ References
 .. [1] ASPRS, *LAS Specification 1.4 - R15*, 2019.
 """
 
+import logging
 import math
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -17,9 +18,11 @@ import numpy as np
 from laspy.vlrs.known import WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
-from colmap_sph.errors import NoResultError, OptionError
+from colmap_sph.errors import NoResultError, OptionError, counted
 from colmap_sph.products.clouds.source import UNKNOWN, Cloud, CloudPiece
 from colmap_sph.products.georeference import Georeference
+
+logger = logging.getLogger(__name__)
 
 _POINT_FORMAT = 7
 # Names that PDAL and CloudCompare know.
@@ -55,6 +58,12 @@ def extent_of(cloud: Cloud, georeference: Georeference) -> Extent:
             high = np.maximum(high, places.max(axis=0))
     if not count:
         raise NoResultError(f"No point of {cloud.paths[0]} has possible coordinates; fuse again.")
+    if count < cloud.count:
+        logger.warning(
+            "%s of the cloud's %s have no possible coordinates; left out",
+            counted(cloud.count - count, "point"),
+            f"{cloud.count:,}",
+        )
     return Extent(count, low, high)
 
 

@@ -178,7 +178,14 @@ def open_cloud(workspace: Workspace) -> Cloud:
     count = sum(layout.count for layout in layouts)
     if not count:
         raise NoResultError(f"The cloud in {workspace.root} has no points; there is nothing to hand over.")
-    return Cloud(paths, count, layouts[0].kind, _have_visibility(paths, layouts))
+    cloud = Cloud(paths, count, layouts[0].kind, _have_visibility(paths, layouts))
+    if not cloud.has_colours:
+        logger.warning(
+            "%s has no colours as this program reads them (red, green and blue of type uchar): what is made of it "
+            "has none",
+            paths[0],
+        )
+    return cloud
 
 
 def _layout(path: Path) -> PlyLayout:

@@ -9,7 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, NoResultError, shell_word
-from colmap_sph.project.map_files import depth_if_readable, has_depth, map_size, read_depth_map, read_normal_planes
+from colmap_sph.project.map_files import (
+    depth_if_readable,
+    depth_on_disk,
+    is_depth,
+    map_size,
+    read_depth_map,
+    read_normal_planes,
+)
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
@@ -58,7 +65,7 @@ class MappedScene:
             normals = read_normal_planes(path)
         else:
             normals = np.zeros((3, *depth.shape), np.float32)
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+        depth = np.where(is_depth(depth), depth, np.float32(0))
         centred = at_pixel_centres(depth, normals, view)
         return DepthAtCentres(view, centred, np.ascontiguousarray(normals.transpose(1, 2, 0)))
 
@@ -80,7 +87,7 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
         path = workspace.depth_map_path(view.name, "geometric")
         if not path.is_file():
             missing += 1
-        elif has_depth(path):
+        elif is_depth(depth_on_disk(path)).any():
             views.append(at_map_size(view, path))
     if not views:
         raise no_maps(workspace, are_missing=missing == len(scene.views))

@@ -3,7 +3,7 @@
 import logging
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +35,8 @@ logger = logging.getLogger(__name__)
 _DEPTHS = (6, 13)
 # COLMAP's poisson crashes where it cuts off all of a surface, as it does of a few points that lie apart.
 _FEWEST_POINTS = 100
+# Nor does it survive normals of a length that nobody means: its squares run over.
+_LONGEST_NORMAL = 1e3
 # Depths of one surface, as the mesh and a view have it, differ by no more than this many pixels on it.
 _TOLERANCE = 6.0
 
@@ -159,26 +161,31 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
         raise InputError(
             f"{cloud} is missing, of which --method poisson makes a mesh; run colmap_sph run{option} first."
         )
-    _check_cloud(cloud, measured_cloud(workspace))  # which refuses one of other poses
-    wanted = round(math.log2(max(_size(seen) / cell, 1.0)))
+    # All of the cloud is in the octree, also a few points that lie far off.
+    sides = _checked_size(cloud, measured_cloud(workspace), cell) / cell  # which refuses one of other poses
+    wanted = round(math.log2(max(sides, 1.0)))
     depth = int(np.clip(wanted, *_DEPTHS))
     if wanted > depth:
         logger.warning(
             "The mesh is coarser than the images, as poisson has %d cells along a side at most, not %d; give "
             "--method tsdf, which has no such bound, for finer ones",
             2**depth,
-            _size(seen) / cell,
+            sides,
         )
     mesh = scratch / "poisson.ply"
     poisson_mesh(cloud, mesh, depth=depth, trim=request.options.trim, threads=request.threads)
     return read_ply(mesh)
 
 
-def _check_cloud(path: Path, cloud: Cloud) -> None:
-    """Raise `InputError` or `NoResultError` for a cloud of which COLMAP would make nothing, or crash."""
+def _checked_size(path: Path, cloud: Cloud, cell: float) -> float:
+    """Longest side of a cloud; `InputError` or `NoResultError` where COLMAP would make nothing of it, or crash."""
     sound = 0
-    if cloud.has_normals:
-        sound = sum(int(np.any(piece.normals, axis=1).sum()) for piece in cloud.pieces())
+    low, high = np.full(3, np.inf), np.full(3, -np.inf)
+    for piece in replace(cloud, has_images=False).pieces():  # images are of no use here, and take long to read
+        if piece.normals is not None and len(piece.xyz):
+            lengths = np.linalg.norm(piece.normals.astype(np.float64), axis=1)
+            sound += int(((lengths > 1 / _LONGEST_NORMAL) & (lengths < _LONGEST_NORMAL)).sum())
+            low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
     if sound < cloud.count:
         raise InputError(
             f"{path} has {counted(cloud.count - sound, 'point')} without a normal, or without possible "
@@ -188,6 +195,13 @@ def _check_cloud(path: Path, cloud: Cloud) -> None:
         raise NoResultError(
             f"{path} has only {counted(sound, 'point')}, too few for a surface; try --method tsdf."
         )
+    size = float((high - low).max())
+    if size < cell:
+        raise NoResultError(
+            f"All points of {path} lie within {size:.3g}, less than one cell of {cell:.3g}, and make no surface; "
+            "fuse again, or give --method tsdf."
+        )
+    return size
 
 
 def _simplified(mesh: Triangles, request: MeshRequest, scratch: Path) -> Triangles:

@@ -135,7 +135,8 @@ def make_surface(request: SurfaceRequest, start: Start, advance: Advance) -> tup
                 advance()
             if not counts.sum():
                 raise NoResultError(
-                    "No cell of the raster is seen by any depth map; choose larger cells or a plane nearby."
+                    "No cell of the raster is seen by any depth map: choose larger cells or a plane nearby, or "
+                    "make maps anew whose normals do not face their cameras."
                 )
             made = files.finish()
             made += write_previews(made)

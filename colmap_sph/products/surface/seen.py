@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.products.maps.reading import no_maps
 from colmap_sph.project.images.reading import read_colours
-from colmap_sph.project.map_files import map_size, read_some_pixels
+from colmap_sph.project.map_files import is_depth, map_size, read_some_pixels
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
@@ -18,8 +18,6 @@ logger = logging.getLogger(__name__)
 
 # Pixels along the longer side of a map that are looked at beforehand.
 _SAMPLES = 128
-# Depths beyond come from damage.
-_FARTHEST = 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +84,7 @@ def _seen(workspace: Workspace, view: View, index: int) -> SeenView | None:
     rows = np.arange(min(step // 2, height - 1), height, step)
     columns = np.arange(min(step // 2, width - 1), width, step)
     depth = read_some_pixels(path, (height, width), rows, columns)
-    has_depth = (depth > 0) & (depth < _FARTHEST)
+    has_depth = is_depth(depth)
     if not has_depth.any():
         return None
     row, column = np.nonzero(has_depth)
@@ -125,7 +123,7 @@ def read_part(workspace: Workspace, view: View, box: Box, *, with_normals: bool 
     columns = np.arange(left, right)
     shape = (view.height, view.width)
     depth = read_some_pixels(workspace.depth_map_path(view.name, "geometric"), shape, rows, columns)
-    depth[~((depth > 0) & (depth < _FARTHEST))] = 0
+    depth[~is_depth(depth)] = 0
     normals = np.zeros((3, 0, 0), np.float32)
     if with_normals:
         normals = read_some_pixels(workspace.normal_map_path(view.name, "geometric"), (*shape, 3), rows, columns)
