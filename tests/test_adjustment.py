@@ -91,3 +91,12 @@ def test_cameras_are_turned_back(adjusted: tuple[pycolmap.Reconstruction, pycolm
     np.testing.assert_allclose(after.mean(axis=0), before.mean(axis=0), atol=0.1)
     left = [np.sqrt((wrong - wrong.mean(axis=0)) ** 2).mean() for wrong in (before, after)]
     assert left[1] < 0.1 * left[0]
+
+
+def test_exact_poses_stay() -> None:
+    """Ties of what is nearly flat fit cameras that are turned towards each other, too, and scale all depths."""
+    model = model_of(true_poses())
+    result = adjusted_model(model, observed(true_poses()))
+    assert result is not None
+    assert np.sqrt((turns(result, true_poses()) ** 2).mean()) < 0.08
+    assert np.median(np.linalg.norm(centers(result) - centers(model), axis=1)) / PIXEL < 0.1

@@ -1,7 +1,8 @@
 """A sparse model and tracks that were measured beside it → the model with adjusted poses: a bundle adjustment.
 
 The work is COLMAP's (Ceres). The model's own tracks take part: they hold the directions that ties leave weak. What
-neither holds is kept by weak priors on the centres, and the result is laid over the given model.
+neither holds is kept by weak priors: on the centres and, without tracks, on the turns. The result is laid over the
+given model.
 """
 
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ from colmap_sph.project.sparse_model import image_names, submodel
 _FEWEST_IMAGES = 3
 _INSIST = "; --polish-poses always polishes them, too"
 # Beyond what is usual a residual counts linearly: mismatches, and what moves. What is usual is measured, between
-# these bounds, pixels.
+# these bounds, pixels; the least of a model without tracks, as what its ties miss by may be its poses alone.
 _LEAST_USUAL = 0.1
 _MOST_USUAL = 1.0
 # Centres that are trusted count so many times more than what they look at.
@@ -28,6 +29,10 @@ _CENTER_WEIGHT = 100
 # its ties where it has none, which hardly tell a turn of the camera from a step.
 _CENTER_PIXELS = 5.0
 _CENTER_PIXELS_BY_TIES = 1.0
+# Stars are so many times farther away than ties are from each other: seen in the same direction from everywhere.
+_STAR_DISTANCE = 1e6
+# COLMAP's tracks have two observations at least.
+_STAR_OBSERVATIONS = 2
 _MAX_ITERATIONS = 100
 _CONVERGED = 1e-7
 
@@ -102,12 +107,14 @@ def adjusted_model(
     model = submodel(given, set(image_names(given)))
     own_points = sorted(model.points3D)
     with_ties = _with_observations(model, observations)
+    priors = _priors(model, with_ties)
+    stars = [] if own_points else _with_stars(with_ties, observations.points)
     with quiet_colmap(int(pycolmap.logging.ERROR)):  # it warns of centres in a row, and does without their priors
         adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-            _options(observations.error, refine_distortion=refine_distortion),
+            _options(observations.error if own_points else _LEAST_USUAL, refine_distortion=refine_distortion),
             pycolmap.PosePriorBundleAdjustmentOptions(),
-            _config(with_ties, refine_distortion=refine_distortion),
-            _priors(model, with_ties),
+            _config(with_ties, stars, refine_distortion=refine_distortion),
+            priors,
             with_ties,
         )
         summary = adjuster.solve()
@@ -142,6 +149,24 @@ def _with_observations(model: pycolmap.Reconstruction, observations: Observation
     return larger
 
 
+def _with_stars(model: pycolmap.Reconstruction, points: NDArray[np.float64]) -> list[int]:
+    """Add a star to each image, in the middle, that holds how its camera is turned; returns their point ids.
+
+    Ties are short: where all cameras turn a little towards each other, they still meet, at other depths.
+    """
+    distance = _STAR_DISTANCE * float(np.ptp(points, axis=0).max())
+    stars = []
+    for image_id in sorted(model.images):
+        image = model.image(image_id)
+        first = len(image.points2D)
+        middle = model.camera(image.camera_id).img_from_cam(np.array([0.0, 0.0, 1.0]))
+        image.points2D.extend([pycolmap.Point2D(middle)] * _STAR_OBSERVATIONS)
+        elements = [pycolmap.TrackElement(image_id, first + number) for number in range(_STAR_OBSERVATIONS)]
+        star = image.cam_from_world().inverse() * np.array([0.0, 0.0, distance])
+        stars.append(model.add_point3D(star, pycolmap.Track(elements)))
+    return stars
+
+
 def _options(usual_error: float, *, refine_distortion: bool) -> pycolmap.BundleAdjustmentOptions:
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
@@ -158,10 +183,14 @@ def _options(usual_error: float, *, refine_distortion: bool) -> pycolmap.BundleA
     return options
 
 
-def _config(model: pycolmap.Reconstruction, *, refine_distortion: bool) -> pycolmap.BundleAdjustmentConfig:
+def _config(
+    model: pycolmap.Reconstruction, stars: Sequence[int], *, refine_distortion: bool
+) -> pycolmap.BundleAdjustmentConfig:
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.images):
         config.add_image(image_id)
+    for star in stars:
+        config.add_constant_point(star)
     if not refine_distortion:
         for camera_id in sorted(model.cameras):
             config.set_constant_cam_intrinsics(camera_id)
