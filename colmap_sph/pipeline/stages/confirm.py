@@ -28,7 +28,7 @@ from colmap_sph.stereo.depth import DepthEstimate, Depths, drop_other_depths
 from colmap_sph.stereo.normals import NormalOptions, fit_normals
 from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.partners.pairing import Pair, as_pair, partners_of
-from colmap_sph.stereo.photographs.fringes import drop_fringes
+from colmap_sph.stereo.photographs.fringes import drop_fringes, drop_rims
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps, suits_half_size
 from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside, is_inside
@@ -124,6 +124,7 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
         planes = refine_maps(view, image, confirmed, *planes, sources, options, usual, half_size=task.half_size)
     if view.original:
         drop_fringes(planes[1])
+        drop_rims(planes[1], None if mask is None else task.reference.window.part(mask))
     drop_other_depths(planes[1], task.depths)
     drop_outside(view, planes[1], region_of(task.focus))
     shown = count_focus(view, estimate.depth, planes[1], task.focus)

@@ -1,4 +1,4 @@
-"""Depth map of a view that was cut from a photograph → the same without the fringes of what is near.
+"""Depth map of a view that was cut from a photograph → the same without fringes and its worst rims.
 
 Windows beside the edge of a near surface show it, too, so that it is found a little too wide. The views of a wide
 image have few pixels per degree: there the outermost pixel of such a surface is wrong nearly as often as right.
@@ -18,6 +18,14 @@ _REACH = 3
 # before a pixel nearly as much as behind it.
 _BEND = 2.0
 _DIRECTIONS = [step for step in itertools.product((-1, 0, 1), repeat=2) if step != (0, 0)]
+# Of the pixels so far around one, those are of its surface whose depth differs by less than this share. Along a
+# straight edge these are three fifths; a pixel with more is no rim.
+_AROUND = 2
+_SAME = 0.05
+_MOST_OF_RIM = 3 / 5
+# Of a map's depths, no more than this share are left out as rims: one with more of them is of fragments, and what
+# is wrong there is no likelier found at a rim.
+_MOST_RIMS = 0.04
 
 
 def drop_fringes(depth: NDArray[np.float32]) -> None:
@@ -57,3 +65,46 @@ def drop_fringes(depth: NDArray[np.float32]) -> None:
             is_fringe |= is_open & is_farther & (own - beyond > away * rise)
             is_open &= beyond == 0
     depth[rows[is_fringe], columns[is_fringe]] = 0
+
+
+def drop_rims(depth: NDArray[np.float32], mask: NDArray[np.uint8] | None = None) -> None:
+    """Drop the pixels with the least of their surface around them, of those that are rims.
+
+    A rim is a pixel of whose surface no more is around it than along a straight edge: three fifths of the 5 x 5
+    pixels that show anything. Those with the least go first, all with equally little at once, as long as they are
+    no more than a twenty-fifth of the map's depths.
+
+    Parameters
+    ----------
+    depth : (H, W) float32 ndarray
+        z-depth; 0 = none. Changed.
+    mask : (H, W) uint8 ndarray, optional
+        0 where nothing is shown, as beyond the lens: what ends there is no rim for that. Without it all is shown.
+
+    Examples
+    --------
+    >>> depth = np.full((20, 20), 5, np.float32)
+    >>> depth[9:, 10:] = 0
+    >>> depth[9, 11] = 4
+    >>> drop_rims(depth)
+    >>> depth[7:11, 8:13].astype(int).tolist()
+    [[5, 5, 5, 5, 5], [5, 5, 5, 5, 5], [5, 5, 0, 0, 0], [5, 5, 0, 0, 0]]
+    """
+    side = 2 * _AROUND + 1
+    window = np.ones((side, side), np.uint8)
+    is_even = (cv2.erode(depth, window) > (1 - _SAME) * depth) & (cv2.dilate(depth, window) < (1 + _SAME) * depth)
+    rows, columns = np.nonzero((depth > 0) & ~is_even)
+    padded = np.pad(depth, _AROUND)
+    is_shown = np.ones(depth.shape, np.uint8) if mask is None else (mask > 0).astype(np.uint8)
+    shown = cv2.boxFilter(is_shown, -1, (side, side), normalize=False, borderType=cv2.BORDER_CONSTANT)
+    places = (rows + _AROUND) * padded.shape[1] + columns + _AROUND
+    own = depth[rows, columns]
+    same = np.zeros(len(places), np.int64)
+    for down, across in itertools.product(range(-_AROUND, _AROUND + 1), repeat=2):
+        same += np.abs(padded.ravel()[places + down * padded.shape[1] + across] - own) < _SAME * own
+    # The surface's share of what is shown, in pixels of a whole window.
+    share = side**2 * same // np.maximum(shown[rows, columns], same)
+    least = np.bincount(share, minlength=side**2 + 1)[: int(_MOST_OF_RIM * side**2) + 1]
+    goes = np.count_nonzero(np.cumsum(least) <= _MOST_RIMS * np.count_nonzero(depth))
+    is_rim = share < goes
+    depth[rows[is_rim], columns[is_rim]] = 0
