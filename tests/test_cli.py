@@ -127,9 +127,20 @@ STAGES = {
 }
 
 
-@pytest.mark.parametrize("name", cli._COMMANDS)
+def test_a_run_loads_no_other_commands() -> None:
+    program = (
+        "import sys; from colmap_sph.app import cli; cli.main(['run', '--model', 'nowhere']); print(*sys.modules)"
+    )
+    ended = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)
+    assert "the model folder nowhere does" in ended.stderr.lower()
+    loaded = {".".join(name.split(".")[:2]) for name in ended.stdout.split()}
+    assert "colmap_sph.pipeline" in loaded
+    assert not {"colmap_sph.evaluation", "colmap_sph.products"} & loaded
+
+
+@pytest.mark.parametrize("name", cli.commands())
 def test_every_text_of_the_help_is_a_sentence(name: str) -> None:
-    for group in option_groups(cli._COMMANDS[name]):
+    for group in option_groups(cli.commands()[name]):
         for text in (group.text, *(option.text for option in group.options)):
             assert text[0].isupper() and text[-1] in ".)", text
 
@@ -238,7 +249,7 @@ def test_help_of_other_commands(
     assert output.startswith(f"usage: colmap_sph {usage}\n")
     for option in options:
         assert re.search(rf"^  {re.escape(option)}  +[A-Z0-9]", output, re.MULTILINE), option
-    told = [option.flag for group in option_groups(cli._COMMANDS[name]) for option in group.options]
+    told = [option.flag for group in option_groups(cli.commands()[name]) for option in group.options]
     assert all(flag.replace("--", "", 1) in output for flag in told)
     assert not re.search(r"None|MISSING|default: ", output)
 

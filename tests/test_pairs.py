@@ -20,6 +20,7 @@ from colmap_sph.errors import InputError, NoResultError, OptionError
 from colmap_sph.project.database import read_verified_matches
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import Scene, SourceImages, View
+from colmap_sph.stereo.partners.observers import observers_of_points
 from colmap_sph.stereo.partners.pairing import partners_of
 from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, overlapping_views, select_pairs
 from colmap_sph.stereo.partners.partner_choice import choose, triangulation_angles, worth_of
@@ -53,6 +54,19 @@ def line() -> Scene:
     points = np.column_stack([rng.uniform(-2, 6, (60, 2)), np.full(60, 10.0)])
     views = [view_at([i, 0, 0], f"{i}.jpg", range(10 * i, min(10 * i + 30, 60))) for i in range(5)]
     return Scene(tuple(views), points)
+
+
+def test_observers_of_points() -> None:
+    """Against a loop over all points, some of which nobody or everybody observes."""
+    rng = np.random.default_rng(3)
+    observed = [np.flatnonzero(rng.random(50) < share) for share in (0.5, 0.0, 0.9, 0.1)]
+    observed = [np.union1d(rows, [7]) if len(rows) else rows for rows in observed]
+    observed = [rows[rows != 49] for rows in observed]
+    first, observers = observers_of_points(observed, 50)
+    found = [observers[first[point] : first[point + 1]].tolist() for point in range(50)]
+    assert found == [[k for k, rows in enumerate(observed) if point in rows] for point in range(50)]
+    assert (found[7], found[49]) == ([0, 2, 3], [])
+    assert observers_of_points([], 2)[0].tolist() == [0, 0, 0]
 
 
 def test_ranked_by_shared_points(line: Scene) -> None:

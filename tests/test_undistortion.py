@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -33,7 +34,8 @@ from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import undistorted_place
 from colmap_sph.project.state.records import begin
 from colmap_sph.project.undistortion import UndistortionOptions
-from colmap_sph.project.undistortion.model import foreseen_scene
+from colmap_sph.project.undistortion.foreseen import foreseen_scene
+from colmap_sph.project.undistortion.model import undistort_model
 from colmap_sph.project.undistortion.originals import read_originals
 from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.workspace import Workspace
@@ -228,11 +230,11 @@ def test_finished_workspace_is_reused(tmp_path: Path) -> None:
 def test_a_finished_workspace_needs_no_space(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that the results have filled is no reason to refuse other options."""
     sparse = make_project(tmp_path)
-    monkeypatch.setattr("colmap_sph.project.undistortion.model.free_space", lambda _: 0)
+    monkeypatch.setattr("colmap_sph.project.undistortion.foreseen.free_space", lambda _: 0)
     with pytest.raises(OutputError, match="need about"):
         prepare(sparse, tmp_path / "dense")
     with monkeypatch.context() as patch:
-        patch.setattr("colmap_sph.project.undistortion.model.free_space", lambda _: 1 << 40)
+        patch.setattr("colmap_sph.project.undistortion.foreseen.free_space", lambda _: 1 << 40)
         prepare(sparse, tmp_path / "dense")
     prepare(sparse, tmp_path / "dense")
     with pytest.raises(OutputError, match="need about"):
@@ -543,6 +545,14 @@ def test_colmaps_process_may_start_before_its_folder_is_there(tmp_path: Path) ->
     with pytest.raises(InputError, match=r"COLMAP ended with exit code 7 at x\.jpg \(so it ends\)"):
         child.call(end_process, "so it ends", "x.jpg")
     child.close()
+
+
+def test_colmaps_process_loads_no_reader_of_images() -> None:
+    """Runs wait for it: its module needs neither these nor what reads scenes."""
+    program = f"import sys, {undistort_model.__module__}; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)
+    assert "pycolmap" in loaded.stdout.split()
+    assert not {"cv2", "OpenImageIO", "scipy", "colmap_sph.scene"} & {*loaded.stdout.split()}
 
 
 def end_process(words: str) -> None:

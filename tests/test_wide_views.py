@@ -15,6 +15,7 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.files import remove_temporary_files
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
+from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.wide import layout, range_maps
 from colmap_sph.project.wide.cuts import cuts_of
 from colmap_sph.project.wide.layout import faces_of
@@ -90,6 +91,17 @@ def test_names_of_views(project: Path) -> None:
     assert "cam/x/upper_left/a.png" in names
     assert names["lower_right/b.c.png"].original == names["lower_right/b.c.png"].photograph == "b.c.png"
     assert len(names) == 16
+
+
+@pytest.mark.usefixtures("with_child_processes")
+def test_views_need_no_process_for_colmap(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It would load for half a second: COLMAP undistorts neither these images nor their model."""
+
+    def start(*_: object) -> None:
+        raise AssertionError("a process for COLMAP is started")
+
+    monkeypatch.setattr(ChildProcess, "_start", start)
+    assert len(read_scene(prepare(model_in(project), project / "dense").sparse_dir).views) == 16
 
 
 def test_no_two_views_have_one_name(project: Path) -> None:

@@ -12,26 +12,22 @@ import cv2
 import tyro
 
 import colmap_sph
-from colmap_sph.app.colmap.commands import answer as colmap_answer
-from colmap_sph.app.colmap.commands import is_colmap_command
+from colmap_sph.app.colmap.names import is_colmap_command
 from colmap_sph.app.colmap.spelling import spelling_of
 from colmap_sph.app.completion import short_completion
 from colmap_sph.app.display import Display
-from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
 from colmap_sph.app.events import Events
 from colmap_sph.app.given_options import all_arguments
 from colmap_sph.app.interruption import Interrupted, stop_on_signals
 from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.option_list import help_of
 from colmap_sph.app.part_command import part_command
-from colmap_sph.app.products.commands import PRODUCTS
 from colmap_sph.app.refusals import refusals_in_words, refuse_empty_paths
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, with_dashed_values
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError, reason_of
-from colmap_sph.evaluation import format_clouds, format_depth_maps
 from colmap_sph.pipeline.forecast.time_limit import process_start
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.workers import is_memory_error
@@ -50,16 +46,22 @@ class DemoCommand:
     """Worker threads; 0: as many as the process may use cores."""
 
 
-_COMMANDS: dict[str, Any] = {
-    "run": RunCommand,
-    "demo": DemoCommand,
-    "evaluate": EvaluateCommand,
-    "report": ReportCommand,
-    "view": ViewCommand,
-    **{name: options for name, (options, _) in PRODUCTS.items()},
-}
-# Or of one of PRODUCTS.
-Command = RunCommand | DemoCommand | EvaluateCommand | ReportCommand | ViewCommand | Any
+# Those that load what a run needs anyway.
+_RUNS: dict[str, Any] = {"run": RunCommand, "demo": DemoCommand}
+Command = Any
+"""The record of a command's options."""
+
+
+def commands(wanted: str | None = None) -> dict[str, Any]:
+    """Return the commands' records of options by their names: of all, or of some among which is the wanted one."""
+    if wanted in _RUNS:
+        return _RUNS
+    # Not before: runs would load for a tenth of a second what they do not need.
+    from colmap_sph.app.evaluate_command import EvaluateCommand
+    from colmap_sph.app.products.commands import PRODUCTS
+
+    products = {name: options for name, (options, _) in PRODUCTS.items()}
+    return _RUNS | {"evaluate": EvaluateCommand, "report": ReportCommand, "view": ViewCommand} | products
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -131,9 +133,9 @@ def _help_asked_for(arguments: Sequence[str]) -> str | None:
     """The help of a command, where that is asked for; None: the parser has that of all."""
     command, *typed = arguments or ("",)
     everything = not {"--help-all", "--help_all"}.isdisjoint(typed)
-    if command not in _COMMANDS or not (everything or not {"-h", "--help"}.isdisjoint(typed)):
+    if not (everything or not {"-h", "--help"}.isdisjoint(typed)) or command not in (known := commands(command)):
         return None
-    return help_text(everything=everything) if command == "run" else help_of(command, _COMMANDS[command])
+    return help_text(everything=everything) if command == "run" else help_of(command, known[command])
 
 
 def _events_of(command: Command) -> Events:
@@ -145,6 +147,8 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal, started: flo
     def last_words(_: Interrupted) -> None:
         logger.info("Interrupted")
         _print_interrupted(None, terminal)
+
+    from colmap_sph.app.colmap.commands import answer as colmap_answer
 
     terminal.spell = spelling_of(arguments[0])
     try:
@@ -158,11 +162,12 @@ def _answer_as_colmap(arguments: Sequence[str], terminal: Terminal, started: flo
 def _parsed(arguments: Sequence[str]) -> Command:
     typed = with_dashed_values(arguments)
     arguments = ["run", *all_arguments(typed[1:], RunCommand)] if typed[:1] == ["run"] else typed
-    if arguments and arguments[0] in _COMMANDS:
-        refuse_empty_paths(arguments[1:], _COMMANDS[arguments[0]])
-    with standard_output(), refusals_in_words(typed, _COMMANDS), short_completion(arguments):
+    known = commands(arguments[0] if arguments else None)
+    if arguments and arguments[0] in known:
+        refuse_empty_paths(arguments[1:], known[arguments[0]])
+    with standard_output(), refusals_in_words(typed, known), short_completion(arguments):
         command: Command = tyro.extras.subcommand_cli_from_dict(
-            _COMMANDS,
+            known,
             prog="colmap_sph",
             description="Dense reconstruction for COLMAP without a GPU. COLMAP's own commands are taken, too: "
             "patch_match_stereo and stereo_fusion are done here, all others by COLMAP.",
@@ -187,6 +192,9 @@ def _do(command: Command, arguments: Sequence[str], terminal: Terminal, events: 
         return report_command(command, terminal)
     if isinstance(command, ViewCommand):
         return view_command(command, terminal)
+    from colmap_sph.app.evaluate_command import EvaluateCommand, evaluate_command
+    from colmap_sph.app.products.commands import PRODUCTS
+
     if isinstance(command, EvaluateCommand):
         return evaluate_command(command, terminal)
     return next(answer for options, answer in PRODUCTS.values() if isinstance(command, options))(command, terminal)
@@ -200,6 +208,7 @@ def demo_command(command: DemoCommand, terminal: Terminal, arguments: Sequence[s
     with log, Display(terminal, options.num_threads) as display:
         # Not before: no other command renders anything.
         from colmap_sph.app.demo import run_demo
+        from colmap_sph.evaluation import format_clouds, format_depth_maps
 
         result = run_demo(command.output, options=options, progress=display)
     print_summary(result.report, result.workspace, terminal)

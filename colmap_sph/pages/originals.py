@@ -204,7 +204,8 @@ def _places(view: View, cut: Cut, rays: Float, first: float = 0.0) -> tuple[NDAr
     ahead = np.flatnonzero(local[:, 2] > _LEAST_COSINE)  # a ray that is not known (NaN) is not ahead
     local = local[ahead]
     places = (local @ view.K.T)[:, :2] / local[:, 2:]
-    inside = ((places >= first) & (places <= (view.width + first, view.height + first))).all(axis=1)
+    x, y = places.T
+    inside = (x >= first) & (x <= view.width + first) & (y >= first) & (y <= view.height + first)
     return ahead[inside], local[inside, 2], places[inside]
 
 

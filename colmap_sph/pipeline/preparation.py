@@ -35,6 +35,7 @@ from colmap_sph.project.state.ownership import (
     undistorted_place,
 )
 from colmap_sph.project.state.records import claim
+from colmap_sph.project.undistortion.foreseen import check_space, foreseen_scene
 from colmap_sph.project.undistortion.marker import (
     Marker,
     adopt,
@@ -48,12 +49,7 @@ from colmap_sph.project.undistortion.marker import (
     set_model_aside,
     write_marker,
 )
-from colmap_sph.project.undistortion.model import (
-    ModelToUndistort,
-    check_space,
-    foreseen_scene,
-    undistort_model,
-)
+from colmap_sph.project.undistortion.model import ModelToUndistort, undistort_model
 from colmap_sph.project.undistortion.originals import read_originals
 from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.wide.cuts import Cut
@@ -162,7 +158,7 @@ class Preparation:
         executor : callable
             What is done with each stage, see `Executor`.
         """
-        if self.is_finished and not self._overwrite:
+        if self._originals.cuts.views or (self.is_finished and not self._overwrite):
             self._make(executor)
             return
         # COLMAP is likely to be asked for the model: its process loads while images are looked at.
@@ -302,10 +298,13 @@ class Preparation:
         return all(before.get(name) == cuts.get(name) for name in names)
 
     def _undistort_model(self, scratch: Path, names: Sequence[str]) -> Path:
-        """Undistort the model in a process of its own; return the folder where it is."""
+        """Undistort the model, where COLMAP does it in a process of its own; return the folder where it is."""
         task = ModelToUndistort(self._originals.model_dir, tuple(names), self.options.undistortion, scratch)
         try:
-            self._child.call(undistort_model, task, f"the model in {self.workspace.root}")
+            if self._originals.cuts.views:
+                undistort_model(task)
+            else:
+                self._child.call(undistort_model, task, f"the model in {self.workspace.root}")
         except InputError as error:
             # The model was read before: what can go wrong is that the disk does not take the new one.
             raise OutputError(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError
 from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.depth import Depths
+from colmap_sph.stereo.partners.observers import observers_of_points
 from colmap_sph.stereo.region.inside import is_inside
 
 # Sparse points of a view to look at, an even part of them.
@@ -73,14 +74,7 @@ class SparseTracks:
         self._scene = scene
         self._is_wanted = np.ones(len(scene.points), bool) if region is None else is_inside(region, scene.points)
         observed = [view.point_indices for view in scene.views]
-        indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in observed])])
-        indices = np.concatenate([*observed, np.empty(0, np.int64)])
-        shape = (len(observed), len(scene.points))
-        from scipy.sparse import csr_array  # which takes long to load
-
-        seen = csr_array((np.ones(len(indices), np.int8), indices, indptr), shape=shape).T.tocsr()
-        seen.sort_indices()
-        self._first, self._views = seen.indptr.astype(np.int64), seen.indices
+        self._first, self._views = observers_of_points(observed, len(scene.points))
         self._cameras = np.array([view.K @ view.cam_from_world for view in scene.views])
 
     def sights(self, name: str) -> SparseSights:

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from colmap_sph.app.colmap.fusion import make_cloud
-from colmap_sph.app.colmap.names import OTHERS, OWN, hand_over
+from colmap_sph.app.colmap.names import OWN, hand_over
 from colmap_sph.app.colmap.options import COMMANDS, ColmapCommand, ColmapOption
 from colmap_sph.app.colmap.parser import Given, parse
 from colmap_sph.app.colmap.patch_match import make_maps
@@ -24,18 +24,13 @@ from colmap_sph.pipeline.report import RunReport
 from colmap_sph.project.workspace import Workspace
 
 
-def is_colmap_command(name: str) -> bool:
-    """Whether COLMAP has a command of this name."""
-    return name in OWN or name in OTHERS
-
-
 def answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int:
     """Do what a command of COLMAP does; returns the exit code.
 
     Parameters
     ----------
     arguments : sequence of str
-        The command's name, for which `is_colmap_command` holds, and its options.
+        The command's name, for which `names.is_colmap_command` holds, and its options.
     terminal : Terminal
     started : float
         When the program began, as `time.monotonic` tells.

@@ -74,6 +74,11 @@ OTHERS = frozenset(
 _TRIED = "COLMAP_SPH_TRIED"
 
 
+def is_colmap_command(name: str) -> bool:
+    """Whether COLMAP has a command of this name."""
+    return name in OWN or name in OTHERS
+
+
 def is_handed_over(arguments: Sequence[str]) -> bool:
     """Whether a command line is for COLMAP."""
     return bool(arguments) and arguments[0] in OTHERS

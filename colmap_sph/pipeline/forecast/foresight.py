@@ -19,7 +19,7 @@ from colmap_sph.pipeline.stages.stage import Job, Result, Stage
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.stereo.partners.pairing import Pair
 
-_ASKED = 16
+_ASKED = 8
 """Items of each stage."""
 _EXPECTED = Result("", made=True, facts=Facts(coverage=1.0))
 

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 
@@ -65,20 +66,27 @@ def _still_shares(
     compared = {other for others in turned.values() for other in others}
     beside = slightly_turned_views(views, compared)
     small: dict[str, NDArray[np.uint8]] = {}
-    for name in sorted({*compared, *beside.values()}):
+
+    def read(name: str) -> None:
         with suppress(InputError):  # told by the stage that needs it
             small[name] = read_small(context.workspace.image_path(name), _LOOKED_AT)
-    shares = {}
-    for name in sorted(turned.keys() & beside.keys() & small.keys()):
+
+    def share(name: str) -> float | None:
         if beside[name] not in small:
-            continue
+            return None
         still = still_pixels(small[name], [small[other] for other in turned[name] if other in small])
         still &= still_pixels(small[name], [small[beside[name]]])
         with suppress(InputError):
             wanted = _wanted(context, name, still.shape)
             if wanted.any():
-                shares[name] = float(still[wanted].mean())
-    return shares
+                return float(still[wanted].mean())
+        return None
+
+    with ThreadPoolExecutor(context.options.num_threads) as pool:
+        list(pool.map(read, sorted({*compared, *beside.values()})))
+        names = sorted(turned.keys() & beside.keys() & small.keys())
+        shares = dict(zip(names, pool.map(share, names), strict=True))
+    return {name: found for name, found in shares.items() if found is not None}
 
 
 def _wanted(context: Context, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -1,4 +1,4 @@
-"""The model of the undistorted images: what it will be, and as COLMAP writes it.
+"""The model of the undistorted images, as COLMAP writes it.
 
 COLMAP leaves images that were not undistorted, and cameras without distortion but of a distorted model, in the
 model it writes; that is mended here.
@@ -6,7 +6,7 @@ model it writes; that is mended here.
 
 import errno
 import tempfile
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,43 +18,20 @@ from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.platforms.files import take_room
 from colmap_sph.project.cameras import change_camera, make_pinhole, plain_camera
 from colmap_sph.project.colmap_library import quiet_colmap
-from colmap_sph.project.files import free_space, make_dir
+from colmap_sph.project.files import make_dir
 from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.files import read_lens_fields
 from colmap_sph.project.lens.straight import pixel_rays, ray_pixels, straight_camera
-from colmap_sph.project.scene_reader import scene_of_model
-from colmap_sph.project.sparse_model import cameras_of_images, load_model, model_files, submodel
+from colmap_sph.project.sparse_model import load_model, submodel
 from colmap_sph.project.undistortion.options import UndistortionOptions
-from colmap_sph.project.undistortion.originals import Originals
 from colmap_sph.project.wide.cuts import Cuts
 from colmap_sph.project.wide.model import model_of_views
 from colmap_sph.project.wide.table import write_cuts
-from colmap_sph.scene import Scene
 
 _FULL_DISK_BYTES = 64 << 20
-# Space that undistortion is given, relative to the files it starts from; JPEGs come out up to 1.6 times larger.
-_SPACE_FACTOR = 2
-# Of a pixel of a view that is cut from a wide image, at most; half of it, as that factor is for all.
-_VIEW_BYTES = 1
 
 
-def foreseen_scene(originals: Originals, names: Collection[str], options: UndistortionOptions) -> Scene:
-    """Return the scene of the undistorted images `names`, before they are there."""
-    if originals.cuts.views:
-        model = _model_of_views(originals.model, originals.cuts, names, originals.fields, options)
-        return scene_of_model(model, originals.model_dir, originals.cuts.views)
-    model = submodel(originals.model, set(names))
-    for camera_id, camera in model.cameras.items():
-        change_camera(camera, straight_camera(camera, options.for_colmap(), originals.fields.get(camera_id)))
-
-    def moved(image: pycolmap.Image, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        i = image.camera_id
-        return _moved(originals.model.camera(i), pixels, originals.fields.get(i), model.camera(i))
-
-    return scene_of_model(model, originals.model_dir, moved=moved)
-
-
-def _moved(
+def moved_pixels(
     camera: pycolmap.Camera, pixels: NDArray[np.float64], field: LensField | None, straight: pycolmap.Camera
 ) -> NDArray[np.float64]:
     """Where (n, 2) image coordinates of an original image are in the undistorted one."""
@@ -99,7 +76,7 @@ def undistort_model(task: ModelToUndistort) -> None:
     model = load_model(task.model_dir)
     cuts = task.options.cuts(model, task.model_dir)
     if cuts.views:
-        made = _model_of_views(model, cuts, task.names, read_lens_fields(task.model_dir), task.options)
+        made = model_with_views(model, cuts, task.names, read_lens_fields(task.model_dir), task.options)
         make_dir(task.final_dir)
         made.write_binary(task.final_dir)
         _load_written_model(task.final_dir)
@@ -130,7 +107,7 @@ def undistort_model(task: ModelToUndistort) -> None:
     _write_final_model(undistorted, task.final_dir, task.names)
 
 
-def _model_of_views(
+def model_with_views(
     model: pycolmap.Reconstruction,
     cuts: Cuts,
     names: Collection[str],
@@ -145,7 +122,7 @@ def _model_of_views(
         return made
 
     def moved(camera: pycolmap.Camera, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        return _moved(camera, pixels, fields.get(camera.camera_id), straight(camera))
+        return moved_pixels(camera, pixels, fields.get(camera.camera_id), straight(camera))
 
     return model_of_views(model, cuts, names, straight, moved)
 
@@ -188,28 +165,6 @@ def _write_final_model(model: pycolmap.Reconstruction, target: Path, names: Coll
     make_dir(target)
     model.write_binary(target)
     _load_written_model(target)
-
-
-def check_space(originals: Originals, names: Iterable[str], output: Path, options: UndistortionOptions) -> None:
-    """Raise `OutputError` unless the undistorted images `names` will fit: COLMAP may not notice a full disk."""
-    needed = sum(path.stat().st_size for path in model_files(originals.model_dir))
-    cameras = cameras_of_images(originals.model)
-    limit = options.max_image_size
-    for name in names:
-        if name in originals.cuts.views:
-            face = originals.cuts.views[name].face
-            needed += _VIEW_BYTES * face.width * face.height
-            continue
-        longest = max(cameras[name].width, cameras[name].height)
-        scale = min(1.0, limit / longest) if limit > 0 else 1.0
-        needed += int(scale**2 * (originals.image_dir / name).stat().st_size)
-    needed *= _SPACE_FACTOR
-    free = free_space(output)
-    if free < needed:
-        raise OutputError(
-            f"The undistorted images need about {needed / 1e6:.0f} MB, but on the disk of {output} only "
-            f"{free / 1e6:.0f} MB are free; free some space or choose another --output."
-        )
 
 
 def _load_written_model(folder: Path) -> pycolmap.Reconstruction:

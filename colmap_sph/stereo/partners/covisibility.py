@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.scene import Photograph, Scene
 from colmap_sph.stereo.partners.frusta import likely_in_view, points_in_view
+from colmap_sph.stereo.partners.observers import observers_of_points
 from colmap_sph.stereo.partners.partner_choice import triangulation_angles, worth_of
 
 if TYPE_CHECKING:
@@ -76,9 +77,7 @@ class Covisibility:
         self._most_seen = max(_LEAST_SEEN, _SEEN_IN_ALL // max(len(photographs), 1))
         self._points = points
         self._observed = observed
-        by_point = _incidence(observed, len(points)).T.tocsr()
-        by_point.sort_indices()
-        self._first, self._observers = by_point.indptr, by_point.indices
+        self._first, self._observers = observers_of_points(observed, len(points))
         self._place = np.full(len(observed), -1)
         self._entry = np.full(len(points), -1)
 
@@ -234,19 +233,9 @@ def _together(observed: list[NDArray[np.int64]]) -> NDArray[np.int64]:
     return observed[0] if len(observed) == 1 else np.unique(np.concatenate(observed))
 
 
-def _incidence(observed: list[NDArray[np.int64]], num_points: int) -> "csr_array":
-    """(V, N) matrix of ones where a photograph sees a point."""
-    from scipy.sparse import csr_array  # which takes long to load, here and below
-
-    indptr = np.concatenate([[0], np.cumsum([len(indices) for indices in observed])])
-    indices = np.concatenate([*observed, np.empty(0, np.int64)]).astype(np.int32)
-    ones = np.ones(len(indices), dtype=np.int8)
-    return csr_array((ones, indices, indptr), shape=(len(observed), num_points))
-
-
 def _match_counts(photographs: Sequence[Photograph], matches: Mapping[tuple[str, str], int]) -> "csr_array":
     """Numbers of verified matches between photographs, as a (V, V) matrix."""
-    from scipy.sparse import csr_array
+    from scipy.sparse import csr_array  # which takes long to load
 
     index_of = {photograph.name: index for index, photograph in enumerate(photographs)}
     known = [

@@ -259,4 +259,5 @@ def sees(view: View, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     The image ends at the outer edges of its pixels: a point is seen wherever in a pixel it lies.
     """
     pixels, depth = view.project(points)
-    return np.asarray((depth > 0) & (pixels > 0).all(axis=1) & (pixels < [view.width, view.height]).all(axis=1))
+    x, y = pixels.T
+    return np.asarray((depth > 0) & (x > 0) & (y > 0) & (x < view.width) & (y < view.height))
