@@ -111,6 +111,59 @@ def selection(
     offset : (H, W) int32, written
     """
 
+def sweep_bytes(
+    backend: str,
+    width: int,
+    depth: int,
+    /,
+) -> tuple[int]:
+    """Size of the state that a sweep over rows of such a level brings from one band of them to the next.
+
+    backend : str
+    width : int
+    depth : int
+    returned: bytes
+    """
+
+def sweep(
+    backend: str,
+    reference: NDArray[np.uint64],
+    target: NDArray[np.uint64],
+    base: NDArray[np.int32],
+    surface: NDArray[np.int32],
+    image: NDArray[np.uint8],
+    depth: int,
+    p1: int,
+    p2: NDArray[np.uint8],
+    max_slant: int,
+    first: int,
+    end: int,
+    above: int,
+    below: int,
+    backward: bool,
+    state: NDArray[np.uint8],
+    /,
+) -> None:
+    """The state of a sweep moves over the rows from first to before end, which have so many above and below.
+
+    backend : str
+    reference : (H, W) uint64
+    target : (H, TARGET_W) uint64
+    base : (H, W) int32
+    surface : (H, W) int32
+    image : (H, W) uint8
+    depth : int
+    p1 : int
+    p2 : (256) uint8
+    max_slant : int
+    first : int
+    end : int
+    above : int
+    below : int
+    backward : bool
+    state : (BYTES) uint8, written
+    """
+
 def match(
     backend: str,
     reference: NDArray[np.uint64],
@@ -125,11 +178,16 @@ def match(
     max_slant: int,
     max_difference: int,
     max_excess: int,
+    first: int,
+    above: int,
+    below: int,
+    forward: NDArray[np.uint8],
+    backward: NDArray[np.uint8],
     scratch: NDArray[np.uint8],
     offset: NDArray[np.int32],
     /,
 ) -> None:
-    """Matching cost, aggregation and selection in one, in bands of so many rows as BAND pixels are.
+    """Matching cost, aggregation and selection of rows from first on, with so many above and below; states move.
 
     backend : str
     reference : (H, W) uint64
@@ -144,8 +202,13 @@ def match(
     max_slant : int
     max_difference : int
     max_excess : int
+    first : int
+    above : int
+    below : int
+    forward : (BYTES) uint8, written
+    backward : (BYTES) uint8, written
     scratch : (2, BAND, D) uint8, written
-    offset : (H, W) int32, written
+    offset : (ROWS, W) int32, written
     """
 
 def fit_offsets(

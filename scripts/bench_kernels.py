@@ -211,7 +211,9 @@ def matching_kernels(scene: Scene) -> list[Kernel]:
 
     def match(backend: str) -> None:
         images = left, right, *shown, base, base, image
-        _native.match(backend, *images, p1, P2, slant, *limits, scratch, matched)
+        size = _native.sweep_bytes(backend, scene.shape[1], scene.depth)
+        states = np.empty(size, np.uint8), np.empty(size, np.uint8)
+        _native.match(backend, *images, p1, P2, slant, *limits, 0, 0, 0, *states, scratch, matched)
 
     steps: list[tuple[Callable[[str], None], NDArray[Any]]] = [
         (matching_cost, cost),

@@ -118,19 +118,44 @@ def source_columns(rng: Random, shape: tuple[int, int]) -> Arguments:
     return [columns, int(rng.integers(0, 150))]
 
 
-def match(rng: Random) -> Arguments:
-    h, w = size(rng)
-    target = int(rng.integers(0, 70))
-    depth = 32 * int(rng.integers(1, 4))
-    words = [filled(rng, (h, width), np.uint64) for width in (w, target)]
+def band_inputs(rng: Random) -> tuple[tuple[int, int, int], Arguments, Arguments, Arguments]:
+    """Rows, columns and disparities; census; bases and image; penalties."""
+    (h, w), target, depth = size(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 4))
+    words: Arguments = [filled(rng, (h, width), np.uint64) for width in (w, target)]
     bases = [filled(rng, (h, w), np.int32) for _ in range(2)]
-    image = filled(rng, (h, w), np.uint8)
     p1 = int(rng.integers(0, 64))
-    p2 = rng.integers(p1, 128, 256).astype(np.uint8)
-    limits = rng.integers(0, (5, 5, 99)).tolist()
-    scratch = np.zeros((2, max(w, 1) * int(rng.integers(1, h + 2)), depth), np.uint8)
-    inputs = [*words, *source_columns(rng, (h, target)), *bases, image]
-    return [backend(rng), *inputs, p1, p2, *limits, scratch, np.zeros((h, w), np.int32)]
+    penalties = [p1, rng.integers(p1, 128, 256).astype(np.uint8), int(rng.integers(0, 5))]
+    return (h, w, depth), words, [*bases, filled(rng, (h, w), np.uint8)], penalties
+
+
+def state(rng: Random, kernels: str, width: int, depth: int) -> np.ndarray:
+    """What a sweep may have left."""
+    return rng.integers(0, 193, _native.sweep_bytes(kernels, width, depth)).astype(np.uint8)
+
+
+def sweep_bytes(rng: Random) -> Arguments:
+    return [backend(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 33))]
+
+
+def sweep(rng: Random) -> Arguments:
+    (h, w, depth), words, images, penalties = band_inputs(rng)
+    kernels = backend(rng)
+    first, end = sorted(rng.integers(0, h + 1, 2).tolist())
+    beside = [int(rng.integers(0, 9)) if inside else 0 for inside in (first > 0, end < h)]
+    band = [first, end, *beside, bool(rng.random() < 0.5)]
+    return [kernels, *words, *images, depth, *penalties, *band, state(rng, kernels, w, depth)]
+
+
+def match(rng: Random) -> Arguments:
+    (h, w, depth), words, images, penalties = band_inputs(rng)
+    kernels = backend(rng)
+    shown = source_columns(rng, words[1].shape)
+    limits = rng.integers(0, (5, 99)).tolist()
+    first, end = sorted(rng.integers(0, h + 1, 2).tolist())
+    beside = [int(rng.integers(0, 9)) if inside else 0 for inside in (first > 0, end < h)]
+    outputs = [np.zeros((2, (end - first) * w, depth), np.uint8), np.zeros((end - first, w), np.int32)]
+    states = [state(rng, kernels, w, depth) for _ in range(2)]
+    return [kernels, *words, *shown, *images, *penalties, *limits, first, *beside, *states, *outputs]
 
 
 def fit_offsets(rng: Random) -> Arguments:
@@ -519,6 +544,8 @@ FUNCTIONS: dict[str, Callable[[Random], Arguments]] = {
         matching_cost,
         aggregation,
         selection,
+        sweep_bytes,
+        sweep,
         match,
         fit_offsets,
         warp,
@@ -635,7 +662,7 @@ def call_function(rng: Random) -> None:
         result = getattr(_native, name)(*arguments)
     except ALLOWED:
         return
-    if result is not None and name not in ("count_points", "count_slopes"):
+    if result is not None and name not in ("count_points", "count_slopes", "sweep_bytes"):
         raise AssertionError(f"{name} returned {result!r}")
 
 

@@ -15,6 +15,8 @@ BACKENDS = _native.backends()
 every_backend = pytest.mark.parametrize("backend", BACKENDS)
 
 H, W, TARGET, DEPTH = 4, 40, 45, 32
+STATE = _native.sweep_bytes("scalar", W, DEPTH)
+SCRATCH = np.zeros((2, H * W, DEPTH), np.uint8)
 
 
 def arguments(function):
@@ -72,8 +74,31 @@ def arguments(function):
             "max_slant": 2,
             "max_difference": 2,
             "max_excess": 4,
-            "out scratch": np.zeros((2, H * W, DEPTH), u8),
-            "out offset": np.zeros((H, W), np.int32),
+            "first": 1,
+            "above": 7,
+            "below": 3,
+            "out forward": np.zeros(STATE, u8),
+            "out backward": np.zeros(STATE, u8),
+            "out scratch": np.zeros((2, (H - 2) * W, DEPTH), u8),
+            "out offset": np.zeros((H - 2, W), np.int32),
+        },
+        "sweep_bytes": {"backend": "scalar", "width": W, "depth": DEPTH},
+        "sweep": {
+            "backend": "scalar",
+            **census_pair,
+            "base": np.zeros((H, W), np.int32),
+            "surface": np.zeros((H, W), np.int32),
+            "image": np.zeros((H, W), u8),
+            "depth": DEPTH,
+            "p1": 10,
+            "p2": np.full(256, 60, u8),
+            "max_slant": 2,
+            "first": 1,
+            "end": H - 1,
+            "above": 7,
+            "below": 3,
+            "backward": False,
+            "out state": np.zeros(STATE, u8),
         },
         "fit_offsets": {
             "backend": "scalar",
@@ -485,6 +510,8 @@ FUNCTIONS = [
     "selection",
     "match",
     "fit_offsets",
+    "sweep_bytes",
+    "sweep",
     "warp",
     "unwarp_offsets",
     "mean_offsets",
@@ -534,6 +561,7 @@ OUTPUTS = [(function, name) for function, name in ARRAYS if name.startswith("out
 FREE = {
     ("matching_cost", "target"): {1},
     ("fit_offsets", "target"): {1},
+    ("sweep", "target"): {1},
     ("census", "out census"): {1},
     ("resample", "mask"): {0},  # none has no rows
     ("warp", "prediction"): {1},
@@ -660,7 +688,12 @@ def test_arrays_are_let_go_of(function):
 
 @pytest.mark.parametrize("function", FUNCTIONS)
 def test_valid_arguments_are_accepted(function):
-    results = {"count_points": (H * W, 2 * H * W), "count_slopes": ((W - 1) // 2, 0)}
+    state = (8 * W + 1) * DEPTH  # two rows of four paths, and a pixel
+    results = {
+        "count_points": (H * W, 2 * H * W),
+        "count_slopes": ((W - 1) // 2, 0),
+        "sweep_bytes": (state,),
+    }
     assert call(function, arguments(function)) == results.get(function)
 
 
@@ -835,6 +868,28 @@ def test_negative_limits_of_the_left_right_check_are_refused(function, limit):
 def test_sources_of_impossible_width_are_refused(function, width, message):
     with pytest.raises(ValueError, match=message):
         call(function, {**arguments(function), "source_width": width})
+
+
+@pytest.mark.parametrize(
+    ("function", "change"),
+    [
+        *((function, {"first": first}) for function in ("sweep", "match") for first in (-1, 0, H, 2**40)),
+        *(("sweep", {"end": end}) for end in (0, H, H + 1, 2**40)),
+        *((function, {beside: -1}) for function in ("sweep", "match") for beside in ("above", "below")),
+        ("match", {"first": 2}),
+        (
+            "match",
+            {"out offset": np.zeros((H, W), np.int32), "out scratch": np.zeros((2, H * W, DEPTH), np.uint8)},
+        ),
+        ("match", {"out scratch": SCRATCH}),
+        ("match", {"out forward": np.zeros(9, np.uint8), "out backward": np.zeros(9, np.uint8)}),
+        ("sweep", {"out state": np.zeros(9, np.uint8)}),
+        ("sweep", {"depth": 33}),
+    ],
+)
+def test_bands_that_are_not_among_the_rows_are_refused(function, change):
+    with pytest.raises(ValueError, match=r"row|scratch|state|multiple"):
+        call(function, {**arguments(function), **change})
 
 
 @pytest.mark.parametrize("change", [{"first": -1}, {"first": 6}, {"out census": np.zeros((H, W + 2), np.uint64)}])

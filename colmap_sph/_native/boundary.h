@@ -34,7 +34,7 @@
 /* H and W are rows and columns of the image or map in question, D disparities; the others speak for themselves. */
 #define SYMBOLS(X) \
     X(H) X(W) X(D) X(FINE_H) X(FINE_W) X(TARGET_W) X(SOURCE_H) X(SOURCE_W) X(MASK_H) X(BAND) X(MAP_H) X(MAP_W) \
-    X(PARTNER_H) X(PARTNER_W) X(PAIRS) X(SOURCES) X(ROWS) X(POINTS) X(WORDS) X(PIXELS) X(TILES)
+    X(PARTNER_H) X(PARTNER_W) X(PAIRS) X(SOURCES) X(ROWS) X(POINTS) X(WORDS) X(PIXELS) X(TILES) X(BYTES)
 
 #define SYMBOL_INDEX(symbol) INDEX_##symbol,
 #define SYMBOL_SIZE(symbol) symbol = (INDEX_##symbol + 1) << SYMBOL_SHIFT,

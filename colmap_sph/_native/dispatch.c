@@ -24,9 +24,13 @@
         return select_rows(&rows_##version, aggregated, base, reference, target, columns, size, check, \
                            offset); \
     } \
-    static int match_##version(const match_input *input, ptrdiff_t band_rows, uint8_t *scratch, \
-                               int32_t *offset) { \
-        return match_rows(&rows_##version, input, band_rows, scratch, offset); \
+    static size_t sweep_bytes_##version(match_size size) { return sweep_bytes_of_rows(&rows_##version, size); } \
+    static int sweep_##version(const match_input *input, row_band band, int backward, uint8_t *state) { \
+        return sweep_over_rows(&rows_##version, input, band, backward, state); \
+    } \
+    static int match_##version(const match_input *input, row_band band, uint8_t *forward, uint8_t *backward, \
+                                    uint8_t *scratch, int32_t *offset) { \
+        return match_rows(&rows_##version, input, band, forward, backward, scratch, offset); \
     }
 
 #define TABLE(version) \
@@ -36,6 +40,8 @@
      aggregation_##version, \
      selection_##version, \
      match_##version, \
+     sweep_bytes_##version, \
+     sweep_##version, \
      fit_offsets_##version, \
      mean_offsets_##version, \
      upsample_offsets_##version, \

@@ -13,6 +13,8 @@ typedef struct {
     aggregation_fn *aggregation;
     selection_fn *selection;
     match_fn *match;
+    sweep_bytes_fn *sweep_bytes;
+    sweep_fn *sweep;
     fit_offsets_fn *fit_offsets;
     mean_offsets_fn *mean_offsets;
     upsample_offsets_fn *upsample_offsets;

@@ -14,6 +14,7 @@ from colmap_sph.pipeline.stages.stage import Job, Result, Stage
 from colmap_sph.pipeline.workers import for_all
 from colmap_sph.project.state.background import vouching_in_background
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo.search.idle import busy, lending
 
 logger = logging.getLogger(__name__)
 
@@ -80,10 +81,11 @@ def made_by_threads(stage: Stage[Item, Task], items: Sequence[Item] | None = Non
             return Result(job.key, made=False, facts=job.done)
         if stage.whole:
             return _made(stage, job)
-        with gate.reserve(job.cost.memory, stage.label(item)):
+        with gate.reserve(job.cost.memory, stage.label(item)), busy():
             return _made(stage, job)
 
-    with gate.keeping(kept.total(gate.threads)), stage.holding(kept), vouching_in_background():
+    keeping = gate.keeping(kept.total(gate.threads))
+    with keeping, stage.holding(kept), vouching_in_background(), lending(gate.threads):
         items = stage.items if items is None else items  # not before: what is kept may tell the best order
         return _one_by_one(work, stage, items) if stage.whole else _by_threads(work, stage, items)
 

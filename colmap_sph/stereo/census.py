@@ -28,6 +28,10 @@ class RectifiedImage:
     image: NDArray[np.float32]
     valid: NDArray[np.uint8]
 
+    def rows(self, rows: slice) -> "RectifiedImage":
+        """Some of its rows."""
+        return RectifiedImage(self.image[rows], self.valid[rows])
+
 
 def pyramid(image: RectifiedImage, levels: int) -> list[RectifiedImage]:
     """Full resolution first. Odd rows and columns are doubled, so that pixel x of a level covers 2x, 2x + 1."""

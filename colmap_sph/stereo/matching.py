@@ -9,7 +9,7 @@ This module and `prediction` are the only callers of the matching kernels. Their
 column minus reference column; with the left image as reference it is minus the disparity.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
-from colmap_sph.stereo.census import Compared, RectifiedImage, census, pyramid
-from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.census import Compared, RectifiedImage, pyramid
+from colmap_sph.stereo.search.bands import BandMatcher, Level, Limits, Scratches, match_whole, scratch_bytes
 from colmap_sph.stereo.search.brightness import equally_bright
 from colmap_sph.stereo.search.offsets import INVALID, SUBPIXEL, remove_small_segments, smooth, to_disparity
 from colmap_sph.stereo.search.prediction import (
@@ -30,11 +30,8 @@ from colmap_sph.stereo.search.prediction import (
 )
 from colmap_sph.stereo.search.ranges import MAX_DEPTH, SPARE, STEP, num_levels
 from colmap_sph.stereo.search.seeds import Seeds
-from colmap_sph.stereo.search.target import Matches, TargetRoom, make_target
+from colmap_sph.stereo.search.target import Matches
 
-_BYTES_PER_SLOT = 2  # of a level's volumes of costs and of forward paths
-# Beside these, one part in so many of scratch memory is for what they are compared with.
-_TARGETS_SHARE = 4
 # Segments of fewer pixels than this are removed at every level, however coarse.
 _LEAST_SEGMENT = 4
 # Sky is searched for where what is infinitely far away is no farther from the range than this share of its width:
@@ -124,37 +121,12 @@ SINGLE_PAIR = MatchingOptions(max_left_right_excess=56, min_segment=150, median_
 """For a pair alone, whose gaps no other pair fills and whose noise no vote finds."""
 
 
-class Scratch:
-    """Working memory of one matching thread, kept from level to level and from pair to pair.
-
-    Parameters
-    ----------
-    max_bytes : int
-        Levels that need more are worked in bands of rows, with the same result. One row is the least.
-    """
-
-    def __init__(self, max_bytes: int = 1 << 30) -> None:
-        self.max_bytes = max_bytes
-        self.targets = TargetRoom(max_bytes // _TARGETS_SHARE)
-        self._memory = np.empty(0, dtype=np.uint8)
-
-    def volume(self, shape: tuple[int, ...], depth: int) -> NDArray[np.uint8]:
-        """(2, pixels, depth) uint8 array for an image or for as many of its rows as `max_bytes` allow."""
-        height, width = shape
-        rows = min(max(self.max_bytes // (_BYTES_PER_SLOT * width * depth), 1), height)
-        size = _BYTES_PER_SLOT * rows * width * depth
-        if size > self._memory.size:
-            self._memory = np.empty(0, dtype=np.uint8)  # the old one goes first
-            self._memory = np.empty(size, dtype=np.uint8)
-        return self._memory[:size].reshape(_BYTES_PER_SLOT, rows * width, depth)
-
-
-def scratch_bytes(pixels: int, options: MatchingOptions) -> int:
+def pair_scratch_bytes(pixels: int, options: MatchingOptions) -> int:
     """Scratch memory that matching fills where it may: its finest levels need most.
 
     A left image has so many pixels; each level above it a quarter of those of the one below.
     """
-    return _BYTES_PER_SLOT * pixels * max(options.disparities, options.coarse_disparities // 4)
+    return scratch_bytes(pixels, max(options.disparities, options.coarse_disparities // 4))
 
 
 def match_pair(
@@ -163,7 +135,7 @@ def match_pair(
     min_disparity: float,
     max_disparity: float,
     options: MatchingOptions,
-    scratch: Scratch | None = None,
+    scratches: Scratches | None = None,
     *,
     infinity: float | None = None,
     seeds: Seeds | None = None,
@@ -178,7 +150,7 @@ def match_pair(
     min_disparity, max_disparity : float
         Range to search, pixels; disparity = left column − right column.
     options : MatchingOptions
-    scratch : Scratch, optional
+    scratches : Scratches, optional
         Working memory to use again.
     infinity : float, optional
         Disparity of what is infinitely far away. Where the range nearly reaches it, matches are searched up to
@@ -213,7 +185,7 @@ def match_pair(
     doi:10.1109/TPAMI.2007.1166. M. Rothermel et al., SURE: photogrammetric surface reconstruction from imagery,
     LC3D Workshop 2012.
     """
-    scratch = scratch or Scratch()
+    scratches = scratches or Scratches()
     least = int(np.floor(-max_disparity)) - 1
     most = int(np.ceil(-min_disparity)) + 1
     size = min(left.image.shape + right.image.shape)
@@ -236,17 +208,12 @@ def match_pair(
         else:
             prediction = from_coarser(offset, prediction, shape, depth, options.range_radius, (low, high))
             lefts[-1] = near_matches(lefts[-1], offset)
-        unseeded: Matches | None = None
+        others: Prediction | None = None
         if offset is None and level > 0 and seeds is not None and len(seeds):
-            whole_range = from_seeds(None, shape, level, low, high)
-            unseeded = _match_level(
-                lefts[-1], rights[-1], whole_range, None, options, scratch, finest=False, fine=False
-            )
-        matches = _match_level(
-            lefts.pop(), rights.pop(), prediction, offset, options, scratch, finest=level == 0, fine=fine
+            others = from_seeds(None, shape, level, low, high)
+        offset = _match_level(
+            lefts.pop(), rights.pop(), prediction, others, offset, options, scratches, finest=level == 0, fine=fine
         )
-        offset = matches.offset if unseeded is None else matches.or_better(unseeded)
-        del matches, unseeded
         # Windows about predictions reach further.
         last = max(high + SPARE, low - SPARE + depth - 1)
         _native.keep_between(offset, (low - SPARE) * SUBPIXEL, last * SUBPIXEL)
@@ -284,46 +251,53 @@ def _match_level(
     left: RectifiedImage,
     right: RectifiedImage,
     prediction: Prediction,
+    others: Prediction | None,
     coarser: NDArray[np.int32] | None,
     options: MatchingOptions,
-    scratch: Scratch,
+    scratches: Scratches,
     *,
     finest: bool,
     fine: bool,
-) -> Matches:
-    """Matches of one level; those of the finest with a sub-pixel fit to the raw costs."""
-    kernels = backend()
-    image = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
+) -> NDArray[np.int32]:
+    """Offsets of one level; those of the finest with a sub-pixel fit to the raw costs.
+
+    Those of `others`, where another prediction is tried, too, and better.
+    """
+    grey = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
     compared = Compared(fine and finest)
     if coarser is not None:
         left, grey_step = equally_bright(left, right, coarser)
         compared = Compared(fine and finest, grey_step)
-    target = make_target(right, prediction, scratch.targets, compared)
-    left_census = census(left, compared)
-    del left, right
-    offset = np.empty(image.shape, dtype=np.int32)
-    _native.match(
-        kernels,
-        left_census,
-        target.census,
-        target.columns,
-        target.right_width,
-        target.base,
-        prediction.base if prediction.exact else prediction.first,
-        image,
+    limits = Limits(
         options.p1,
         _p2_table(options),
         0 if prediction.exact else options.max_slant,
         options.max_left_right_difference,
         options.max_left_right_excess if finest else options.max_coarse_left_right_excess,
-        scratch.volume(image.shape, prediction.depth),
-        offset,
     )
-    if finest:
-        fitted = np.empty_like(offset)
-        _native.fit_offsets(kernels, offset, left_census, target.census, fitted)
-        offset = fitted
-    return Matches(target, left_census, offset)
+    level = Level(left, right, grey, prediction, compared)
+    del left, right
+    if others is not None:
+        unseeded = _matches(replace(level, prediction=others), limits, scratches)
+        return _matches(level, limits, scratches).or_better(unseeded)
+    if _is_large(level, scratches):
+        return BandMatcher(level, limits, scratches).offset(fit=finest)
+    return _matches(level, limits, scratches, fit=finest).offset
+
+
+def _is_large(level: Level, scratches: Scratches) -> bool:
+    return scratch_bytes(level.grey.size, level.prediction.depth) > scratches.max_bytes
+
+
+def _matches(level: Level, limits: Limits, scratches: Scratches, *, fit: bool = False) -> Matches:
+    """Matches of a level, with all that is compared."""
+    large = BandMatcher(level, limits, scratches).target_offset() if _is_large(level, scratches) else None
+    with scratches.lent() as scratch:
+        rows = level.rows(0, len(level.grey), scratch.targets)
+        offset = match_whole(rows, limits, scratch) if large is None else large
+        matches = Matches(rows.target, rows.left_census, rows.fitted(offset) if fit else offset)
+        _ = matches.offset  # while the target is there
+    return matches
 
 
 def _p2_table(options: MatchingOptions) -> NDArray[np.uint8]:

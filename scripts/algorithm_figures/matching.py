@@ -76,7 +76,7 @@ def recorded() -> Iterator[list[Level]]:
 
     def match_and_record(*arguments: Any) -> None:
         match(*arguments)
-        _, left, right, _, _, base, surface, image, p1, p2, max_slant, _, _, scratch, offset = arguments
+        _, left, right, _, _, base, surface, image, p1, p2, max_slant, *_, scratch, offset = arguments
         images = left.copy(), right.copy(), base.copy(), surface.copy(), image.copy()
         # A level whose images are not stretched against each other is not warped.
         how = (np.zeros(base.shape, np.int32), 0, np.empty((0, 0), np.float32))

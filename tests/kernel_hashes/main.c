@@ -187,10 +187,19 @@ static void run_match(const kernel_table *k, image_size size) {
     FILL(int32_t, base, PIXELS, base_of(x))
     FILL(uint8_t, image, PIXELS, grey_of())
     FILL(uint8_t, p2, 256, 120 - i / 3)
-    MAKE(uint8_t, scratch, 2 * 3 * size.width * size.depth);
+    MAKE(uint8_t, scratch, 2 * PIXELS * size.depth);
     MAKE(int32_t, offset, PIXELS);
     const match_input input = {reference, target, columns, base, base, image, MATCH_SIZE, {10, p2, 3}, {2, 5}};
-    EACH_TIME failed |= k->match(&input, 3, scratch, offset);
+    /* In two bands, the second one first. */
+    const ptrdiff_t half = size.height / 2, bytes = (ptrdiff_t)k->sweep_bytes(MATCH_SIZE);
+    const row_band bands[2] = {{0, half, 0, size.height - half}, {half, size.height, half, 0}};
+    MAKE(uint8_t, forward, bytes);
+    MAKE(uint8_t, backward, bytes);
+    EACH_TIME {
+        failed |= k->sweep(&input, bands[0], 0, forward);
+        failed |= k->match(&input, bands[1], forward, backward, scratch, offset + half * size.width);
+        failed |= k->match(&input, bands[0], forward, backward, scratch, offset);
+    }
     HASH(offset, PIXELS);
 }
 

@@ -170,6 +170,84 @@ static int run_selection(void *arguments) {
 FUNCTION(selection, SELECTION, check_selection,
          "Offsets of the least sums in 1/256 pixel, -2^31 where the left-right check or content lacks.");
 
+#define SWEEP_BYTES(X) \
+    X(VALUE, backend, backend) \
+    X(VALUE, int, width) \
+    X(VALUE, int, depth) \
+    X(RESULT, bytes)
+ARGUMENTS(sweep_bytes, SWEEP_BYTES);
+
+static int check_sweep_bytes(const void *arguments) {
+    const sweep_bytes_arguments *a = arguments;
+    return check_source_width(a->width) && check_depth(a->depth);
+}
+
+static int run_sweep_bytes(void *arguments) {
+    sweep_bytes_arguments *a = arguments;
+    a->bytes = (ptrdiff_t)a->backend->sweep_bytes((match_size){0, a->width, 0, a->depth, 0});
+    return a->bytes ? 0 : -1;
+}
+
+FUNCTION(sweep_bytes, SWEEP_BYTES, check_sweep_bytes,
+         "Size of the state that a sweep over rows of such a level brings from one band of them to the next.");
+
+static int check_state(const kernel_table *kernels, const sizes *size, ptrdiff_t bytes) {
+    const size_t needed = kernels->sweep_bytes(match_size_of(size));
+    return check(needed > 0 && bytes == (ptrdiff_t)needed, "the state must have the size that sweep_bytes tells");
+}
+
+static int check_band(const sizes *size, row_band band) {
+    return check(band.above >= 0 && band.below >= 0, "the numbers of rows above and below must not be negative") &&
+           check(band.first >= (band.above > 0) && band.first <= band.end &&
+                     band.end <= size->H - (band.below > 0),
+                 "the rows of the band, and those beside it, must be among those given");
+}
+
+#define SWEEP(X) \
+    X(VALUE, backend, backend) \
+    X(IN, uint64, reference, H, W) \
+    X(IN, uint64, target, H, TARGET_W) \
+    X(IN, int32, base, H, W) \
+    X(IN, int32, surface, H, W) \
+    X(IN, uint8, image, H, W) \
+    X(VALUE, int, depth) \
+    X(VALUE, int, p1) \
+    X(IN, uint8, p2, 256) \
+    X(VALUE, int, max_slant) \
+    X(VALUE, ptrdiff, first) \
+    X(VALUE, ptrdiff, end) \
+    X(VALUE, ptrdiff, above) \
+    X(VALUE, ptrdiff, below) \
+    X(VALUE, flag, backward) \
+    X(OUT, uint8, state, BYTES)
+ARGUMENTS(sweep, SWEEP);
+
+static int check_sweep(const void *arguments) {
+    const sweep_arguments *a = arguments;
+    sizes size = a->size;
+    size.D = a->depth;
+    return check_depth(a->depth) && check_widths(&size) && check_penalties(a->p1, a->p2, a->max_slant) &&
+           check_band(&size, (row_band){a->first, a->end, a->above, a->below}) &&
+           check_state(a->backend, &size, size.BYTES);
+}
+
+static int run_sweep(void *arguments) {
+    const sweep_arguments *a = arguments;
+    match_size size = match_size_of(&a->size);
+    size.depth = a->depth;
+    const match_input input = {.reference = a->reference,
+                               .target = a->target,
+                               .base = a->base,
+                               .surface = a->surface,
+                               .image = a->image,
+                               .size = size,
+                               .penalties = {(uint8_t)a->p1, a->p2, a->max_slant}};
+    return a->backend->sweep(&input, (row_band){a->first, a->end, a->above, a->below}, a->backward, a->state);
+}
+
+FUNCTION(sweep, SWEEP, check_sweep,
+         "The state of a sweep moves over the rows from first to before end, which have so many above and below.");
+
 #define MATCH(X) \
     X(VALUE, backend, backend) \
     X(IN, uint64, reference, H, W) \
@@ -184,16 +262,27 @@ FUNCTION(selection, SELECTION, check_selection,
     X(VALUE, int, max_slant) \
     X(VALUE, int, max_difference) \
     X(VALUE, int, max_excess) \
+    X(VALUE, ptrdiff, first) \
+    X(VALUE, ptrdiff, above) \
+    X(VALUE, ptrdiff, below) \
+    X(OUT, uint8, forward, BYTES) \
+    X(OUT, uint8, backward, BYTES) \
     X(OUT, uint8, scratch, 2, BAND, D) \
-    X(OUT, int32, offset, H, W)
+    X(OUT, int32, offset, ROWS, W)
 ARGUMENTS(match, MATCH);
+
+static row_band band_of_match(const match_arguments *a) {
+    return (row_band){a->first, a->first + a->size.ROWS, a->above, a->below};
+}
 
 static int check_match(const void *arguments) {
     const match_arguments *a = arguments;
     return check_depth(a->size.D) && check_widths(&a->size) && check_source_width(a->source_width) &&
-           check(a->size.BAND > 0 && (a->size.W == 0 || a->size.BAND % a->size.W == 0),
-                 "scratch must have the size (2, pixels of one row or more, disparities)") &&
-           check_penalties(a->p1, a->p2, a->max_slant) && check_left_right(a->max_difference, a->max_excess);
+           check_penalties(a->p1, a->p2, a->max_slant) && check_left_right(a->max_difference, a->max_excess) &&
+           check(a->size.BAND == a->size.ROWS * a->size.W,
+                 "scratch must have the size (2, pixels of the band, disparities)") &&
+           check(a->first <= a->size.H, "the first row must be among those given") &&
+           check_band(&a->size, band_of_match(a)) && check_state(a->backend, &a->size, a->size.BYTES);
 }
 
 static int run_match(void *arguments) {
@@ -207,12 +296,12 @@ static int run_match(void *arguments) {
                                warped_size_of(&a->size, a->source_width),
                                {(uint8_t)a->p1, a->p2, a->max_slant},
                                {a->max_difference, a->max_excess}};
-    const ptrdiff_t band_rows = a->size.W > 0 ? a->size.BAND / a->size.W : a->size.H + 1;
-    return a->backend->match(&input, band_rows, a->scratch, a->offset);
+    return a->backend->match(&input, band_of_match(a), a->forward, a->backward, a->scratch, a->offset);
 }
 
-FUNCTION(match, MATCH, check_match,
-         "Matching cost, aggregation and selection in one, in bands of so many rows as BAND pixels are.");
+FUNCTION(
+    match, MATCH, check_match,
+    "Matching cost, aggregation and selection of rows from first on, with so many above and below; states move.");
 
 #define FIT_OFFSETS(X) \
     X(VALUE, backend, backend) \
@@ -376,16 +465,9 @@ static int run_to_disparity(void *arguments) {
 FUNCTION(to_disparity, TO_DISPARITY, any,
          "Disparities, pixels, of offsets, less the shift of their fraction; NaN where there is no offset.");
 
-native_function *const matching_functions[] = {&census_function,
-                                               &matching_cost_function,
-                                               &aggregation_function,
-                                               &selection_function,
-                                               &match_function,
-                                               &fit_offsets_function,
-                                               &warp_function,
-                                               &unwarp_offsets_function,
-                                               &mean_offsets_function,
-                                               &upsample_offsets_function,
-                                               &search_windows_function,
-                                               &to_disparity_function,
-                                               NULL};
+native_function *const matching_functions[] = {
+    &census_function,         &matching_cost_function, &aggregation_function,
+    &selection_function,      &sweep_bytes_function,   &sweep_function,
+    &match_function,          &fit_offsets_function,   &warp_function,
+    &unwarp_offsets_function, &mean_offsets_function,  &upsample_offsets_function,
+    &search_windows_function, &to_disparity_function,  NULL};

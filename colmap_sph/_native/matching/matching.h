@@ -99,9 +99,23 @@ typedef struct {
     left_right_check check;
 } match_input;
 
-/* Cost, aggregation and selection in one. `scratch` has room for 2 bytes per slot of `band_rows` rows; the result
- * does not depend on their number, but with fewer rows than the image has, half of the sweeps are done twice. */
-typedef int match_fn(const match_input *input, ptrdiff_t band_rows, uint8_t *scratch, int32_t *offset);
+/* A band of an image's rows, from `first` to before `end` of those that are given: among them are the rows beside
+ * it, where the image has any. So many rows of the image lie above and below the band. */
+typedef struct {
+    ptrdiff_t first, end, above, below;
+} row_band;
+
+/* What a sweep brings from a band to the next one, bytes; 0 without memory. */
+typedef size_t sweep_bytes_fn(match_size size);
+
+/* A sweep over a band for that alone, from `state` to `state`, which is not read at the first of the image's rows.
+ */
+typedef int sweep_fn(const match_input *input, row_band band, int backward, uint8_t *state);
+
+/* Cost, aggregation and selection of a band in one, from what both sweeps bring to it to what they take from it,
+ * so that the result is that of one piece. `scratch` has room for 2 bytes per slot of the band. */
+typedef int match_fn(const match_input *input, row_band band, uint8_t *forward, uint8_t *backward,
+                     uint8_t *scratch, int32_t *offset);
 
 /* Offsets fitted to the raw costs of a window around each pixel; `size.depth` is not used. */
 typedef int fit_offsets_fn(const int32_t *offset, const uint64_t *reference, const uint64_t *target,

@@ -124,25 +124,28 @@ int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int
 typedef struct {
     const row_kernels *kernels;
     const match_input *input;
-    ptrdiff_t row_size, band_rows;
+    ptrdiff_t row_size;
     row_span *spans;
     uint64_t *cost_buffer;
     uint8_t *row_sums;
     selection_buffers selection;
     sweep_state forward, backward;
-    uint8_t *checkpoints; /* what the forward sweep brings to each band but the first */
 } matcher;
 
 /* A group is as many rows as are swept at once and still are in the cache for the next step. */
 enum { GROUP = 2 };
 
-static void forward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost, uint8_t *detours) {
+static void cost_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost) {
     const match_input *in = m->input;
     for (ptrdiff_t r = y; r < y + rows; r++) {
         m->kernels->cost_row(in->reference + r * in->size.width, in->target + r * in->size.target_width,
                              in->base + r * in->size.width, in->size, m->spans[r], m->cost_buffer,
                              cost + (r - y) * m->row_size);
     }
+}
+
+static void forward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, uint8_t *cost, uint8_t *detours) {
+    cost_rows(m, y, rows, cost);
     m->kernels->sweep_rows(&m->forward, y, rows, cost, detours, NULL);
 }
 
@@ -163,35 +166,6 @@ static void backward_rows(matcher *m, ptrdiff_t y, ptrdiff_t rows, const uint8_t
 
 static ptrdiff_t lesser(ptrdiff_t a, ptrdiff_t b) { return a < b ? a : b; }
 
-/* The last band first. Its forward sweep starts from what was noted when the rows above it were swept for that
- * alone: the result is that of one piece, to the bit. */
-static void match_bands(matcher *m, ptrdiff_t bands, uint8_t *cost, int32_t *offset) {
-    const ptrdiff_t height = m->input->size.height, row_size = m->row_size;
-    uint8_t *detours = cost + m->band_rows * row_size;
-    for (ptrdiff_t band = 0; band < bands - 1; band++) {
-        const ptrdiff_t first = band * m->band_rows;
-        for (ptrdiff_t n = 0; n < m->band_rows; n += GROUP) {
-            forward_rows(m, first + n, lesser(GROUP, m->band_rows - n), cost, detours);
-        }
-        memcpy(m->checkpoints + (size_t)band * m->forward.memory_size, m->forward.memory, m->forward.memory_size);
-    }
-    for (ptrdiff_t band = bands - 1; band >= 0; band--) {
-        const ptrdiff_t first = band * m->band_rows, count = lesser(m->band_rows, height - first);
-        m->forward.done = first;
-        if (band > 0) {
-            memcpy(m->forward.memory, m->checkpoints + (size_t)(band - 1) * m->forward.memory_size,
-                   m->forward.memory_size);
-        }
-        for (ptrdiff_t n = 0; n < count; n += GROUP) {
-            forward_rows(m, first + n, lesser(GROUP, count - n), cost + n * row_size, detours + n * row_size);
-        }
-        for (ptrdiff_t n = count; n > 0; n -= lesser(GROUP, n)) {
-            backward_rows(m, first + n - 1, lesser(GROUP, n), cost + (n - 1) * row_size,
-                          detours + (n - 1) * row_size, offset);
-        }
-    }
-}
-
 static void find_spans(const uint64_t *reference, match_size size, row_span *spans) {
     for (ptrdiff_t y = 0; y < size.height; y++, reference += size.width) {
         ptrdiff_t first = 0, end = size.width;
@@ -205,32 +179,99 @@ static void find_spans(const uint64_t *reference, match_size size, row_span *spa
     }
 }
 
-int match_rows(const row_kernels *kernels, const match_input *in, ptrdiff_t band_rows, uint8_t *scratch,
-               int32_t *offset) {
-    const ptrdiff_t bands = in->size.height > 0 ? (in->size.height + band_rows - 1) / band_rows : 0;
-    matcher m = {.kernels = kernels, .input = in, .band_rows = band_rows};
-    m.row_size = in->size.width * in->size.depth;
-    int status = -1;
-    if (!kernels->sweep_begin(&m.forward, in->surface, in->image, in->size, in->penalties, 0) &&
-        !kernels->sweep_begin(&m.backward, in->surface, in->image, in->size, in->penalties, 1) &&
-        !selection_begin(&m.selection, in->size)) {
-        m.cost_buffer = cost_row_buffer(in->size);
-        m.row_sums = malloc(((size_t)(m.row_size * GROUP) + 1) * sizeof *m.row_sums);
-        m.checkpoints = malloc((size_t)(bands > 1 ? bands - 1 : 1) * m.forward.memory_size);
-        m.spans = malloc(((size_t)in->size.height + 1) * sizeof *m.spans);
-        if (m.cost_buffer && m.row_sums && m.checkpoints && m.spans) {
-            find_spans(in->reference, in->size, m.spans);
-            m.forward.spans = m.backward.spans = m.spans;
-            match_bands(&m, bands, scratch, offset);
-            status = 0;
-        }
+/* What a matcher works in; -1 without memory. matcher_end in any case. */
+static int matcher_begin(matcher *m, const row_kernels *kernels, const match_input *in) {
+    *m = (matcher){.kernels = kernels, .input = in, .row_size = in->size.width * in->size.depth};
+    if (kernels->sweep_begin(&m->forward, in->surface, in->image, in->size, in->penalties, 0) ||
+        kernels->sweep_begin(&m->backward, in->surface, in->image, in->size, in->penalties, 1) ||
+        selection_begin(&m->selection, in->size)) {
+        return -1;
     }
-    free(m.spans);
-    free(m.checkpoints);
-    free(m.row_sums);
-    free(m.cost_buffer);
-    free(m.selection.winner);
-    free_aligned(m.backward.memory);
-    free_aligned(m.forward.memory);
+    m->cost_buffer = cost_row_buffer(in->size);
+    m->row_sums = malloc(((size_t)(m->row_size * GROUP) + 1) * sizeof *m->row_sums);
+    m->spans = malloc(((size_t)in->size.height + 1) * sizeof *m->spans);
+    if (!m->cost_buffer || !m->row_sums || !m->spans) {
+        return -1;
+    }
+    find_spans(in->reference, in->size, m->spans);
+    m->forward.spans = m->backward.spans = m->spans;
+    return 0;
+}
+
+static void matcher_end(matcher *m) {
+    free(m->spans);
+    free(m->row_sums);
+    free(m->cost_buffer);
+    free(m->selection.winner);
+    free_aligned(m->backward.memory);
+    free_aligned(m->forward.memory);
+}
+
+size_t sweep_bytes_of_rows(const row_kernels *kernels, match_size size) {
+    static const uint8_t p2[256];
+    sweep_state state;
+    const int status = kernels->sweep_begin(&state, NULL, NULL, size, (path_penalties){.p2 = p2}, 0);
+    if (!status) {
+        free_aligned(state.memory);
+    }
+    return status ? 0 : state.memory_size;
+}
+
+/* A sweep goes on where `state` was noted. */
+static void resume(sweep_state *sweep, ptrdiff_t done, const uint8_t *state) {
+    sweep->done = done;
+    if (done > 0) {
+        memcpy(sweep->memory, state, sweep->memory_size);
+    }
+}
+
+int sweep_over_rows(const row_kernels *kernels, const match_input *in, row_band band, int backward,
+                    uint8_t *state) {
+    matcher m;
+    int status = matcher_begin(&m, kernels, in);
+    /* Costs, and detours that nobody reads, of a group. */
+    uint8_t *group = status ? NULL : calloc((size_t)(2 * GROUP * m.row_size) + 1, 1);
+    if (group) {
+        uint8_t *cost = group, *detours = group + GROUP * m.row_size;
+        sweep_state *sweep = backward ? &m.backward : &m.forward;
+        resume(sweep, backward ? band.below : band.above, state);
+        for (ptrdiff_t n = 0, rows; n < band.end - band.first; n += rows) {
+            rows = lesser(GROUP, band.end - band.first - n);
+            const ptrdiff_t first = backward ? band.end - n - rows : band.first + n;
+            const ptrdiff_t last = backward ? rows - 1 : 0; /* where the sweep begins, in the group */
+            cost_rows(&m, first, rows, cost);
+            kernels->sweep_rows(sweep, first + last, rows, cost + last * m.row_size, detours + last * m.row_size,
+                                m.row_sums + last * m.row_size);
+        }
+        memcpy(state, sweep->memory, sweep->memory_size);
+    } else {
+        status = -1;
+    }
+    free(group);
+    matcher_end(&m);
+    return status;
+}
+
+int match_rows(const row_kernels *kernels, const match_input *in, row_band band, uint8_t *forward,
+               uint8_t *backward, uint8_t *scratch, int32_t *offset) {
+    matcher m;
+    const int status = matcher_begin(&m, kernels, in);
+    if (!status) {
+        const ptrdiff_t count = band.end - band.first;
+        uint8_t *cost = scratch, *detours = scratch + count * m.row_size;
+        resume(&m.forward, band.above, forward);
+        resume(&m.backward, band.below, backward);
+        for (ptrdiff_t n = 0; n < count; n += GROUP) {
+            forward_rows(&m, band.first + n, lesser(GROUP, count - n), cost + n * m.row_size,
+                         detours + n * m.row_size);
+        }
+        for (ptrdiff_t n = count; n > 0; n -= lesser(GROUP, n)) {
+            backward_rows(&m, band.first + n - 1, lesser(GROUP, n), cost + (n - 1) * m.row_size,
+                          detours + (n - 1) * m.row_size, offset - band.first * in->size.width);
+        }
+        memcpy(forward, m.forward.memory, m.forward.memory_size);
+        memcpy(backward, m.backward.memory, m.backward.memory_size);
+    }
+    matcher_end(&m);
     return status;
 }

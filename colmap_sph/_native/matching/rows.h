@@ -95,7 +95,10 @@ int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_
 int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
                 const uint64_t *reference, const uint64_t *target, const int32_t *columns, match_size size,
                 left_right_check check, int32_t *offset);
-int match_rows(const row_kernels *kernels, const match_input *input, ptrdiff_t band_rows, uint8_t *scratch,
-               int32_t *offset);
+size_t sweep_bytes_of_rows(const row_kernels *kernels, match_size size);
+int sweep_over_rows(const row_kernels *kernels, const match_input *input, row_band band, int backward,
+                    uint8_t *state);
+int match_rows(const row_kernels *kernels, const match_input *input, row_band band, uint8_t *forward,
+               uint8_t *backward, uint8_t *scratch, int32_t *offset);
 
 #endif

@@ -5,8 +5,10 @@ import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, get_args
+from weakref import WeakValueDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +27,7 @@ from colmap_sph.project.state.ownership import remove_array_files, remove_flat_p
 from colmap_sph.project.workspace import Known
 from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.census import RectifiedImage
-from colmap_sph.stereo.matching import MatchingOptions, Scratch, match_pair, scratch_bytes
+from colmap_sph.stereo.matching import MatchingOptions, match_pair, pair_scratch_bytes
 from colmap_sph.stereo.partners.pairing import Pair, as_pair
 from colmap_sph.stereo.photographs.resampling import resample_photograph
 from colmap_sph.stereo.photographs.ties import find_ties_of_photographs
@@ -33,6 +35,8 @@ from colmap_sph.stereo.poses.ties import Ties, find_ties, row_residual, tolerabl
 from colmap_sph.stereo.rectification import rectify_pair, sampling_of
 from colmap_sph.stereo.rectified_pair import PairDisparity, RectifiedPair, Side, is_fine
 from colmap_sph.stereo.resampling import resample
+from colmap_sph.stereo.search.bands import Scratches
+from colmap_sph.stereo.search.idle import at_once
 from colmap_sph.stereo.search.seeds import Seeds, finer_first, seeds_of_points, shared_points
 
 if TYPE_CHECKING:
@@ -51,7 +55,7 @@ _PAIR_SECONDS = 0.02
 # Bytes on disk per left rectified pixel.
 _FILE_BYTES = 2.0
 # Largest bytes in use at a time: per left rectified pixel while a pair is matched, beside its scratch; …
-_MATCH_BYTES = 53.0
+_MATCH_BYTES = 34.0
 # … while an image is read and rectified: per pixel of its own, and per left rectified pixel of both.
 _READ_BYTES = 11.0
 _RECTIFIED_BYTES = 10.0
@@ -59,11 +63,13 @@ _RECTIFIED_BYTES = 10.0
 # count.
 _RECTIFIED_SHARE = 1.4
 # Scratch memory of a thread and bytes of a cache: more is no faster.
-_SCRATCH_BYTES = 256 << 20
+_SCRATCH_BYTES = 320 << 20
 _CACHE_BYTES = 512 << 20
 
 _photos: LoadCache[Photo] = LoadCache(lambda photo: photo.nbytes)
 _thread = threading.local()
+_lock = threading.Lock()
+_all_scratches: WeakValueDictionary[int, Scratches] = WeakValueDictionary()
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +101,6 @@ class MatchTask:
 
 def make_disparity_maps(task: MatchTask) -> Facts:
     """Rectify and match a pair; writes its disparity map and ties, both where it is matched both ways."""
-    if getattr(_thread, "scratch", None) is None or _thread.scratch.max_bytes != task.scratch_bytes:
-        _thread.scratch = Scratch(task.scratch_bytes)
     share = _tolerable_share(task)
     return _facts_of(make_disparity_map(way, share) for way in task.ways)
 
@@ -127,18 +131,30 @@ def make_disparity_map(task: MatchTask, share: float) -> Facts:
 
 
 def _match(task: MatchTask, geometry: RectifiedPair) -> tuple[NDArray[np.float32], Ties]:
+    images = at_once(*(partial(_rectified, task, geometry, side) for side in get_args(Side)))
     disparity = match_pair(
-        _rectified(task, geometry, "left"),
-        _rectified(task, geometry, "right"),
+        images.pop(0),  # which lets go of them
+        images.pop(),
         geometry.min_disparity,
         geometry.max_disparity,
         task.options,
-        _thread.scratch,
+        _scratches(task.scratch_bytes),
         infinity=-geometry.disparity_origin,
         seeds=task.seeds * (geometry.columns_per_radian / task.geometry.columns_per_radian),
         fine=is_fine(task.left[0].view, geometry),
     )
     return disparity, _ties(task, geometry, disparity)
+
+
+def _scratches(max_bytes: int) -> Scratches:
+    """Working memory that threads share, and that goes when they end."""
+    own = getattr(_thread, "scratches", None)
+    if own is None or own.max_bytes != max_bytes:
+        with _lock:
+            own = _all_scratches.get(max_bytes) or Scratches(max_bytes)
+            _all_scratches[max_bytes] = own
+        _thread.scratches = own
+    return own
 
 
 def _ties(task: MatchTask, geometry: RectifiedPair, disparity: NDArray[np.float32]) -> Ties:
@@ -253,7 +269,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
             seconds=match_seconds(both_pixels) + (match_seconds(trial**2 * both_pixels) if trial < 1 else 0.0),
             memory=max(_MATCH_BYTES * left_pixels, reading + _RECTIFIED_BYTES * left_pixels),
             disk=_FILE_BYTES * left_pixels,
-            scratch=scratch_bytes(left_pixels, context.options.matching),
+            scratch=pair_scratch_bytes(left_pixels, context.options.matching),
         )
         task = MatchTask(
             tuple(map(self._photo, left.views)),

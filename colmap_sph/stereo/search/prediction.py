@@ -74,6 +74,11 @@ class Prediction:
     warps: bool = True
     torn: NDArray[np.bool_] | None = None
 
+    def rows(self, rows: slice) -> "Prediction":
+        """What some of the rows search."""
+        torn = None if self.torn is None else self.torn[rows]
+        return replace(self, offset=self.offset[rows], base=self.base[rows], torn=torn)
+
     @property
     def first(self) -> NDArray[np.int32]:
         """(H, W) int32 first offset to search, pixels."""

@@ -5,7 +5,7 @@ what lies behind one edge and before the other is in no place of the warped imag
 image as it is, whose columns follow those of the warped one in the same row.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -77,6 +77,16 @@ class Target:
     right_width: int
     as_it_is: int
     prediction: Prediction
+
+    def rows(self, rows: slice) -> "Target":
+        """What some of the rows are compared with."""
+        return replace(
+            self,
+            census=self.census[rows],
+            columns=self.columns[rows],
+            base=self.base[rows],
+            prediction=self.prediction.rows(rows),
+        )
 
     def offsets_to_right(self, offset: NDArray[np.int32]) -> NDArray[np.int32]:
         """(H, W) int32 offsets, 1/256 pixel, to columns of the right image, from those to columns of this."""

@@ -1,0 +1,40 @@
+"""Idle threads help."""
+
+import threading
+
+import pytest
+
+from colmap_sph.stereo.search.idle import at_once, busy, lending
+
+
+def test_parts_are_done_in_their_order_where_no_thread_is_idle():
+    done = []
+    assert at_once(*(lambda part=part: done.append(part) or part**2 for part in range(5))) == [0, 1, 4, 9, 16]
+    assert done == [0, 1, 2, 3, 4]
+
+
+def test_parts_are_done_at_once_by_threads_that_are_idle():
+    """Three wait for each other; a thread that has its own work is not asked."""
+    meeting = threading.Barrier(3, timeout=20)
+
+    def part():
+        meeting.wait()
+        return threading.get_ident()
+
+    with lending(3), busy():
+        assert len(set(at_once(part, part, part))) == 3
+        with busy(), busy():
+            assert set(at_once(*[threading.get_ident] * 8)) == {threading.get_ident()}
+        assert len(set(at_once(part, part, part))) == 3  # who has helped is idle again
+
+
+def test_the_error_of_a_part_is_raised():
+    """By whatever thread it was found, when none works any more."""
+
+    def wrong():
+        raise MemoryError("of a part")
+
+    for order in ((wrong, int), (int, wrong), (wrong, wrong)):
+        for threads in (0, 2):
+            with lending(threads), pytest.raises(MemoryError, match="of a part"):
+                at_once(*order)
