@@ -402,7 +402,8 @@ def _read_depth(depth, u, v):
 
 def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_support, *, silence_counts):
     """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner has a depth there (or, if silence
-    counts, the point in view) that does not hide the point, the partner's depth and sigma, clearance.
+    counts, the point in view) that does not hide the point, the partner's depth, its sigma of inverse depth,
+    clearance.
 
     `maps` are the partner's depth, sigma and support.
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
@@ -444,6 +445,7 @@ def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_
             verdict[row, col] = 1
         elif difference > 2 * gate and partner_support[nearest] >= min_support:
             verdict[row, col] = -1
+        spread[row, col] *= (seen[2] / found / z) ** 2
         observing[row, col] = difference >= -2 * gate
         clearance[row, col] = min(
             clearance[row, col],
