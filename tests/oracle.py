@@ -356,7 +356,8 @@ def transfer_disparity(left, max_step, right_width):
 def vote_depth(depths, sigmas, tolerance, stations):
     """Depth, sigma, support, and the least distance of any pair of candidates from the gate, per pixel.
 
-    Candidates of one station count as one, with the mean of their weights and weighted depths.
+    Candidates of one station count as one, with the mean of their weights and weighted inverse depths. A standard
+    deviation is that of an inverse depth, the same wherever the candidate came to lie.
     """
     stations = np.asarray(stations)
     shape = depths.shape[1:]
@@ -376,10 +377,11 @@ def vote_depth(depths, sigmas, tolerance, stations):
         # Most friends first, then the smallest variance, then the first.
         centre = min(range(len(z)), key=lambda k: (-len(set(at[agree[k]])), variance[k], k))
         members = [agree[centre] & (at == station) for station in sorted(set(at[agree[centre]]))]
-        weights = [np.mean(1 / variance[own]) for own in members]
-        weighted = [np.mean(z[own] / variance[own]) for own in members]
-        depth[pixel] = sum(weighted) / sum(weights)
-        sigma[pixel] = sum(weights) ** -0.5
+        inverse_variance = variance / z**4
+        weights = [np.mean(1 / inverse_variance[own]) for own in members]
+        weighted = [np.mean(1 / z[own] / inverse_variance[own]) for own in members]
+        depth[pixel] = sum(weights) / sum(weighted)
+        sigma[pixel] = sum(weights) ** -0.5 * depth[pixel] ** 2
         support[pixel] = len(members)
     return depth, sigma, support, clearance
 
@@ -402,7 +404,8 @@ def _read_depth(depth, u, v):
 
 def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_support, *, silence_counts):
     """Verdict (+1 agrees, -1 looks through, 0 none), whether the partner has a depth there (or, if silence
-    counts, the point in view) that does not hide the point, the partner's depth and sigma, clearance.
+    counts, the point in view) that does not hide the point, the partner's depth, its sigma of inverse depth,
+    clearance.
 
     `maps` are the partner's depth, sigma and support.
     `view` and `partner` have K, R, t; pixel (row, col) stands for the image coordinates (col, row), COLMAP's
@@ -444,6 +447,7 @@ def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_
             verdict[row, col] = 1
         elif difference > 2 * gate and partner_support[nearest] >= min_support:
             verdict[row, col] = -1
+        spread[row, col] *= (seen[2] / found / z) ** 2
         observing[row, col] = difference >= -2 * gate
         clearance[row, col] = min(
             clearance[row, col],

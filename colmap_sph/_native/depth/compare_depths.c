@@ -118,9 +118,13 @@ static inline void judge(consistency_gates gates, block *k) {
         k->contradicted[i] = (difference > 2 * gate ? sure : 0) & ~hidden;
         k->observed[i] = (gates.silence_counts ? k->inside[i] : seen) & ~hidden;
         k->agreed[i] = fabsf(difference) <= gate ? seen & k->near[i] : 0;
-        const float weight = 1 / (spread * spread);
+        /* The standard deviation of a depth grows with its square: that found is brought to the one expected, or
+         * what is too near would weigh more. In inverse depth of the reference. */
+        const float depth = k->depth[i], ratio = k->expected[i] / k->found[i] / depth;
+        const float inverse_spread = spread * ratio * ratio;
+        const float weight = 1 / (inverse_spread * inverse_spread);
         k->weight[i] = weight;
-        k->shift[i] = weight * (k->carried[i] - k->depth[i]);
+        k->shift[i] = weight * (1 / k->carried[i] - 1 / depth);
     }
 }
 

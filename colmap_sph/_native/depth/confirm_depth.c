@@ -52,9 +52,10 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
         const int fits = depth[p] > 0 && agreeing[p] >= least && (float)contradicting[p] <= most;
         const int enough = missing <= (contradicting[p] > 0 ? 0 : may_miss);
         fates[p] = fits ? enough ? KEPT : OF_SURFACE : DROPPED;
-        const float own = 1 / (sigma[p] * sigma[p]);
-        weighted_depth[p] = depth[p] + weighted_depth[p] / (weight[p] + own);
-        weight[p] = 1 / __builtin_sqrtf(weight[p] + own);
+        const float squared = depth[p] * depth[p], own = squared * squared / (sigma[p] * sigma[p]);
+        const float mean = 1 / (1 / depth[p] + weighted_depth[p] / (weight[p] + own));
+        weighted_depth[p] = mean;
+        weight[p] = mean * mean / __builtin_sqrtf(weight[p] + own);
     }
     for (ptrdiff_t row = 0; row < height; row++) {
         for (ptrdiff_t column = 0; column < width; column++) {

@@ -114,7 +114,7 @@ typedef struct {
 } consistency_gates;
 
 /* Of the partners so far, per pixel: how many observe the point, and see nothing in front of it, agree, and
- * contradict; and the running weighted sums of their depths, carried to the pixel's ray, less its own. */
+ * contradict; and the running weighted sums of their inverse depths, carried to the pixel's ray, less its own. */
 typedef struct {
     uint8_t *observing, *agreeing, *contradicting;
     float *weighted_depth, *weight;
