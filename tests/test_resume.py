@@ -312,7 +312,8 @@ def test_an_image_that_changes_before_a_run_fails(pristine: Finished, tmp_path: 
     assert Workspace(again.dense).fused_path.read_bytes() == Workspace(pristine.dense).fused_path.read_bytes()
 
 
-def test_a_mask_that_changes_during_a_run(pristine: Finished, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("what", "stage"), [("masks", "match pairs"), ("fusion.mask_path", "fuse")])
+def test_a_mask_that_changes_during_a_run(what: str, stage: str, pristine: Finished, tmp_path: Path) -> None:
     """It is told; and with the former mask the next run makes what an undisturbed one makes."""
     clouds = []
     for disturbed in (False, True):
@@ -325,12 +326,15 @@ def test_a_mask_that_changes_during_a_run(pristine: Finished, tmp_path: Path) ->
         cv2.imwrite(str(mask), half)
 
         class Exchange(Silent):
-            def start(self, stage: str, total: int, mask: Path = mask, half: np.ndarray = half) -> None:
-                if stage == "match pairs":
+            def start(self, begun: str, total: int, mask: Path = mask, half: np.ndarray = half) -> None:
+                if begun == stage:
                     cv2.imwrite(str(mask), half[:, ::-1])
 
-        def rerun(progress: Silent | None, dense: Path = dense, masks: Path = mask.parent) -> RunReport:
-            return colmap_sph.run(workspace=dense, masks=masks, options=OPTIONS, progress=progress)
+        def rerun(progress: Silent | None, dense: Path = dense, folder: Path = mask.parent) -> RunReport:
+            options, masks = OPTIONS, folder
+            if what == "fusion.mask_path":
+                options, masks = replace(OPTIONS, fusion=replace(OPTIONS.fusion, mask_path=folder)), None
+            return colmap_sph.run(workspace=dense, masks=masks, options=options, progress=progress)
 
         if disturbed:
             told = rerun(Exchange()).incomplete

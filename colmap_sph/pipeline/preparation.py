@@ -178,7 +178,7 @@ class Preparation:
         try:
             undistorted = self.undistort(executor, images)
         finally:
-            tell_changed(self._context, self._places, images, self._originals.mask_of)
+            tell_changed(self._context, self._places, images, lambda name: [self._originals.mask_of(name)])
         self.finish(undistorted)
 
     def check(self, executor: "Executor") -> dict[str, Result]:
