@@ -14,14 +14,14 @@ from typing import Any
 
 import cv2
 
-from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError
+from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutputError
 from colmap_sph.pipeline.engine.group import Answer, Group, Outcome, Piece, RunSeen, folders_of
 from colmap_sph.pipeline.engine.lag import PATIENCE, made_with_patience
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import holding_caches
-from colmap_sph.pipeline.workers import is_memory_error
+from colmap_sph.pipeline.workers import refusal_of
 from colmap_sph.platforms.files import look_again
 from colmap_sph.platforms.memory import keep_freed_memory, most_resident, resident
 from colmap_sph.project.files import read_small, writing_only_if
@@ -141,9 +141,10 @@ class Workplace:
         except ColmapSphError as error:
             return Outcome(None, str(error))
         except (MemoryError, cv2.error) as error:
-            if not is_memory_error(error):
+            told = refusal_of(error)
+            if told is None:
                 raise
-            return Outcome(None, str(OutOfMemoryError()))
+            return Outcome(None, str(told))
 
     def _look_once(self, folders: set[Path]) -> None:
         """Once in a stage what is remembered of a folder is of the stage before."""
