@@ -103,8 +103,7 @@ class Workplace:
         """
         refuse_other_programs(group.run)
         if not sees_token(group.run, patience):
-            who = f"The worker on {socket.gethostname()} does"
-            raise InputError(unseen(who, group.run.path.parent))
+            raise InputError(unseen(_this_worker_does(), group.run.path.parent))
         # In a thread of its own, so that scratch memory and processes of a thread end with the group.
         with self._at_stage(group), ThreadPoolExecutor(1) as pool:
             return pool.submit(self._work, group, patience).result()
@@ -139,7 +138,9 @@ class Workplace:
         except (OptionError, OutputError):
             raise
         except ColmapSphError as error:
-            return Outcome(None, str(error))
+            # Of a file that is there for the others, this machine would say that it is missing.
+            blind = [folder for folder in folders if str(folder) in str(error) and not folder.is_dir()]
+            return Outcome(None, unseen(_this_worker_does(), blind[0]) if blind else str(error))
         except (MemoryError, cv2.error) as error:
             told = refusal_of(error)
             if told is None:
@@ -251,6 +252,10 @@ def unseen(who: str, folder: Path) -> str:
         f"{who} not see {folder}; images and workspace must lie on a disk that all machines share, under the same "
         "path."
     )
+
+
+def _this_worker_does() -> str:
+    return f"The worker on {socket.gethostname()} does"
 
 
 class _Words(logging.Handler):
