@@ -16,6 +16,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 from numpy.typing import NDArray
 
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.images import jpeg, tiff
 from colmap_sph.project.images.jpeg import DamagedError
 
@@ -141,6 +142,11 @@ def read_pixels(path: Path, *, deep: bool = True) -> NDArray[Any]:
         if pixels is None or image.has_error:
             raise DamagedError(_in_short(image.geterror(), path))
     return np.asarray(pixels).reshape(header.height, header.width, header.channels)
+
+
+def unreadable(path: Path, error: Exception, remedy: str = "mend or remove it") -> InputError:
+    """What is said of an image whose header or pixels cannot be read, with what to do."""
+    return InputError(f"{path} cannot be read as an image ({reason_of(error)}); {remedy}.")
 
 
 def _jpeg_size(path: Path) -> tuple[int, int, str] | None:
