@@ -77,11 +77,12 @@ class OutOfMemoryError(ColmapSphError):
 
     exit_code = 6
 
-    def __init__(self) -> None:
-        super().__init__(
-            "There is not enough memory; give fewer --threads or a smaller --max-image-size, "
-            "or end other programs."
-        )
+    def __init__(
+        self,
+        words: str = "There is not enough memory; give fewer --threads or a smaller --max-image-size, "
+        "or end other programs.",
+    ) -> None:
+        super().__init__(words)
 
 
 class LostWorkersError(ColmapSphError):

@@ -668,7 +668,7 @@ def test_a_second_run_says_what_was_up_to_date(small: Path, capsys: pytest.Captu
             "some/file cannot be used (No space left on device)",
         ),
         (OSError(28, "No space left on device"), 3, "No space left on device"),
-        (RuntimeError("can't start new thread"), 6, "not enough memory"),
+        (RuntimeError("can't start new thread"), 6, "refuses another thread"),
         (OSError(errno.EDQUOT, os.strerror(errno.EDQUOT), "some/file"), 3, "some/file cannot be used (Disk quota"),
         (
             OSError(errno.EFBIG, os.strerror(errno.EFBIG), "some/file"),

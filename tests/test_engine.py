@@ -62,7 +62,7 @@ class FilesStage(Stage[int, tuple[Path, int]]):
     def make(task: tuple[Path, int]) -> Facts:
         path, number = task
         if number < 0:
-            raise InputError(f"{number} is damaged")
+            raise InputError(f"{path} is damaged")
         with atomic_file(path) as file:
             file.write(_cache.get("number", str(number).encode))
             if number == 99:
@@ -173,8 +173,16 @@ def test_a_result_half_done_is_not_begun_anew(tmp_path: Path) -> None:
 
 def test_one_failure_costs_one_item(run: RunSeen, place: Workplace) -> None:
     answer = place.work(group_of(run, 1, -2, 3))
-    assert [outcome.failure for outcome in answer.outcomes] == ["", "-2 is damaged", ""]
+    failure = f"{run.path.with_name('-2.txt')} is damaged"
+    assert [outcome.failure for outcome in answer.outcomes] == ["", failure, ""]
     assert answer.peak_memory > 10e6
+
+
+def test_a_worker_that_does_not_see_the_images(run: RunSeen, place: Workplace) -> None:
+    """It sees the run, and what it misses is there for others."""
+    folder = run.path.with_name("images")
+    answer = place.work(Group(run, FilesStage, 1, Kept(), {}, [Piece((folder / "a.jpg", -1), "a.jpg", 1e3)]))
+    assert f"does not see {folder}; images and workspace must lie on a disk" in answer.outcomes[0].failure
 
 
 def test_warnings_come_with_the_answer(run: RunSeen, place: Workplace, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -134,6 +134,22 @@ def test_other_spellings(tmp_path: Path, name: str, there: str) -> None:
     assert "rename the files as the model has them" in str(error.value)
 
 
+@pytest.mark.parametrize("called", ["{}", "{}.jpg", r"C:\data\photos\{}.png", "/data/photos/{}.JPG", "x.y/{}.tif"])
+def test_other_endings_and_folders(tmp_path: Path, called: str) -> None:
+    """As other programs write names of images into models."""
+    sparse = make_project(tmp_path)
+    (tmp_path / "images/v.1.png").touch()
+    names = [called.format(name) for name in ("a", "b", "v.1")]
+    with pytest.raises(InputError) as error:
+        find_images(sparse, names)
+    assert f"calls an image '{names[0]}', and {tmp_path / 'images'} has 'a.png' (so for 3 of 3" in str(error.value)
+    assert "rename the images in the model as their files" in str(error.value)
+    # Not where the file of an image cannot be told, or most have none.
+    for others in (["p/a.jpg", "q/a.jpg"], ["a.jpg", "n.jpg", "m.jpg"]):
+        with pytest.raises(InputError, match="were not found in"):
+            find_images(sparse, others)
+
+
 def test_two_files_that_could_be_meant(tmp_path: Path) -> None:
     sparse = make_project(tmp_path)
     shutil.rmtree(tmp_path / "images")

@@ -362,14 +362,26 @@ def test_grey_values_keep_their_depth(tmp_path: Path, extension: str) -> None:
     assert read_pixels(path).dtype == np.uint16
 
 
-def test_floating_point_images(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("extension", "dtype"), [("tif", "float"), ("exr", "half"), ("tif", "double")])
+def test_floating_point_images(tmp_path: Path, extension: str, dtype: str) -> None:
     """0 is black, 1 is white; what lies beyond is cut off, and no number is black."""
-    values = noise(1, "float")
+    values = noise(1, dtype)
     values[3, 4] = np.nan
-    write(tmp_path / "image.tif", values, "float")
-    expected = np.nan_to_num(np.clip(values[..., 0], 0, 1) * 255)
-    np.testing.assert_allclose(read_grey(tmp_path / "image.tif"), expected, atol=1e-3)
-    np.testing.assert_array_equal(read_whole_grey(tmp_path / "image.tif"), np.rint(expected))
+    path = tmp_path / f"image.{extension}"
+    write(path, values.astype(np.float64) if dtype == "double" else values, dtype)
+    assert read_pixels(path).dtype == np.float32
+    expected = np.nan_to_num(np.clip(values[..., 0].astype(np.float64), 0, 1) * 255)
+    np.testing.assert_allclose(read_grey(path), expected, atol=1e-3)
+    np.testing.assert_array_equal(read_whole_grey(path), np.rint(read_grey(path)))
+
+
+def test_numbers_with_a_sign(tmp_path: Path) -> None:
+    """As of 16-bit TIFF files: the largest is white, and what is below zero black."""
+    values = np.linspace(-32768, 32767, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH, 1).astype(np.int16)
+    write(tmp_path / "image.tif", values, "int16")
+    np.testing.assert_allclose(
+        read_grey(tmp_path / "image.tif"), np.clip(values[..., 0] / 32767, 0, 1) * 255, atol=1e-3
+    )
 
 
 def test_an_image_of_few_values_is_stretched_to_be_matched(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from conftest import keep_images
 from projects import FOUR_NAMES, FOUR_SIZE, read_picture, render_four_images
@@ -312,7 +313,8 @@ def test_an_image_that_changes_before_a_run_fails(pristine: Finished, tmp_path: 
     assert Workspace(again.dense).fused_path.read_bytes() == Workspace(pristine.dense).fused_path.read_bytes()
 
 
-def test_a_mask_that_changes_during_a_run(pristine: Finished, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("what", "stage"), [("masks", "match pairs"), ("fusion.mask_path", "fuse")])
+def test_a_mask_that_changes_during_a_run(what: str, stage: str, pristine: Finished, tmp_path: Path) -> None:
     """It is told; and with the former mask the next run makes what an undisturbed one makes."""
     clouds = []
     for disturbed in (False, True):
@@ -325,12 +327,16 @@ def test_a_mask_that_changes_during_a_run(pristine: Finished, tmp_path: Path) ->
         cv2.imwrite(str(mask), half)
 
         class Exchange(Silent):
-            def start(self, stage: str, total: int, mask: Path = mask, half: np.ndarray = half) -> None:
-                if stage == "match pairs":
+            def start(self, begun: str, total: int, mask: Path = mask, half: np.ndarray = half) -> None:
+                if begun == stage:
                     cv2.imwrite(str(mask), half[:, ::-1])
 
-        def rerun(progress: Silent | None, dense: Path = dense, masks: Path = mask.parent) -> RunReport:
-            return colmap_sph.run(workspace=dense, masks=masks, options=OPTIONS, progress=progress)
+        def rerun(progress: Silent | None, dense: Path = dense, folder: Path = mask.parent) -> RunReport:
+            options = OPTIONS
+            masks: Path | None = folder
+            if what == "fusion.mask_path":
+                options, masks = replace(OPTIONS, fusion=replace(OPTIONS.fusion, mask_path=folder)), None
+            return colmap_sph.run(workspace=dense, masks=masks, options=options, progress=progress)
 
         if disturbed:
             told = rerun(Exchange()).incomplete
@@ -339,6 +345,28 @@ def test_a_mask_that_changes_during_a_run(pristine: Finished, tmp_path: Path) ->
         assert rerun(None).incomplete == {}
         clouds.append(Workspace(dense).fused_path.read_bytes())
     assert clouds[0] == clouds[1] != Workspace(pristine.dense).fused_path.read_bytes()
+
+
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_model_that_changes_during_a_run(is_whole: bool, pristine: Finished, tmp_path: Path) -> None:
+    """As structure from motion that is still at work does: it is told, and with it the next run begins anew."""
+    shutil.copytree(pristine.project, tmp_path / "project", ignore=shutil.ignore_patterns("dense"))
+    model = tmp_path / "project/sparse/0"
+
+    class Exchange(Silent):
+        def start(self, stage: str, total: int) -> None:
+            if stage == "undistort":
+                moved = pycolmap.Reconstruction(model)
+                moved.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), np.zeros(3)))
+                moved.write(model)
+                if not is_whole:
+                    os.truncate(model / "images.bin", 100)
+
+    with pytest.raises(InputError, match=r"sparse/0 was changed while the run was at work; run again"):
+        colmap_sph.run(model, options=OPTIONS, progress=Exchange())
+    shutil.copytree(pristine.project / "sparse/0", model, dirs_exist_ok=True)
+    again = Finished(tmp_path / "project", colmap_sph.run(model, options=OPTIONS))
+    assert Workspace(again.dense).fused_path.read_bytes() == Workspace(pristine.dense).fused_path.read_bytes()
 
 
 def test_an_image_that_is_only_touched_during_a_run(finished: Finished) -> None:

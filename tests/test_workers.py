@@ -89,10 +89,10 @@ def test_a_failed_item_keeps_no_memory() -> None:
     assert results[2] == 1
 
 
-def test_no_memory_for_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_threads_that_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: threading.Thread) -> None:
         raise RuntimeError("can't start new thread")
 
     monkeypatch.setattr(threading.Thread, "start", refuse)
-    with pytest.raises(OutOfMemoryError, match="fewer --threads"):
+    with pytest.raises(OutOfMemoryError, match="refuses another thread; give fewer --threads"):
         run(abs, range(3))

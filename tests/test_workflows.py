@@ -136,6 +136,28 @@ def test_a_batch_of_odd_names(root: str, tmp_path: Path, stub: Path) -> None:
     assert {name for name in names if (tmp_path / root / os.fsdecode(name) / "dense/colmap_sph").is_dir()} == names
 
 
+def link_projects(tmp_path: Path) -> Path:
+    """A folder of a project, one linked from elsewhere, one with the first one's model, and links in a circle."""
+    root = tmp_path / "survey"
+    add_model(root, "one/sparse/0", 0)
+    add_model(tmp_path / "away", "two/sparse/0", 0)
+    (root / "two").symlink_to("../away/two")
+    (root / "three").mkdir()
+    (root / "three/sparse").symlink_to("../one/sparse")
+    (root / "one/up").symlink_to("..")
+    (root / "zero").symlink_to("one")
+    return root
+
+
+def test_a_batch_of_links(tmp_path: Path, stub: Path) -> None:
+    """Users collect projects from several disks so."""
+    root = link_projects(tmp_path)
+    assert called(WORKFLOWS / "batch.sh", root).returncode == 0
+    assert stub.read_text().splitlines() == [
+        f"run --model {root}/{name}/sparse/0 --output {root}/{name}/dense" for name in ("one", "three", "two")
+    ]
+
+
 def test_a_batch_lists_products(tmp_path: Path, stub: Path) -> None:
     root = tmp_path / "survey"
     add_model(root, "one/sparse/0", 0)
@@ -263,6 +285,13 @@ def test_snakemake_with_models_of_all_kinds(tmp_path: Path, stub: Path) -> None:
     assert done.returncode == 1, done.stderr
     assert set(stub.read_text().splitlines()) == {call for call in calls if "/one/" not in call}
     assert table_of(root) == {**expected, f"{deep}/sparse/0": ["done", *numbers, ""]}
+
+
+@needs_snakemake
+def test_snakemake_with_links(tmp_path: Path, stub: Path) -> None:
+    root = link_projects(tmp_path)
+    assert snakemake(root).returncode == 0
+    assert table_of(root).keys() == {"one/sparse/0", "three/sparse/0", "two/sparse/0"}
 
 
 @needs_snakemake

@@ -4,7 +4,7 @@
 #     workflows/batch.sh ROOT [options of `colmap_sph run`]
 #
 # A project is a folder, at any depth below ROOT, with a sparse model in sparse/0; its result goes to dense/ beside
-# sparse/, and that of sparse/1 to dense-1/. A failure does not stop the batch. A project that finished without some of
+# sparse/, and that of sparse/1 to dense-1/. Links to folders are followed, and each project is taken once. A failure does not stop the batch. A project that finished without some of
 # its images counts as done, with a warning. At the end a table says what became of each, and why; it is also in
 # ROOT/colmap_sph_batch.tsv, and as a page with links to the reports in ROOT/colmap_sph_batch.html. The exit code is 1
 # where a project failed. Run it again to try those once more: finished results are kept.
@@ -21,9 +21,14 @@ program=$(command -v colmap_sph) || program=$here/../.venv/bin/colmap_sph
 has_model() { [ -e "$1/images.bin" ] || [ -e "$1/images.txt" ]; }
 
 # As bytes: in other languages' sets of characters, names of an older one would not match.
-find_models() { LC_ALL=C find -H "$root" -regextype posix-extended -regex '.*/sparse/[0-9]+' -print0; }
+find_models() { LC_ALL=C find -L "$root" -regextype posix-extended -regex '.*/sparse/[0-9]+' -print0; }
 mapfile -d '' models < <(find_models | LC_ALL=C sort -zV)
-for index in "${!models[@]}"; do has_model "${models[index]}" || unset "models[index]"; done
+declare -A taken
+for index in "${!models[@]}"; do
+    place=$(realpath -z "${models[index]%/sparse/*}" | tr '\0' /)${models[index]##*/} # $( ) cuts line breaks off
+    if [ -n "${taken[$place]:-}" ] || ! has_model "${models[index]}"; then unset "models[index]"; fi
+    taken[$place]=1
+done
 [ "${#models[@]}" -gt 0 ] || { echo "no folder with sparse/0 below $root" >&2; exit 2; }
 
 scratch=$(mktemp -d) || exit 3

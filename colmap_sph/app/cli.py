@@ -27,10 +27,10 @@ from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_com
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, with_dashed_values
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
-from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError, reason_of
+from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutputError, reason_of
 from colmap_sph.pipeline.forecast.time_limit import process_start
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.workers import is_memory_error
+from colmap_sph.pipeline.workers import refusal_of
 from colmap_sph.project.workspace import Workspace
 
 logger = logging.getLogger(__name__)
@@ -89,8 +89,8 @@ def _in_words(error: BaseException) -> ColmapSphError | None:
         return error.spelled(flag_of)
     if isinstance(error, ColmapSphError):
         return error
-    if isinstance(error, (MemoryError, cv2.error, RuntimeError)) and is_memory_error(error):
-        return OutOfMemoryError()
+    if (refused := refusal_of(error)) is not None:
+        return refused
     if isinstance(error, OSError) and error.errno is not None and not isinstance(error, BrokenPipeError):
         what = f"{error.filename} cannot be used" if error.filename else "A file cannot be written"
         return OutputError(f"{what} ({reason_of(error)}); check space and permissions.")

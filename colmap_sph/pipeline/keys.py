@@ -253,7 +253,7 @@ class Keys:
             (scene.origin, scene.anchor, scene.image_ids, [(view.name, view.original) for view in scene.views]),
             [] if self.fresh else [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
             self._options.fusion,
-            [_digest_if_there(mask_path(folder, name)) for name in maps] if folder else [],
+            [self._mask_digest(mask_path(folder, name)) for name in maps] if folder else [],
         )
 
 

@@ -174,7 +174,7 @@ class Preparation:
         try:
             undistorted = self.undistort(executor, images)
         finally:
-            tell_changed(self._context, self._places, images, self._originals.mask_of)
+            tell_changed(self._context, self._places, images, lambda name: [self._originals.mask_of(name)])
         self.finish(undistorted)
 
     def check(self, executor: "Executor") -> dict[str, Result]:
@@ -306,6 +306,7 @@ class Preparation:
             else:
                 self._child.call(undistort_model, task, f"the model in {self.workspace.root}")
         except InputError as error:
+            self._refuse_changed_model()
             # The model was read before: what can go wrong is that the disk does not take the new one.
             raise OutputError(
                 f"The model of the undistorted images cannot be written ({reason_of(error)}); check space and "
@@ -313,7 +314,16 @@ class Preparation:
             ) from error
         finally:
             self._child.close()
+        self._refuse_changed_model()
         return task.final_dir
+
+    def _refuse_changed_model(self) -> None:
+        """Raise `InputError` where the model is not the one that images were undistorted by: it was read again."""
+        if self._originals.model_digest() != self._marker.model:
+            raise InputError(
+                f"The model in {self._originals.model_dir} was changed while the run was at work; run again once "
+                "it is complete."
+            )
 
     def _adopt_images(self, *, has_masks: bool) -> None:
         """Take what an earlier version undistorted for this program's, so that it may be replaced.

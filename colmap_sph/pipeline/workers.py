@@ -15,6 +15,10 @@ R = TypeVar("R")
 
 # Errors that no other item of a stage would be spared.
 _FATAL = (OptionError, OutputError)
+_NO_THREAD = (
+    "The system refuses another thread; give fewer --threads, end other programs, or allow more threads (ulimit "
+    "-u, or the container's limit of processes) or memory (ulimit -v)."
+)
 
 
 def for_all(
@@ -59,9 +63,10 @@ def for_all(
                 except ColmapSphError as error:
                     skip(item, str(error))
                 except (MemoryError, cv2.error) as error:
-                    if not is_memory_error(error):
+                    told = refusal_of(error)
+                    if told is None:
                         raise
-                    skip(item, str(OutOfMemoryError()))
+                    skip(item, str(told))
                 # Nothing may keep a future: with its exception it keeps all arrays of the item that failed.
                 del future
                 advance(result)
@@ -71,12 +76,15 @@ def for_all(
     return {item: results[item] for item in items if item in results}
 
 
-def is_memory_error(error: BaseException) -> bool:
-    """Whether an error says that memory or a thread was refused, by Python or by OpenCV."""
+def refusal_of(error: BaseException) -> OutOfMemoryError | None:
+    """What a user is told of memory or a thread that was refused, by Python or by OpenCV; None of other errors."""
     if isinstance(error, RuntimeError):
         # Python's own words, and those of C++'s libraries: no memory for its stack, or a limit on threads
-        return "start new thread" in str(error) or "temporarily unavailable" in str(error)
-    return isinstance(error, MemoryError) or (isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem)
+        is_thread = "start new thread" in str(error) or "temporarily unavailable" in str(error)
+        return OutOfMemoryError(_NO_THREAD) if is_thread else None
+    if isinstance(error, MemoryError) or (isinstance(error, cv2.error) and error.code == cv2.Error.StsNoMem):
+        return OutOfMemoryError()
+    return None
 
 
 @contextmanager
@@ -94,5 +102,8 @@ def room_for_workers() -> Iterator[None]:
 def _submit(pool: ThreadPoolExecutor, work: Callable[[T], R], items: Sequence[T]) -> dict[Future[R], T]:
     try:
         return {pool.submit(work, item): item for item in items}
-    except RuntimeError as error:  # "can't start new thread": no memory for its stack, or a limit on threads
-        raise OutOfMemoryError from error
+    except RuntimeError as error:
+        told = refusal_of(error)
+        if told is None:
+            raise
+        raise told from error

@@ -14,14 +14,14 @@ from typing import Any
 
 import cv2
 
-from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutOfMemoryError, OutputError
+from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutputError
 from colmap_sph.pipeline.engine.group import Answer, Group, Outcome, Piece, RunSeen, folders_of
 from colmap_sph.pipeline.engine.lag import PATIENCE, made_with_patience
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import holding_caches
-from colmap_sph.pipeline.workers import is_memory_error
+from colmap_sph.pipeline.workers import refusal_of
 from colmap_sph.platforms.files import look_again
 from colmap_sph.platforms.memory import keep_freed_memory, most_resident, resident
 from colmap_sph.project.files import read_small, writing_only_if
@@ -103,8 +103,7 @@ class Workplace:
         """
         refuse_other_programs(group.run)
         if not sees_token(group.run, patience):
-            who = f"The worker on {socket.gethostname()} does"
-            raise InputError(unseen(who, group.run.path.parent))
+            raise InputError(unseen(_this_worker_does(), group.run.path.parent))
         # In a thread of its own, so that scratch memory and processes of a thread end with the group.
         with self._at_stage(group), ThreadPoolExecutor(1) as pool:
             return pool.submit(self._work, group, patience).result()
@@ -139,11 +138,14 @@ class Workplace:
         except (OptionError, OutputError):
             raise
         except ColmapSphError as error:
-            return Outcome(None, str(error))
+            # Of a file that is there for the others, this machine would say that it is missing.
+            blind = [folder for folder in folders if str(folder) in str(error) and not folder.is_dir()]
+            return Outcome(None, unseen(_this_worker_does(), blind[0]) if blind else str(error))
         except (MemoryError, cv2.error) as error:
-            if not is_memory_error(error):
+            told = refusal_of(error)
+            if told is None:
                 raise
-            return Outcome(None, str(OutOfMemoryError()))
+            return Outcome(None, str(told))
 
     def _look_once(self, folders: set[Path]) -> None:
         """Once in a stage what is remembered of a folder is of the stage before."""
@@ -250,6 +252,10 @@ def unseen(who: str, folder: Path) -> str:
         f"{who} not see {folder}; images and workspace must lie on a disk that all machines share, under the same "
         "path."
     )
+
+
+def _this_worker_does() -> str:
+    return f"The worker on {socket.gethostname()} does"
 
 
 class _Words(logging.Handler):

@@ -4,6 +4,7 @@ import logging
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING
 
@@ -13,7 +14,7 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.self_check import judge_copies, misplaced_views, refuse_cameras
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of, tell_changed
 from colmap_sph.pipeline.stages.stage import keys_of
-from colmap_sph.project.workspace import Workspace
+from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.rectification import sampling_of
 
 if TYPE_CHECKING:
@@ -68,11 +69,15 @@ def with_good_images(
 @contextmanager
 def telling_changed(context: Context) -> Iterator[None]:
     """Report images that were changed while something was made of them, however that ends; see `tell_changed`."""
+    workspace, folder = context.workspace, context.options.fusion.mask_path
+
+    def masks_of(name: str) -> list[Path | None]:
+        return [workspace.mask_path(name), None if folder is None else mask_path(folder, name)]
+
     try:
         yield
     finally:
-        workspace = context.workspace
-        tell_changed(context, _places(workspace), context.scene.index_of, workspace.mask_path)
+        tell_changed(context, _places(workspace), context.scene.index_of, masks_of)
 
 
 def _places(workspace: Workspace) -> ImagePlaces:

@@ -4,7 +4,7 @@ A file whose size, times and place on the disk are as they were is not read agai
 its digest, and decoded only if that is new.
 """
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -271,7 +271,10 @@ def details_of(results: Mapping[str, Result]) -> dict[str, float]:
 
 
 def tell_changed(
-    context: "Context", places: ImagePlaces, names: Collection[str], mask_of: Callable[[str], Path | None]
+    context: "Context",
+    places: ImagePlaces,
+    names: Collection[str],
+    masks_of: Callable[[str], Iterable[Path | None]],
 ) -> None:
     """Report images that are not as they were checked, or whose masks are not: either may be in what was made.
 
@@ -283,19 +286,21 @@ def tell_changed(
     places : ImagePlaces
     names : collection of str
         Images that were found good. One that is gone was there when it was read, or was reported then.
-    mask_of : callable
-        Name → where its mask is, or would be.
+    masks_of : callable
+        Name → where its masks are, or would be; None where it can have none.
     """
     file, key = places.known_file(context), context.keys.known_images()
     known = read_known(file, key)
     changed = {}
     for name in sorted(known.keys() & {*names}):
-        image, mask = places.path(name), mask_of(name)
+        image = places.path(name)
         with suppress(OSError, InputError):
             if _is_changed(image, known[name]):
                 changed[name] = image
-            elif mask is not None and context.keys.is_mask_changed(mask):
-                changed[name] = mask
+                continue
+            for mask in filter(None, masks_of(name)):
+                if context.keys.is_mask_changed(mask):
+                    changed[name] = mask
     if changed:
         doubted = {name: replace(known[name], doubt=digest(known[name].doubt, "doubt")) for name in changed}
         write_known(file, key, known | doubted)

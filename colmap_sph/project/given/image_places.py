@@ -184,18 +184,39 @@ def _common_misspelling(model_dir: Path, folder: Path, files: Sequence[str], nam
     """Say how a folder spells the names of a model's images, of which it has none; None where it does not."""
     spelled = other_spellings(files, names)
     if not spelled:
-        return _other_folder(model_dir, folder, files, names)
-    name = min(spelled)
-    if all("\\" in each and each.replace("\\", "/") == file for each, file in spelled.items()):
+        elsewhere = _other_folder(model_dir, folder, files, names)
+        if elsewhere:
+            return elsewhere
+        spelled = _same_stems(files, names)
+        if not spelled or 2 * len(spelled) < len(names):
+            return None
+        remedy = "rename the images in the model as their files"
+    elif all("\\" in each and each.replace("\\", "/") == file for each, file in spelled.items()):
         remedy = f"write the names in the model with /: {_SLASHES.format(model=str(model_dir))}"
     else:
         remedy = "rename the files as the model has them"
+    name = min(spelled)
     # As it is typed: `repr` doubles each \.
     called = repr(name).replace(r"\\", "\\")
     return (
         f"The model {model_dir} calls an image {called}, and {folder} has {spelled[name]!r} "
         f"(so for {len(spelled)} of {len(names)} images); {remedy}."
     )
+
+
+def _same_stems(files: Iterable[str], names: Iterable[str]) -> dict[str, str]:
+    """Files called as images are, but for folders and endings: name → file, where one belongs to the other alone.
+
+    Other programs write names without an ending, or the place that the image has on their machine.
+    """
+    by_stem: dict[str, list[str]] = {}
+    for file in files:
+        by_stem.setdefault(PurePosixPath(_folded(file)).stem, []).append(file)
+    last = {name: PurePosixPath(_folded(name)) for name in names}
+    alike = {name: by_stem.get(part.name) or by_stem.get(part.stem, []) for name, part in last.items()}
+    found = {name: those[0] for name, those in alike.items() if len(those) == 1}
+    wanted = Counter(found.values())
+    return {name: file for name, file in found.items() if wanted[file] == 1}
 
 
 def _other_folder(model_dir: Path, folder: Path, files: Sequence[str], names: Sequence[str]) -> str | None:

@@ -16,6 +16,7 @@ import numpy as np
 import OpenImageIO as oiio  # noqa: N813
 from numpy.typing import NDArray
 
+from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.images import jpeg, tiff
 from colmap_sph.project.images.jpeg import DamagedError
 
@@ -29,6 +30,9 @@ _PNG_GREY = (0, 4)
 _JPEG_HEADER_BYTES = 1 << 17
 # COLMAP leaves out the last channel of two or four: transparency.
 _COLOUR_CHANNELS = {1: 1, 2: 1, 3: 3, 4: 3}
+
+# `Header.dtype` as OpenImageIO calls it.
+_LIBRARY_TYPES = {"uint8": "uint8", "uint16": "uint16", "float32": "float"}
 
 # Worker threads decode an image each.
 oiio.attribute("threads", 1)
@@ -134,10 +138,15 @@ def read_pixels(path: Path, *, deep: bool = True) -> NDArray[Any]:
         tiff.check_tiff(path.read_bytes())
     with _opened(path) as image:
         header = _header(image)
-        pixels = image.read_image(0, 0, 0, header.channels, header.dtype if deep else "uint8")
+        pixels = image.read_image(0, 0, 0, header.channels, _LIBRARY_TYPES[header.dtype if deep else "uint8"])
         if pixels is None or image.has_error:
             raise DamagedError(_in_short(image.geterror(), path))
     return np.asarray(pixels).reshape(header.height, header.width, header.channels)
+
+
+def unreadable(path: Path, error: Exception, remedy: str = "mend or remove it") -> InputError:
+    """What is said of an image whose header or pixels cannot be read, with what to do."""
+    return InputError(f"{path} cannot be read as an image ({reason_of(error)}); {remedy}.")
 
 
 def _jpeg_size(path: Path) -> tuple[int, int, str] | None:

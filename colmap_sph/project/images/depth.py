@@ -13,8 +13,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.images.decoding import read_header, read_pixels
+from colmap_sph.project.images.decoding import read_header, read_pixels, unreadable
 from colmap_sph.project.images.jpeg import DamagedError
 
 # Largest value of each kind of number: white, where nothing is stretched.
@@ -68,7 +67,7 @@ def sample_values(path: Path) -> ValueSample | None:
             return None
         pixels = read_pixels(path)
     except (OSError, DamagedError) as error:
-        raise InputError(f"{path} cannot be read as an image ({reason_of(error)}); mend or remove it.") from error
+        raise unreadable(path, error) from error
     colours = "grey" if header.channels == 1 else "colour"
     return ValueSample(f"{_KIND_NAMES[header.dtype]} {colours}", tuple(map(float, _quantiles(pixels))))
 

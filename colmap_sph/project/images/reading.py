@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.platforms.files import is_link
 from colmap_sph.project.images import jpeg
-from colmap_sph.project.images.decoding import is_jpeg, read_header, read_pixels
+from colmap_sph.project.images.decoding import is_jpeg, read_header, read_pixels, unreadable
 from colmap_sph.project.images.depth import narrow_range, stretched
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.scene import View
@@ -210,6 +210,4 @@ def read_small_colours(path: Path, longest: int) -> NDArray[np.uint8]:
 
 
 def _unreadable(path: Path, error: Exception) -> InputError:
-    return InputError(
-        f"{path} cannot be read as an image ({reason_of(error)}); undistort it again or remove it from the model."
-    )
+    return unreadable(path, error, "undistort it again or remove it from the model")

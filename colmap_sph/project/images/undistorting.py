@@ -16,9 +16,9 @@ import OpenImageIO as oiio  # noqa: N813
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.errors import InputError, OutputError
 from colmap_sph.project.files import atomic_file, make_dir
-from colmap_sph.project.images.decoding import is_jpeg, read_pixels
+from colmap_sph.project.images.decoding import is_jpeg, read_pixels, unreadable
 from colmap_sph.project.images.depth import ValueRange, stretched
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.orientation import copy_without_orientation
@@ -102,9 +102,7 @@ def _read(source: Path, size: tuple[int, int], *, deep: bool) -> NDArray[Any]:
     try:
         image = read_pixels(source, deep=deep)
     except (OSError, DamagedError) as error:
-        raise InputError(
-            f"{source} cannot be read as an image ({reason_of(error)}); mend or remove it."
-        ) from error
+        raise unreadable(source, error) from error
     if image.shape[1::-1] != size:
         raise InputError(f"{source} is not of its camera's size; start again.")
     return image

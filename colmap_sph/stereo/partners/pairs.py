@@ -311,11 +311,13 @@ def report_selection(selection: PairSelection, options: PairOptions) -> None:
             raise NoResultError(
                 "No pair of the model's usable images comes of patch-match.cfg; mend or delete it."
             )
+        # Others may be what splats begin with: drawn at random.
+        points = " do points without tracks lie on what they show? if not, delete them"
         raise NoResultError(
             f"No pair of images overlaps and has parallax, going by {words[selection.source]}: at least "
             f"{options.min_shared_points} shared points and a triangulation angle of "
-            f"{options.min_triangulation_angle} degrees are needed; check the model (were its images "
-            "taken from different places?), or lower these bounds."
+            f"{options.min_triangulation_angle} degrees are needed; check the model (were its images taken from "
+            f"different places?{points if selection.source == 'frusta' else ''}), or lower these bounds."
         )
     logger.info("%d pairs of %d images, by %s", num_unique, len(selection.partners), words[selection.source])
     for name in selection.without_partner:
