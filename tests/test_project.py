@@ -54,6 +54,7 @@ def test_default_output(tmp_path: Path, model: str, expected: str) -> None:
         ("mine/sparse", "store/sparse", "mine/sparse/0", "mine/dense"),
         ("mine/sparse/1", "store/sparse/0", "mine/sparse/1", "mine/dense-1"),
         ("mine/best", "store/sparse/0", "mine/best", "store/dense"),
+        ("mine/sparse/best", "store/sparse/1", "mine/sparse/best", "store/dense-1"),
     ],
 )
 def test_default_output_of_links(tmp_path: Path, link: str, target: str, model: str, expected: str) -> None:

@@ -112,7 +112,10 @@ def read_projects(path: Path) -> list[Project]:
 def default_output(model: Path) -> Path:
     """Where `colmap_sph run` puts the result of a model, of sparse/0, sparse/1 or sparse."""
     there = Path(os.path.normpath(Path.cwd() / model))
-    model = there if "sparse" in (there.name, there.parent.name) else model.resolve()
+    if "sparse" in (there.name, there.parent.name if there.name.isdigit() else ""):
+        model = there
+    else:
+        model = model.resolve()
     number = model.name if model.name.isdigit() else ""
     folder = model.parent if number else model
     is_one_of_many = folder.name == "sparse" and number.strip("0")

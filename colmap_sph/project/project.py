@@ -82,8 +82,8 @@ class Project:
             return self.output
         assert self.model is not None
         project = Path(os.path.normpath(Path.cwd() / self.model))
-        if "sparse" not in (project.name, project.parent.name):  # a link to a model says nothing of its project
-            project = real_path(self.model)
+        if "sparse" not in (project.name, project.parent.name if project.name.isdigit() else ""):
+            project = real_path(self.model)  # a link to a model, such as sparse/best, says nothing of its project
         number = project.name if project.name.isdigit() else ""
         if number:  # sparse/0, but not a project that is called 2024
             project = project.parent
