@@ -272,7 +272,7 @@ def test_a_mesh_coarser_than_the_pixels_is_told(cloudy, tmp_path, monkeypatch, c
     assert re.search(r"poisson has 16 cells along a side at most, not 2\d;", caplog.text)
 
 
-def test_cells_of_poisson_are_as_asked_for_where_something_lies_far_off(cloudy, tmp_path):
+def test_cells_of_poisson_are_as_asked_for_where_something_lies_far_off(cloudy, tmp_path, monkeypatch, caplog):
     """The octree is as large as all of the cloud, not as what most pixels see: cells were 8 times as large."""
     head, data = cloudy.fused_path.read_bytes().split(b"end_header\n")
     points = np.frombuffer(data, POINT).copy()
@@ -285,6 +285,12 @@ def test_cells_of_poisson_are_as_asked_for_where_something_lies_far_off(cloudy, 
     edges = mesh.edges_unique_length[(np.abs(mesh.vertices[mesh.edges_unique]) < 20).all(axis=(1, 2))]
     # Of a surface in cubes, whose side is the whole over a power of two: up to 1.5 times what is given.
     assert 0.25 < np.median(edges) < 1.0
+    assert caplog.text == ""
+    monkeypatch.setattr(make, "_DEPTHS", (3, 8))
+    made(other, tmp_path / "coarse", method="poisson", voxel=0.5, trim=0.0)
+    assert re.search(
+        r"coarser than --voxel asks for, as poisson has 256 cells along a side at most, not 12\d\d;", caplog.text
+    )
 
 
 def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
@@ -306,6 +312,7 @@ def test_poisson_without_a_cloud_says_what_is_missing(workspace, tmp_path):
         ("two points", r"has only 2 points"),
         ("one normal unknown", r"fused\.ply has 1 point without a normal"),
         ("normals of no length", r"fused\.ply has 20,000 points without a normal"),
+        ("normals of any length", r"fused\.ply has 20,000 points without a normal of possible length"),
         ("one place for all", r"All points of .*fused\.ply lie within 0, less than one cell of 0\.\d+,"),
         ("nearly one place", r"All points of .*fused\.ply lie within 1e-30, less than one cell"),
     ],
@@ -323,8 +330,8 @@ def test_a_cloud_that_poisson_would_crash_on_is_refused(wrong, words, cloudy, tm
         points["xyz"][7, 1] = np.nan
     elif wrong == "one normal unknown":
         points["normal"][7, 1] = np.nan
-    elif wrong == "normals of no length":
-        points["normal"] *= 1e-30
+    elif wrong in ("normals of no length", "normals of any length"):
+        points["normal"] *= 1e-30 if wrong == "normals of no length" else 1e30
     elif wrong in ("one place for all", "nearly one place"):
         points["xyz"] = 0
         points["xyz"][::2, 0] = 1e-30 if wrong == "nearly one place" else 0

@@ -167,8 +167,9 @@ def _of_cloud(request: MeshRequest, scene: Scene, seen: list[SeenView], cell: fl
     depth = int(np.clip(wanted, *_DEPTHS))
     if wanted > depth:
         logger.warning(
-            "The mesh is coarser than the images, as poisson has %d cells along a side at most, not %d; give "
+            "The mesh is coarser than %s, as poisson has %d cells along a side at most, not %d; give "
             "--method tsdf, which has no such bound, for finer ones",
+            "--voxel asks for" if request.options.voxel else "the images",
             2**depth,
             sides,
         )
@@ -188,8 +189,8 @@ def _checked_size(path: Path, cloud: Cloud, cell: float) -> float:
             low, high = np.minimum(low, piece.xyz.min(axis=0)), np.maximum(high, piece.xyz.max(axis=0))
     if sound < cloud.count:
         raise InputError(
-            f"{path} has {counted(cloud.count - sound, 'point')} without a normal, or without possible "
-            "coordinates, and --method poisson needs both; fuse again, or give --method tsdf."
+            f"{path} has {counted(cloud.count - sound, 'point')} without a normal of possible length, or without "
+            "possible coordinates, and --method poisson needs both; fuse again, or give --method tsdf."
         )
     if sound < _FEWEST_POINTS:
         raise NoResultError(
