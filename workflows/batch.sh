@@ -4,10 +4,11 @@
 #     workflows/batch.sh ROOT [options of `colmap_sph run`]
 #
 # A project is a folder, at any depth below ROOT, with a sparse model in sparse/0; its result goes to dense/ beside
-# sparse/, and that of sparse/1 to dense-1/. Links to folders are followed, and each project is taken once. A failure does not stop the batch. A project that finished without some of
-# its images counts as done, with a warning. At the end a table says what became of each, and why; it is also in
-# ROOT/colmap_sph_batch.tsv, and as a page with links to the reports in ROOT/colmap_sph_batch.html. The exit code is 1
-# where a project failed. Run it again to try those once more: finished results are kept.
+# sparse/, and that of sparse/1 to dense-1/. Links to folders are followed, and each project is taken once. A failure
+# does not stop the batch. A project that finished without some of its images counts as done, with a warning. At the
+# end a table says what became of each, and why; it is also in ROOT/colmap_sph_batch.tsv, and as a page with links to
+# the reports in ROOT/colmap_sph_batch.html. The exit code is 1 where a project failed. Run it again to try those once
+# more: finished results are kept.
 set -u
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)
 root=${1:?usage: batch.sh ROOT [options of colmap_sph run]}
