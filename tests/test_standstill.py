@@ -1,5 +1,7 @@
 """What stands still while the camera turns is not of the scene: it gets no depth, and this is told."""
 
+import threading
+import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +14,7 @@ import pytest
 import colmap_sph
 from colmap_sph import synthetic as syn
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.input import standing
 from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
@@ -125,6 +128,30 @@ def test_an_object_with_eight_equal_sides_is_matched(tmp_path):
     assert still_images(context_of(tmp_path, pictures[:1] * 16, views_of(cameras))) == 16
     # And all there are, where each of its sides has one.
     assert not still_images(context_of(tmp_path, pictures[:1] * 8, views_of(cameras[::2])))
+
+
+def test_no_more_images_are_read_at_once_than_memory_allows(tmp_path, monkeypatch):
+    """Two of them here: what is no JPEG is decoded whole, also to be seen small."""
+    picture = np.full((HEIGHT, WIDTH), 100, np.uint8)
+    context = context_of(tmp_path, [picture] * 16, views_of(ring(16, 2, 0.7)))
+    context = replace(context, options=RunOptions(threads=8, memory="2GiB"))
+    reading, most, lock = 0, 0, threading.Lock()
+    read_small = standing.read_small
+
+    def read(path, longest):
+        nonlocal reading, most
+        with lock:
+            reading += 1
+            most = max(most, reading)
+        time.sleep(0.05)
+        with lock:
+            reading -= 1
+        return read_small(path, longest)
+
+    monkeypatch.setattr(standing, "read_small", read)
+    monkeypatch.setattr(standing, "_READ_BYTES", 0.9 * 2**30 / picture.size)
+    still_images(context)
+    assert most == 2
 
 
 def test_images_that_others_are_compared_with_are_read_once(tmp_path, monkeypatch):

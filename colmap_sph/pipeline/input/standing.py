@@ -21,6 +21,8 @@ logger = logging.getLogger(__name__)
 
 # Images are looked at with so many pixels along their longest side.
 _LOOKED_AT = 320
+# Largest bytes in use per pixel while an image is read.
+_READ_BYTES = 25.0
 # Side of what is left out around masked pixels: windows there show these, too.
 _SIDE = 9
 # A smaller share of a camera's images may look alike by chance.
@@ -82,8 +84,11 @@ def _still_shares(
                 return float(still[wanted].mean())
         return None
 
-    with ThreadPoolExecutor(context.options.num_threads) as pool:
-        list(pool.map(read, sorted({*compared, *beside.values()})))
+    needed = sorted({*compared, *beside.values()})
+    largest = _READ_BYTES * max((context.scene.view(name).num_pixels for name in needed), default=1)
+    fitting = int(context.options.memory_budget / largest)
+    with ThreadPoolExecutor(min(max(fitting, 1), context.options.num_threads)) as pool:
+        list(pool.map(read, needed))
         names = sorted(turned.keys() & beside.keys() & small.keys())
         shares = dict(zip(names, pool.map(share, names), strict=True))
     return {name: found for name, found in shares.items() if found is not None}
