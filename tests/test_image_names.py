@@ -143,7 +143,7 @@ def test_other_endings_and_folders(tmp_path: Path, called: str) -> None:
     with pytest.raises(InputError) as error:
         find_images(sparse, names)
     assert f"calls an image '{names[0]}', and {tmp_path / 'images'} has 'a.png' (so for 3 of 3" in str(error.value)
-    assert "rename the images in the model as their files" in str(error.value)
+    assert "rename the images in the model as their files, or give the folder" in str(error.value)
     # Not where the file of an image cannot be told, or most have none.
     for others in (["p/a.jpg", "q/a.jpg"], ["a.jpg", "n.jpg", "m.jpg"]):
         with pytest.raises(InputError, match="were not found in"):

@@ -190,7 +190,7 @@ def _common_misspelling(model_dir: Path, folder: Path, files: Sequence[str], nam
         spelled = _same_stems(files, names)
         if not spelled or 2 * len(spelled) < len(names):
             return None
-        remedy = "rename the images in the model as their files"
+        remedy = "rename the images in the model as their files, or give the folder of its images as --images"
     elif all("\\" in each and each.replace("\\", "/") == file for each, file in spelled.items()):
         remedy = f"write the names in the model with /: {_SLASHES.format(model=str(model_dir))}"
     else:
