@@ -68,6 +68,8 @@ def test_default_output_of_links(tmp_path: Path, link: str, target: str, model: 
     assert project.root == tmp_path / expected
     assert runpy.run_path(str(SUMMARY))["default_output"](tmp_path / model) == tmp_path / expected
     assert project.database() == tmp_path / "mine/database.db"
+    (tmp_path / "store/database.db").touch()  # of which the model was made; the other may be anything's
+    assert project.database() == tmp_path / "store/database.db"
 
 
 def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ _MAX_NUM_IMAGES = 2147483647
 
 def find_database(model_dir: Path) -> Path | None:
     """COLMAP's ``database.db`` beside or above the model, if there is one."""
-    # Of a link to a model both where it is and where it leads to.
-    folders = [model_dir, *(Path.cwd() / model_dir).parents[:2], *real_path(model_dir).parents[:2]]
+    # Of a link to a model where it leads to, that is beside which it was made, and then where it is.
+    folders = [model_dir, *real_path(model_dir).parents[:2], *(Path.cwd() / model_dir).parents[:2]]
     return next((f / "database.db" for f in folders if (f / "database.db").is_file()), None)
 
 
