@@ -181,8 +181,7 @@ def open_cloud(workspace: Workspace) -> Cloud:
     cloud = Cloud(paths, count, layouts[0].kind, _have_visibility(paths, layouts))
     if not cloud.has_colours:
         logger.warning(
-            "%s has no colours as this program reads them (red, green and blue of type uchar): what is made of it "
-            "has none",
+            "%s has no colours as this program reads them (red, green and blue of type uchar); none are taken",
             paths[0],
         )
     return cloud
