@@ -1,5 +1,7 @@
 """What stands still while the camera turns is not of the scene: it gets no depth, and this is told."""
 
+import threading
+import time
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
@@ -245,3 +247,26 @@ def test_keep_blank_matches_the_room_too(model, tmp_path):
     report = colmap_sph.run(model, output=tmp_path / "dense", options=options)
     assert not report.still
     assert share_off(Workspace(tmp_path / "dense")) > 0.05
+
+
+@pytest.mark.parametrize(("memory", "most"), [("", 3), ("1KiB", 1)])
+def test_images_are_read_at_once_as_memory_allows(tmp_path, monkeypatch, memory, most):
+    cameras = ring(IMAGES, 2, 0.7)
+    views = views_of(cameras)
+    context = context_of(tmp_path, [photograph(egg(), cameras[0], 0)[0]] * IMAGES, views)
+    context = replace(context, options=replace(context.options, memory=memory, threads=3))
+    small, lock = photo.read_small, threading.Lock()
+    reading: list[int] = [0]
+
+    def read(path: Path, side: int) -> photo.Mask:
+        with lock:
+            reading.append(reading[-1] + 1)
+        time.sleep(0.02)
+        found = small(path, side)
+        with lock:
+            reading.append(reading[-1] - 1)
+        return found
+
+    monkeypatch.setattr("colmap_sph.pipeline.input.standing.read_small", read)
+    assert still_images(context) == IMAGES
+    assert max(reading) == most
