@@ -1,7 +1,10 @@
 """Idle threads help."""
 
+import gc
 import threading
+import weakref
 
+import numpy as np
 import pytest
 
 from colmap_sph.stereo.search.idle import at_once, busy, lending
@@ -38,3 +41,51 @@ def test_the_error_of_a_part_is_raised():
         for threads in (0, 2):
             with lending(threads), pytest.raises(MemoryError, match="of a part"):
                 at_once(*order)
+
+
+def test_the_error_of_a_part_keeps_no_memory():
+    """Its traceback knows all arrays of the part: they go with the error, not when garbage is looked for."""
+    arrays = []
+
+    def wrong():
+        array = np.zeros(10)
+        arrays.append(weakref.ref(array))
+        raise MemoryError("of a part")
+
+    gc.disable()
+    try:
+        for threads in (0, 2):
+            with lending(threads), pytest.raises(MemoryError):
+                at_once(wrong, int, wrong)
+            assert arrays and all(array() is None for array in arrays)
+    finally:
+        gc.enable()
+
+
+def test_who_begins_its_own_work_waits_for_who_helps():
+    """Two threads are two at a time, also where one gets work of its own while it helps the other."""
+    begun, end, own = threading.Barrier(3, timeout=20), threading.Event(), threading.Event()
+
+    def part():
+        begun.wait()
+        assert end.wait(20)
+
+    def helped():
+        with busy():
+            at_once(part, part)
+
+    def has_work():
+        with busy():
+            own.set()
+
+    with lending(2):
+        first = threading.Thread(target=helped)
+        first.start()
+        begun.wait()
+        second = threading.Thread(target=has_work)
+        second.start()
+        assert not own.wait(0.2)
+        end.set()
+        assert own.wait(20)
+        first.join()
+        second.join()

@@ -123,6 +123,22 @@ def test_what_earlier_work_has_left_behind_refuses_nothing(monkeypatch: pytest.M
         gate.check(3 * GIB, "the pair e - f")
 
 
+def test_a_pair_has_memory_for_two_images_that_are_read_at_once(tmp_path: Path) -> None:
+    """As a thread that is idle reads one of them; a single thread reads one after the other."""
+    context = make_context(prepare(make_project(tmp_path), tmp_path / "dense"))
+    pair = (NAMES[0], NAMES[1])
+
+    def needed(threads: int) -> float:
+        soft = replace(
+            context, details=dict.fromkeys(NAMES, 0.3), options=replace(context.options, threads=threads)
+        )
+        return MatchStage(soft, [pair]).job(pair).cost.memory
+
+    # While one is read: its colours, whole grey values and what corners are found by.
+    pixels = context.scene.view(NAMES[0]).num_pixels
+    assert 10 * pixels < needed(2) - needed(1) < 13 * pixels
+
+
 def test_a_dry_run_refuses_no_images_that_it_has_not_seen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import oracle
+import psutil
 import pytest
 
 from colmap_sph import _native
@@ -890,6 +891,19 @@ def test_sources_of_impossible_width_are_refused(function, width, message):
 def test_bands_that_are_not_among_the_rows_are_refused(function, change):
     with pytest.raises(ValueError, match=r"row|scratch|state|multiple"):
         call(function, {**arguments(function), **change})
+
+
+@every_backend
+def test_the_size_of_a_state_is_told_without_memory_for_one(backend):
+    """Where memory is refused, functions say that, and not that the state they are given has another size."""
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + (64 << 20), before[1]))
+    try:
+        (size,) = _native.sweep_bytes(backend, 65535, 1024)
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, before)
+    assert size >= 3 * 65535 * 1024  # at least three paths come from the row before
 
 
 @pytest.mark.parametrize("change", [{"first": -1}, {"first": 6}, {"out census": np.zeros((H, W + 2), np.uint64)}])

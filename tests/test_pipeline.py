@@ -465,9 +465,12 @@ def test_all_cores_by_default() -> None:
 
 
 def test_a_pair_may_take_most_of_the_budget(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Caches and scratch memory take of what the largest pair leaves: two images do with twice a pair's bytes."""
+    """Caches and scratch memory take of what the largest pair leaves: it is matched in twice its bytes."""
     keep_images(project, NADIR[:2])
     monkeypatch.setattr("colmap_sph.pipeline.memory.resident", lambda: 0)
-    memory = f"{int(1.8 * _MATCH_BYTES * 320 * 240)}"
-    report = colmap_sph.run(project / "sparse" / "0", options=replace(FEW_PAIRS, memory=memory))
-    assert report.pairs == 1 and not report.skipped_pairs
+    workspace = prepare(project / "sparse/0", project / "dense")
+    options = replace(FEW_PAIRS, memory=f"{int(1.8 * _MATCH_BYTES * 320 * 240)}")
+    scene = anchored(read_scene(workspace.sparse_dir))
+    pairs = select_pairs(scene, options.pairs).unique_pairs()
+    context = with_good_images(Context(workspace, scene, options, Keys(workspace, options)), execute)
+    assert list(execute(MatchStage(context, pairs))) == pairs == [tuple(NADIR[:2])]

@@ -14,7 +14,6 @@ import pytest
 import colmap_sph
 from colmap_sph import synthetic as syn
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.input import standing
 from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
@@ -128,30 +127,6 @@ def test_an_object_with_eight_equal_sides_is_matched(tmp_path):
     assert still_images(context_of(tmp_path, pictures[:1] * 16, views_of(cameras))) == 16
     # And all there are, where each of its sides has one.
     assert not still_images(context_of(tmp_path, pictures[:1] * 8, views_of(cameras[::2])))
-
-
-def test_no_more_images_are_read_at_once_than_memory_allows(tmp_path, monkeypatch):
-    """Two of them here: what is no JPEG is decoded whole, also to be seen small."""
-    picture = np.full((HEIGHT, WIDTH), 100, np.uint8)
-    context = context_of(tmp_path, [picture] * 16, views_of(ring(16, 2, 0.7)))
-    context = replace(context, options=RunOptions(threads=8, memory="2GiB"))
-    reading, most, lock = 0, 0, threading.Lock()
-    read_small = standing.read_small
-
-    def read(path, longest):
-        nonlocal reading, most
-        with lock:
-            reading += 1
-            most = max(most, reading)
-        time.sleep(0.05)
-        with lock:
-            reading -= 1
-        return read_small(path, longest)
-
-    monkeypatch.setattr(standing, "read_small", read)
-    monkeypatch.setattr(standing, "_READ_BYTES", 0.9 * 2**30 / picture.size)
-    still_images(context)
-    assert most == 2
 
 
 def test_images_that_others_are_compared_with_are_read_once(tmp_path, monkeypatch):
@@ -272,3 +247,26 @@ def test_keep_blank_matches_the_room_too(model, tmp_path):
     report = colmap_sph.run(model, output=tmp_path / "dense", options=options)
     assert not report.still
     assert share_off(Workspace(tmp_path / "dense")) > 0.05
+
+
+@pytest.mark.parametrize(("memory", "most"), [("", 3), ("1KiB", 1)])
+def test_images_are_read_at_once_as_memory_allows(tmp_path, monkeypatch, memory, most):
+    cameras = ring(IMAGES, 2, 0.7)
+    views = views_of(cameras)
+    context = context_of(tmp_path, [photograph(egg(), cameras[0], 0)[0]] * IMAGES, views)
+    context = replace(context, options=replace(context.options, memory=memory, threads=3))
+    small, lock = photo.read_small, threading.Lock()
+    reading: list[int] = [0]
+
+    def read(path: Path, side: int) -> photo.Mask:
+        with lock:
+            reading.append(reading[-1] + 1)
+        time.sleep(0.02)
+        found = small(path, side)
+        with lock:
+            reading.append(reading[-1] - 1)
+        return found
+
+    monkeypatch.setattr("colmap_sph.pipeline.input.standing.read_small", read)
+    assert still_images(context) == IMAGES
+    assert max(reading) == most

@@ -24,7 +24,6 @@
         return select_rows(&rows_##version, aggregated, base, reference, target, columns, size, check, \
                            offset); \
     } \
-    static size_t sweep_bytes_##version(match_size size) { return sweep_bytes_of_rows(&rows_##version, size); } \
     static int sweep_##version(const match_input *input, row_band band, int backward, uint8_t *state) { \
         return sweep_over_rows(&rows_##version, input, band, backward, state); \
     } \

@@ -45,12 +45,16 @@ static void path_step(const uint8_t *cost, const uint8_t *before, ptrdiff_t dept
     }
 }
 
+size_t sweep_bytes_scalar(match_size size) {
+    /* This row and the one before, of four paths; and a pixel's detours. */
+    return (size_t)((8 * size.width + 1) * size.depth);
+}
+
 int sweep_begin_scalar(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
                        path_penalties penalties, int backward) {
     *state =
         (sweep_state){.base = base, .image = image, .size = size, .penalties = penalties, .backward = backward};
-    /* This row and the one before, of four paths; and a pixel's detours. */
-    state->memory_size = (size_t)((8 * size.width + 1) * size.depth);
+    state->memory_size = sweep_bytes_scalar(size);
     state->memory = allocate_aligned(64, state->memory_size);
     return state->memory ? 0 : -1;
 }

@@ -74,6 +74,15 @@ static void clear_place(const sweep_state *s, ptrdiff_t place, int k) {
     memset(slots_of(s, place, k), 0, (size_t)s->size.depth);
 }
 
+size_t VERSION_OF(sweep_bytes)(match_size size) {
+#if BYTES == 64
+    if (size.depth % BYTES) { /* as below */
+        return sweep_bytes_avx2(size);
+    }
+#endif
+    return VERTICAL_PATHS * path_bytes(size);
+}
+
 int VERSION_OF(sweep_begin)(sweep_state *state, const int32_t *base, const uint8_t *image, match_size size,
                             path_penalties penalties, int backward) {
 #if BYTES == 64
@@ -83,7 +92,7 @@ int VERSION_OF(sweep_begin)(sweep_state *state, const int32_t *base, const uint8
 #endif
     *state =
         (sweep_state){.base = base, .image = image, .size = size, .penalties = penalties, .backward = backward};
-    state->memory_size = VERTICAL_PATHS * path_bytes(size);
+    state->memory_size = VERSION_OF(sweep_bytes)(size);
     state->memory = allocate_aligned(64, state->memory_size + PENALTIES + ROWS * 3 * notes_bytes(size));
     if (!state->memory) {
         return -1;

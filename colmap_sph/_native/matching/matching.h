@@ -105,7 +105,7 @@ typedef struct {
     ptrdiff_t first, end, above, below;
 } row_band;
 
-/* What a sweep brings from a band to the next one, bytes; 0 without memory. */
+/* Bytes of what a sweep brings from a band to the next one. */
 typedef size_t sweep_bytes_fn(match_size size);
 
 /* A sweep over a band for that alone, from `state` to `state`, which is not read at the first of the image's rows.

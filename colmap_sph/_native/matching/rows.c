@@ -207,16 +207,6 @@ static void matcher_end(matcher *m) {
     free_aligned(m->forward.memory);
 }
 
-size_t sweep_bytes_of_rows(const row_kernels *kernels, match_size size) {
-    static const uint8_t p2[256];
-    sweep_state state;
-    const int status = kernels->sweep_begin(&state, NULL, NULL, size, (path_penalties){.p2 = p2}, 0);
-    if (!status) {
-        free_aligned(state.memory);
-    }
-    return status ? 0 : state.memory_size;
-}
-
 /* A sweep goes on where `state` was noted. */
 static void resume(sweep_state *sweep, ptrdiff_t done, const uint8_t *state) {
     sweep->done = done;

@@ -84,6 +84,7 @@ typedef struct {
 } row_kernels;
 
 cost_row_fn cost_row_scalar, cost_row_avx2, cost_row_avx512, cost_row_neon;
+sweep_bytes_fn sweep_bytes_scalar, sweep_bytes_avx2, sweep_bytes_avx512, sweep_bytes_neon;
 sweep_begin_fn sweep_begin_scalar, sweep_begin_avx2, sweep_begin_avx512, sweep_begin_neon;
 sweep_rows_fn sweep_rows_scalar, sweep_rows_avx2, sweep_rows_avx512, sweep_rows_neon;
 selection_row_fn selection_row_scalar, selection_row_avx2, selection_row_avx512, selection_row_neon;
@@ -95,7 +96,6 @@ int aggregate_rows(const row_kernels *kernels, const uint8_t *cost, const int32_
 int select_rows(const row_kernels *kernels, const uint8_t *aggregated, const int32_t *base,
                 const uint64_t *reference, const uint64_t *target, const int32_t *columns, match_size size,
                 left_right_check check, int32_t *offset);
-size_t sweep_bytes_of_rows(const row_kernels *kernels, match_size size);
 int sweep_over_rows(const row_kernels *kernels, const match_input *input, row_band band, int backward,
                     uint8_t *state);
 int match_rows(const row_kernels *kernels, const match_input *input, row_band band, uint8_t *forward,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.stages.photo import read_small
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.scene import View
@@ -21,8 +22,8 @@ logger = logging.getLogger(__name__)
 
 # Images are looked at with so many pixels along their longest side.
 _LOOKED_AT = 320
-# Largest bytes in use per pixel while an image is read.
-_READ_BYTES = 25.0
+# Largest bytes in use, per pixel of its own, while an image is read.
+_READ_BYTES = 25
 # Side of what is left out around masked pixels: windows there show these, too.
 _SIDE = 9
 # A smaller share of a camera's images may look alike by chance.
@@ -84,14 +85,21 @@ def _still_shares(
                 return float(still[wanted].mean())
         return None
 
-    needed = sorted({*compared, *beside.values()})
-    largest = _READ_BYTES * max((context.scene.view(name).num_pixels for name in needed), default=1)
-    fitting = int(context.options.memory_budget / largest)
-    with ThreadPoolExecutor(min(max(fitting, 1), context.options.num_threads)) as pool:
-        list(pool.map(read, needed))
+    looked_at = sorted({*compared, *beside.values()})
+    with ThreadPoolExecutor(_readers(context, looked_at)) as pool:
+        list(pool.map(read, looked_at))
         names = sorted(turned.keys() & beside.keys() & small.keys())
         shares = dict(zip(names, pool.map(share, names), strict=True))
     return {name: found for name, found in shares.items() if found is not None}
+
+
+def _readers(context: Context, names: Sequence[str]) -> int:
+    """How many threads read images at a time: as many as memory allows."""
+    options = context.options
+    sizes = [context.scene.view(name).file_size for name in names]
+    largest = max((_READ_BYTES * width * height for width, height in sizes), default=1)
+    free = MemoryGate(options.memory_budget, options.num_threads).free
+    return max(min(options.num_threads, free // largest), 1)
 
 
 def _wanted(context: Context, name: str, shape: tuple[int, ...]) -> NDArray[np.bool_]:

@@ -260,10 +260,9 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         trial = self._trial(left, right, geometry) if is_first else 1.0
         key = context.keys.pair(left, right, geometry, seeds, trial, context.still)
         left_pixels = geometry.height * geometry.left_width
-        pixels = max(left.num_pixels, right.num_pixels)
-        views = (*left.views, *right.views)
-        still = max((still_bytes(view) for view in views if view.name in context.still), default=0.0)
-        reading = max(_READ_BYTES * pixels, bytes_to_reduce(*views), still)
+        of_sides = [self._reading_bytes(side) for side in (left, right)]
+        # Both at once, where a thread is idle.
+        reading = sum(of_sides) if context.options.num_threads > 1 else max(of_sides)
         both_pixels = left_pixels + geometry.height * geometry.right_width
         cost = Cost(
             seconds=match_seconds(both_pixels) + (match_seconds(trial**2 * both_pixels) if trial < 1 else 0.0),
@@ -283,6 +282,11 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
             key,
         )
         return task, cost
+
+    def _reading_bytes(self, side: Photograph) -> float:
+        """Largest bytes in use while one side of a pair is read."""
+        still = max((still_bytes(view) for view in side.views if view.name in self.context.still), default=0.0)
+        return max(_READ_BYTES * side.num_pixels, bytes_to_reduce(*side.views), still)
 
     def _geometry(self, left: Photograph, right: Photograph) -> RectifiedPair:
         try:
@@ -341,11 +345,13 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
 
     def kept_memory(self, gate: "MemoryGate") -> Kept:
         """Scratch memory and caches take of what the largest pair leaves, but never starve."""
-        views = self.context.scene.views
-        largest = max(photograph.num_pixels for photograph in self.context.scene.photographs)
+        views, photographs = self.context.scene.views, self.context.scene.photographs
+        largest = max(photograph.num_pixels for photograph in photographs)
         finest = max(sampling_of(self._detail(view)) for view in views)
         share = _RECTIFIED_SHARE * (finest * self.context.options.rectification.sampling) ** 2
-        spare = int(max(gate.spare(share * _MATCH_BYTES * largest), gate.free / 8))
+        reading = min(gate.threads, 2) * max(map(self._reading_bytes, photographs))
+        needed = max(share * _MATCH_BYTES * largest, reading + share * _RECTIFIED_BYTES * largest)
+        spare = int(max(gate.spare(needed), gate.free / 8))
         scratch = min(_SCRATCH_BYTES, spare // (3 * gate.threads))
         paths = (self.context.workspace.image_path(view.name) for view in views)
         whole = sum(view.num_pixels * (grey_bytes(path) + 1) for view, path in zip(views, paths, strict=True))

@@ -11,7 +11,7 @@ from typing import TypeVar
 
 T = TypeVar("T")
 
-_lock = threading.Lock()
+_changed = threading.Condition()
 _idle = 0
 
 
@@ -27,8 +27,12 @@ def lending(threads: int) -> Iterator[None]:
 
 @contextmanager
 def busy() -> Iterator[None]:
-    """One of the threads has its own work."""
-    _change(-1)
+    """One of the threads has its own work; where all help others it begins when the first of them is done.
+
+    So never more work at a time than there are threads, whose memory is planned.
+    """
+    with _changed:
+        _changed.wait_for(_take)
     try:
         yield
     finally:
@@ -56,8 +60,11 @@ def at_once(*parts: Callable[[], T]) -> list[T]:
     work()
     for helper in helpers:
         helper.join()
-    if errors:
-        raise errors[0]
+    try:
+        if errors:
+            raise errors[0]
+    finally:
+        errors.clear()  # or this frame and their tracebacks keep each other, and all arrays of the parts
     return [results[number] for number in range(len(parts))]
 
 
@@ -83,7 +90,7 @@ def _help(work: Callable[[], None]) -> None:
 
 def _take() -> bool:
     global _idle
-    with _lock:
+    with _changed:
         if _idle < 1:
             return False
         _idle -= 1
@@ -92,5 +99,6 @@ def _take() -> bool:
 
 def _change(threads: int) -> None:
     global _idle
-    with _lock:
+    with _changed:
         _idle += threads
+        _changed.notify_all()
