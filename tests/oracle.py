@@ -356,8 +356,7 @@ def transfer_disparity(left, max_step, right_width):
 def vote_depth(depths, sigmas, tolerance, stations):
     """Depth, sigma, support, and the least distance of any pair of candidates from the gate, per pixel.
 
-    Candidates of one station count as one, with the mean of their weights and weighted inverse depths. A standard
-    deviation is that of an inverse depth, the same wherever the candidate came to lie.
+    Candidates of one station count as one, with the mean of their weights and weighted depths.
     """
     stations = np.asarray(stations)
     shape = depths.shape[1:]
@@ -377,11 +376,10 @@ def vote_depth(depths, sigmas, tolerance, stations):
         # Most friends first, then the smallest variance, then the first.
         centre = min(range(len(z)), key=lambda k: (-len(set(at[agree[k]])), variance[k], k))
         members = [agree[centre] & (at == station) for station in sorted(set(at[agree[centre]]))]
-        inverse_variance = variance / z**4
-        weights = [np.mean(1 / inverse_variance[own]) for own in members]
-        weighted = [np.mean(1 / z[own] / inverse_variance[own]) for own in members]
-        depth[pixel] = sum(weights) / sum(weighted)
-        sigma[pixel] = sum(weights) ** -0.5 * depth[pixel] ** 2
+        weights = [np.mean(1 / variance[own]) for own in members]
+        weighted = [np.mean(z[own] / variance[own]) for own in members]
+        depth[pixel] = sum(weighted) / sum(weights)
+        sigma[pixel] = sum(weights) ** -0.5
         support[pixel] = len(members)
     return depth, sigma, support, clearance
 

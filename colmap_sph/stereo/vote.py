@@ -2,7 +2,7 @@
 
 Each pair gives one depth candidate per pixel, read along the pixel's ray from the pair's disparity map, with a
 standard deviation from its geometry. The candidates vote: the largest mutually consistent cluster wins, and its
-weighted mean, of inverse depths, is the *photometric* depth.
+weighted mean is the *photometric* depth.
 """
 
 import math

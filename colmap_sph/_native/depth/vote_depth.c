@@ -91,9 +91,7 @@ static inline cluster largest_cluster(const candidates *found, ptrdiff_t number,
 }
 
 /* Weighted mean of what agrees with the centre of the cluster, and its variance; each station has the mean weight
- * of its candidates. The centre's stations are counted anew: as many. Errors are even in inverse depth, and a
- * depth's standard deviation grows with its square: the mean is that of inverse depths, and deviations are brought
- * to the centre's depth, or what came out too near would weigh more. */
+ * of its candidates. The centre's stations are counted anew: as many. */
 static inline void mean_of_cluster(const candidates *found, ptrdiff_t number, const cluster *centre,
                                    float tolerance_squared, float_lanes *mean, float_lanes *variance) {
     const float_lanes none = {0};
@@ -101,10 +99,8 @@ static inline void mean_of_cluster(const candidates *found, ptrdiff_t number, co
     for (ptrdiff_t b = 0; b < number; b++) {
         const candidates *c = &found[b];
         const int_lanes counts = agree(c, centre->depth, centre->variance, tolerance_squared);
-        const float_lanes nearer = centre->depth / c->depth, squared = nearer * nearer;
-        const float_lanes own_weight = 1 / (c->variance * squared * squared);
-        own_sum += chosen(counts, (nearer - 1) * own_weight, none);
-        own_weights += chosen(counts, own_weight, none);
+        own_sum += chosen(counts, (c->depth - centre->depth) / c->variance, none);
+        own_weights += chosen(counts, 1 / c->variance, none);
         members += chosen(counts, none + 1, none);
         if (c->ends_station) {
             const int_lanes some = (int_lanes)(members > 0);
@@ -113,9 +109,8 @@ static inline void mean_of_cluster(const candidates *found, ptrdiff_t number, co
             own_sum = own_weights = members = none;
         }
     }
-    const float_lanes farther = 1 / (1 + sum / weights), squared = farther * farther;
-    *mean = centre->depth * farther;
-    *variance = squared * squared / weights;
+    *mean = centre->depth + sum / weights;
+    *variance = 1 / weights;
 }
 
 int VERSION_OF(vote_depth)(const float *depths, const float *sigmas, const int32_t *stations, ptrdiff_t pairs,
