@@ -3,6 +3,7 @@
 import gc
 import threading
 import weakref
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,7 +13,12 @@ from colmap_sph.stereo.search.idle import at_once, busy, lending
 
 def test_parts_are_done_in_their_order_where_no_thread_is_idle():
     done = []
-    assert at_once(*(lambda part=part: done.append(part) or part**2 for part in range(5))) == [0, 1, 4, 9, 16]
+
+    def square(part):
+        done.append(part)
+        return part**2
+
+    assert at_once(*(partial(square, part) for part in range(5))) == [0, 1, 4, 9, 16]
     assert done == [0, 1, 2, 3, 4]
 
 

@@ -796,16 +796,18 @@ def run_match(backend, images, bases_, image, p1, p2, max_slant, check: tuple[in
         for number in numbers:
             *arrays, place = given(number)
             states.append(states[-1].copy())
-            penalties = p1, p2, max_slant
-            _native.sweep(backend, *arrays[:2], *arrays[3:], depth, *penalties, *place, backward, states[-1])
+            arguments = [*arrays[:2], *arrays[3:], depth, p1, p2, max_slant, *place, backward, states[-1]]
+            _native.sweep(backend, *arguments)
         return states
 
     def match(number, forward, backward):
         *arrays, (first, end, above, below) = given(number)
         scratch = np.full((2, (end - first) * image.shape[1], depth), 77, dtype=np.uint8)
         found = np.full((end - first, image.shape[1]), 5, dtype=np.int32)
-        limits = p1, p2, max_slant, *check, first, above, below
-        _native.match(backend, *arrays[:3], width, *arrays[3:], *limits, forward, backward, scratch, found)
+        limits = p1, p2, max_slant, *check
+        place = first, above, below
+        arguments = [*arrays[:3], width, *arrays[3:], *limits, *place, forward, backward, scratch, found]
+        _native.match(backend, *arguments)
         offset[slice(*bands[number])] = found
 
     downwards = swept(range(middle), backward=False)
