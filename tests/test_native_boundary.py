@@ -7,7 +7,6 @@ import re
 
 import numpy as np
 import oracle
-import psutil
 import pytest
 
 from colmap_sph import _native
@@ -896,7 +895,7 @@ def test_bands_that_are_not_among_the_rows_are_refused(function, change):
 @every_backend
 def test_the_size_of_a_state_is_told_without_memory_for_one(backend):
     """Where memory is refused, functions say that, and not that the state they are given has another size."""
-    resource = pytest.importorskip("resource")
+    resource, psutil = map(pytest.importorskip, ("resource", "psutil"))
     before = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (psutil.Process().memory_info().vms + (64 << 20), before[1]))
     try:
