@@ -235,6 +235,8 @@ class BandMatcher:
         """(H, W) int32 offsets to columns of the right image, 1/256 pixel, fitted to the raw costs or not."""
         self._fit = fit
         self.target_offset()
+        if not fit:
+            return self._offset
         for first, _ in self._bands[1:]:
             low, high = max(first - 2 * _FIT_ROWS, 0), min(first + 2 * _FIT_ROWS, self._height)
             found = np.stack([self._beside[row] for row in range(low, high)])
@@ -298,7 +300,7 @@ class BandMatcher:
         if self._fit is None:
             self._offset[first:end] = found
             return
-        near = 2 * _FIT_ROWS
+        near = 2 * _FIT_ROWS if self._fit else 0
         for row in {*range(first, min(first + near, end)), *range(max(end - near, first), end)}:
             self._beside[row] = found[row - first].copy()
         self._keep(found, rows.rows(slice(band.first, band.end)), first, end)
@@ -310,8 +312,9 @@ class BandMatcher:
         return self._level.rows(low, high), Band(first - low, end - low, first, self._height - end)
 
     def _keep(self, found: NDArray[np.int32], rows: LevelRows, first: int, end: int) -> None:
-        """Set the offsets of the rows from `first` to before `end` that are not next to the ends of these."""
-        kept = slice(first + _FIT_ROWS * (first > 0), end - _FIT_ROWS * (end < self._height))
+        """Set the offsets of the rows from `first` to before `end`; none is fitted next to the ends of these."""
+        near = _FIT_ROWS if self._fit else 0
+        kept = slice(first + near * (first > 0), end - near * (end < self._height))
         if kept.start < kept.stop:
             own = slice(kept.start - first, kept.stop - first)
             fitted = rows.fitted(found) if self._fit else found
