@@ -188,10 +188,11 @@ def depth_on_disk(path: Path) -> NDArray[np.float32]:
     return np.memmap(path, "<f4", "r", header, shape)
 
 
-def has_depth(path: Path) -> bool:
-    """Whether a depth map has a depth anywhere; it is read as far as the first one."""
+def has_depth(path: Path, *, possible: bool = False) -> bool:
+    """Whether a depth map has a depth anywhere, or a possible one; it is read as far as the first one."""
     values = depth_on_disk(path).reshape(-1)
-    return any((values[first : first + _BAND_VALUES] > 0).any() for first in range(0, len(values), _BAND_VALUES))
+    bands = (values[first : first + _BAND_VALUES] for first in range(0, len(values), _BAND_VALUES))
+    return any((is_depth(band) if possible else band > 0).any() for band in bands)
 
 
 def is_depth(values: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, NoResultError, shell_word
 from colmap_sph.project.map_files import (
     depth_if_readable,
-    depth_on_disk,
+    has_depth,
     is_depth,
     map_size,
     read_depth_map,
@@ -87,7 +87,7 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
         path = workspace.depth_map_path(view.name, "geometric")
         if not path.is_file():
             missing += 1
-        elif is_depth(depth_on_disk(path)).any():
+        elif has_depth(path, possible=True):
             views.append(at_map_size(view, path))
     if not views:
         raise no_maps(workspace, are_missing=missing == len(scene.views))
