@@ -133,6 +133,12 @@ def state(rng: Random, kernels: str, width: int, depth: int) -> np.ndarray:
     return rng.integers(0, 193, _native.sweep_bytes(kernels, width, depth)).astype(np.uint8)
 
 
+def band_of(rng: Random, rows: int) -> list[int]:
+    """Rows from the first to before the end, and how many of the image lie above and below."""
+    first, end = sorted(rng.integers(0, rows + 1, 2).tolist())
+    return [first, end, *(int(rng.integers(0, 9)) if inside else 0 for inside in (first > 0, end < rows))]
+
+
 def sweep_bytes(rng: Random) -> Arguments:
     return [backend(rng), int(rng.integers(0, 70)), 32 * int(rng.integers(1, 33))]
 
@@ -140,9 +146,7 @@ def sweep_bytes(rng: Random) -> Arguments:
 def sweep(rng: Random) -> Arguments:
     (h, w, depth), words, images, penalties = band_inputs(rng)
     kernels = backend(rng)
-    first, end = sorted(rng.integers(0, h + 1, 2).tolist())
-    beside = [int(rng.integers(0, 9)) if inside else 0 for inside in (first > 0, end < h)]
-    band = [first, end, *beside, bool(rng.random() < 0.5)]
+    band = [*band_of(rng, h), bool(rng.random() < 0.5)]
     return [kernels, *words, *images, depth, *penalties, *band, state(rng, kernels, w, depth)]
 
 
@@ -151,8 +155,7 @@ def match(rng: Random) -> Arguments:
     kernels = backend(rng)
     shown = source_columns(rng, words[1].shape)
     limits = rng.integers(0, (5, 99)).tolist()
-    first, end = sorted(rng.integers(0, h + 1, 2).tolist())
-    beside = [int(rng.integers(0, 9)) if inside else 0 for inside in (first > 0, end < h)]
+    first, end, *beside = band_of(rng, h)
     outputs = [np.zeros((2, (end - first) * w, depth), np.uint8), np.zeros((end - first, w), np.int32)]
     states = [state(rng, kernels, w, depth) for _ in range(2)]
     return [kernels, *words, *shown, *images, *penalties, *limits, first, *beside, *states, *outputs]
