@@ -41,6 +41,8 @@ P2 = np.round(OPTIONS.p2_min + (OPTIONS.p2 - OPTIONS.p2_min) / (1 + np.arange(25
 OFFSET_INVALID = np.iinfo(np.int32).min
 
 REGISTER_BYTES = {"avx2": 32, "avx512": 64}
+MATCHES_AS = {"avx512bw": "avx2"}
+"""Version → the one whose matching kernels it has."""
 # Bytes of the volumes read and written per slot; that stored lines are first read into the cache is not counted.
 # All volumes have 1 byte per slot. `aggregation` reads costs twice, writes and reads what the forward paths add to
 # them, and writes sums; `match` writes and reads costs and what the forward paths add, but sums stay in the cache.
@@ -497,8 +499,9 @@ def bench(width: int, height: int, disparities: int, runs: int) -> None:
     print(table(header, comparison))
     if share < 0.95:
         print(f"\nOnly {100 * share:.0f} % of the time on a processor: other programs share its caches, too.")
-    if backends[0] in REGISTER_BYTES:
-        print_limits(backends[0], [timing for timing in timings if timing.depth])
+    version = MATCHES_AS.get(backends[0], backends[0])
+    if version in REGISTER_BYTES:
+        print_limits(version, [timing for timing in timings if timing.depth])
 
 
 def main() -> None:

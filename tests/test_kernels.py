@@ -140,7 +140,7 @@ shares = st.sampled_from([0.0, 0.3, 1.0])
 
 def test_scalar_kernels_are_always_there():
     assert BACKENDS[-1] == "scalar"
-    assert set(BACKENDS) <= {"avx512", "avx2", "neon", "scalar"}
+    assert set(BACKENDS) <= {"avx512", "avx512bw", "avx2", "neon", "scalar"}
 
 
 # ---- census ------------------------------------------------------------------------------------------------

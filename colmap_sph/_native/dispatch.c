@@ -61,6 +61,17 @@ WHOLE_IMAGES(avx2)
 static const kernel_table avx2_kernels = TABLE(avx2);
 #endif
 
+#ifdef COLMAP_SPH_HAVE_AVX512BW
+/* These instructions alone do not match faster than AVX2's. */
+#define cost_avx512bw cost_avx2
+#define aggregation_avx512bw aggregation_avx2
+#define selection_avx512bw selection_avx2
+#define match_avx512bw match_avx2
+#define sweep_bytes_avx512bw sweep_bytes_avx2
+#define sweep_avx512bw sweep_avx2
+static const kernel_table avx512bw_kernels = TABLE(avx512bw);
+#endif
+
 #ifdef COLMAP_SPH_HAVE_AVX512
 WHOLE_IMAGES(avx512)
 static const kernel_table avx512_kernels = TABLE(avx512);
@@ -83,11 +94,14 @@ WHOLE_IMAGES(neon)
 static const kernel_table neon_kernels = TABLE(neon);
 #endif
 
-const char *const kernel_names[] = {"avx512", "avx2", "neon", "scalar", NULL};
+const char *const kernel_names[] = {"avx512", "avx512bw", "avx2", "neon", "scalar", NULL};
 
 const char *const missing_kernels[] = {
 #if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX512)
     "avx512",
+#endif
+#if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX512BW)
+    "avx512bw",
 #endif
 #if defined(__x86_64__) && !defined(COLMAP_SPH_HAVE_AVX2)
     "avx2",
@@ -109,6 +123,11 @@ const kernel_table *kernels_by_name(const char *name) {
 #ifdef COLMAP_SPH_HAVE_AVX2
     if (strcmp(name, "avx2") == 0 && processor_has_avx2()) {
         return &avx2_kernels;
+    }
+#endif
+#ifdef COLMAP_SPH_HAVE_AVX512BW
+    if (strcmp(name, "avx512bw") == 0 && processor_has_avx512bw()) {
+        return &avx512bw_kernels;
     }
 #endif
 #ifdef COLMAP_SPH_HAVE_AVX512

@@ -48,10 +48,14 @@ static int runs_avx2(void) {
            system_keeps(XMM_AND_YMM);
 }
 
+static int runs_avx512bw(void) {
+    return runs_avx2() && system_keeps(AVX512_STATE) &&
+           has_bits(read_leaf(7).ebx, bit_AVX512F | bit_AVX512DQ | bit_AVX512BW | bit_AVX512VL);
+}
+
 static int runs_avx512(void) {
     const cpuid_leaf leaf = read_leaf(7);
-    return runs_avx2() && system_keeps(AVX512_STATE) &&
-           has_bits(leaf.ebx, bit_AVX512F | bit_AVX512DQ | bit_AVX512IFMA | bit_AVX512BW | bit_AVX512VL) &&
+    return runs_avx512bw() && has_bits(leaf.ebx, bit_AVX512IFMA) &&
            has_bits(leaf.ecx, bit_AVX512VBMI | bit_AVX512VPOPCNTDQ);
 }
 
@@ -73,6 +77,11 @@ static int kept(answer *known, int (*ask)(void)) {
 int processor_has_avx2(void) {
     static answer known;
     return kept(&known, runs_avx2);
+}
+
+int processor_has_avx512bw(void) {
+    static answer known;
+    return kept(&known, runs_avx512bw);
 }
 
 int processor_has_avx512(void) {

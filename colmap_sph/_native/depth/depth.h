@@ -124,11 +124,13 @@ typedef struct {
 typedef void compare_depths_fn(const depth_map *reference, const depth_map *partner, const view_transfer *transfer,
                                consistency_gates gates, const consistency_sums *sums);
 
-depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2, depth_candidates_avx512;
-vote_depth_fn vote_depth_scalar, vote_depth_avx2, vote_depth_avx512;
-compare_depths_fn compare_depths_scalar, compare_depths_avx2, compare_depths_avx512;
-fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512;
-add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512;
+depth_candidates_fn depth_candidates_scalar, depth_candidates_avx2, depth_candidates_avx512bw,
+    depth_candidates_avx512;
+vote_depth_fn vote_depth_scalar, vote_depth_avx2, vote_depth_avx512bw, vote_depth_avx512;
+compare_depths_fn compare_depths_scalar, compare_depths_avx2, compare_depths_avx512bw, compare_depths_avx512;
+fit_planes_fn fit_planes_scalar, fit_planes_avx2, fit_planes_avx512bw, fit_planes_avx512;
+add_patch_equations_fn add_patch_equations_scalar, add_patch_equations_avx2, add_patch_equations_avx512bw,
+    add_patch_equations_avx512;
 
 /* ---- kernels of one version, so that the result never depends on the processor ----------------------------- */
 

@@ -39,8 +39,8 @@ void half_mask(const uint8_t *mask, ptrdiff_t height, ptrdiff_t width, uint8_t *
  * the image go on. -1 without memory. */
 typedef int sharpen_fn(const float *image, ptrdiff_t height, ptrdiff_t width, float sharpening, int16_t *padded);
 
-source_pixels_fn source_pixels_scalar, source_pixels_avx2, source_pixels_avx512;
-resample_fn resample_scalar, resample_avx2, resample_avx512;
-sharpen_fn sharpen_scalar, sharpen_avx2, sharpen_avx512;
+source_pixels_fn source_pixels_scalar, source_pixels_avx2, source_pixels_avx512bw, source_pixels_avx512;
+resample_fn resample_scalar, resample_avx2, resample_avx512bw, resample_avx512;
+sharpen_fn sharpen_scalar, sharpen_avx2, sharpen_avx512bw, sharpen_avx512;
 
 #endif

@@ -1,6 +1,7 @@
 #include <immintrin.h>
 
 #include "matching/census_blocks.h"
+#include "version.h"
 
 enum { LANES = 32, PARTS = 4 };
 
@@ -44,6 +45,6 @@ static inline void census_32_pixels(const int16_t *window, ptrdiff_t stride, uin
     store_words(parts, words);
 }
 
-void census_avx512(census_image image, ptrdiff_t stride, uint64_t *census) {
+void VERSION_OF(census)(census_image image, ptrdiff_t stride, uint64_t *census) {
     census_in_blocks(census_32_pixels, LANES, image, stride, census);
 }

@@ -160,9 +160,10 @@ void search_windows(const int32_t *predicted, const float *least, const float *m
 /* Disparities in pixels, minus the offsets and what `shifts` says by their fraction; NaN where there is none. */
 void to_disparity(const int32_t *offset, ptrdiff_t pixels, const float *shifts, float *disparity);
 
-census_fn census_scalar, census_avx2, census_avx512, census_neon;
-fit_offsets_fn fit_offsets_scalar, fit_offsets_avx2, fit_offsets_avx512;
-mean_offsets_fn mean_offsets_scalar, mean_offsets_avx2, mean_offsets_avx512;
-upsample_offsets_fn upsample_offsets_scalar, upsample_offsets_avx2, upsample_offsets_avx512;
+census_fn census_scalar, census_avx2, census_avx512bw, census_avx512, census_neon;
+fit_offsets_fn fit_offsets_scalar, fit_offsets_avx2, fit_offsets_avx512bw, fit_offsets_avx512;
+mean_offsets_fn mean_offsets_scalar, mean_offsets_avx2, mean_offsets_avx512bw, mean_offsets_avx512;
+upsample_offsets_fn upsample_offsets_scalar, upsample_offsets_avx2, upsample_offsets_avx512bw,
+    upsample_offsets_avx512;
 
 #endif
