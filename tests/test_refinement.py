@@ -1,6 +1,7 @@
 """Refined planes against exact depth of rendered scenes; the kernel against its oracle."""
 
 import shutil
+import tracemalloc
 from dataclasses import replace
 
 import cv2
@@ -13,6 +14,7 @@ from rendered import SIDES, grey
 import colmap_sph
 from colmap_sph import _native
 from colmap_sph import synthetic as syn
+from colmap_sph.pipeline.stages import confirm
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
@@ -631,3 +633,24 @@ def test_small_images_are_matched_as_they_are(size, rows):
 def test_soft_images_with_imprecise_poses_are_matched_at_half_size(detail, pixels, half_size):
     assert suits_half_size(detail, pixels) == half_size
     assert OPTIONS.images_used(9, half_size=half_size) == (9 / 4 if half_size else 9)
+
+
+@pytest.mark.parametrize("half_size", [False, True])
+def test_memory_is_what_is_reserved(half_size):
+    """Two rounds, with planes fitted anew between them: measured with all that is given."""
+    shape = (4096, 256)
+    size = shape[0] * shape[1]
+    K = np.array([[1e4, 0, 128], [0, 1e4, 2048], [0, 0, 1]])
+    view, other = (View(k, str(k), *shape[::-1], K, np.eye(3), np.array([-0.1 * k, 0, 0]), None) for k in (0, 1))
+    images = [np.roll(texture(shape, 1), -k, axis=1) for k in (0, 1)]
+    tracemalloc.start()
+    depth = np.full(shape, 1000, np.float32)
+    estimate = DepthEstimate(depth.copy(), depth / 1000, np.full(shape, 2, np.uint8))
+    normals = np.zeros((*shape, 3), np.float32)
+    normals[..., 2] = -1
+    given = (view, images[0], estimate, normals, depth, [(other, images[1])], OPTIONS)
+    refine_maps(*given, half_size=half_size)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    reserved = confirm._REFINE_BYTES + confirm._HALF_SIZE_BYTES * half_size + confirm._PAIRED_BYTES
+    assert 0.7 * reserved < peak / size < reserved

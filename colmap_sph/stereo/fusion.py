@@ -213,9 +213,12 @@ def fuse_view(
     covered = np.zeros(shape, np.uint8)
     agreeing = np.zeros(shape, np.uint64)
     colour = reference.image.astype(np.uint16)
+    reference = replace(reference, image=reference.image[:0].copy())  # may go: `colour` has it
     indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
     indices[0] = reference.index
-    for bit, partner in enumerate(islice(partners, MAX_PARTNERS)):
+    bit = -1
+    for partner in islice(partners, MAX_PARTNERS):  # `enumerate` would keep one while the next is read
+        bit += 1
         if partner is None:
             continue
         indices[1 + bit] = partner.index
@@ -238,6 +241,7 @@ def fuse_view(
             agreeing,
             colour,
         )
+        del partner
     view = reference.view
     step = max(_BAND_PIXELS // shape[1], 1)
     gates = (options.min_num_pixels, _station_bits(stations))

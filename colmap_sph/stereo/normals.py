@@ -5,6 +5,7 @@ surface gives the plane, hence the normal and a denoised depth.
 """
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from colmap_sph.errors import OptionError
 from colmap_sph.scene import View
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.kernels import backend
+from colmap_sph.stereo.search.idle import at_once
 
 # Rows that are fitted at a time, which bounds the memory for it.
 _BAND_ROWS = 256
@@ -85,17 +87,27 @@ def fit_normals(
     >>> np.allclose(normals, [0, 0, -1], atol=1e-6), np.allclose(fitted, 5)
     (True, True)
     """
-    normals = np.empty((*estimate.depth.shape, 3), dtype=np.float32)
+    normals = np.zeros((*estimate.depth.shape, 3), dtype=np.float32)
+    return normals, fit_normals_anew(view, estimate, options, normals)
+
+
+def fit_normals_anew(
+    view: View, estimate: DepthEstimate, options: NormalOptions, normals: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """As `fit_normals`; changes normals, in place, where a plane fits, and returns the depth of these planes."""
     fitted = np.empty_like(estimate.depth)
-    for first in range(0, view.height, _BAND_ROWS):
+
+    def fit(first: int) -> None:
         end = min(first + _BAND_ROWS, view.height)
         low, high = max(first - options.radius, 0), min(end + options.radius, view.height)
         kept = slice(first - low, end - low)
         band_normals, band_fitted = _fit_rows(view, estimate, low, high, options)
-        normals[first:end] = band_normals[kept]
         fitted[first:end] = band_fitted[kept]
+        np.copyto(normals[first:end], band_normals[kept], where=fitted[first:end, :, None] != 0)
+
+    at_once(*(partial(fit, first) for first in range(0, view.height, _BAND_ROWS)))
     _native.add_relief(estimate.depth, estimate.sigma, fitted)
-    return normals, fitted
+    return fitted
 
 
 def _fit_rows(

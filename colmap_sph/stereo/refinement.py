@@ -9,6 +9,7 @@ Baltsavias, 1988): it uses all images at once, while the disparity maps saw two 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -19,7 +20,8 @@ from colmap_sph.errors import OptionError
 from colmap_sph.scene import View, pixel_transfer
 from colmap_sph.stereo.depth import DepthEstimate
 from colmap_sph.stereo.kernels import backend
-from colmap_sph.stereo.normals import NormalOptions, fit_normals
+from colmap_sph.stereo.normals import NormalOptions, fit_normals_anew
+from colmap_sph.stereo.search.idle import at_once
 
 # Pixels of a tile of so many rows and columns are matched in the same partners, found on one of its rows. The
 # equations of as many rows are in memory at a time. See `depth.h`.
@@ -160,19 +162,23 @@ def refine_maps(
     partners = [(_paired(source_image), pixel_transfer(view, source)) for source, source_image in sources]
     rank = _ranks(view, image, estimate, normals, depth, partners, options)
     K = np.ascontiguousarray(view.K)
+
+    def refine(used: NDArray[np.bool_], first: int) -> None:
+        rows = slice(first, min(first + _TILE, view.height), 1)
+        planes = _planes_of_maps(view, normals, depth, rows)
+        equations = _equations(image, partners, used, planes, rows, options)
+        sigma = _freedom(estimate.sigma[rows], planes, options)
+        slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
+        _native.refine_planes(equations, sigma, slope_sigma, planes)
+        _native.maps_of_planes(planes, K, first, normals, depth)
+
     for done in range(options.rounds):
         if done:
             _smooth_planes(view, estimate, normals, depth, options.smoothing_radius)
         is_last = done == options.rounds - 1
         most = options.max_partners if is_last else min(options.max_partners, _FEW_PARTNERS)
-        for tile, first in enumerate(range(0, view.height, _TILE)):
-            rows = slice(first, min(first + _TILE, view.height), 1)
-            planes = _planes_of_maps(view, normals, depth, rows)
-            equations = _equations(image, partners, rank[:, tile] < most, planes, rows, options)
-            sigma = _freedom(estimate.sigma[rows], planes, options)
-            slope_sigma = np.tan(np.radians(options.slope_freedom)) / float(view.K[0, 0])
-            _native.refine_planes(equations, sigma, slope_sigma, planes)
-            _native.maps_of_planes(planes, K, first, normals, depth)
+        used = rank < most
+        at_once(*(partial(refine, used[:, tile], _TILE * tile) for tile in range(used.shape[1])))
     return normals, depth
 
 
@@ -181,10 +187,8 @@ def _smooth_planes(
 ) -> None:
     """Fit planes anew to the depths that have moved, in place; a pixel without neighbours keeps its plane."""
     moved = replace(estimate, depth=depth)
-    smooth_normals, smooth_depth = fit_normals(view, moved, NormalOptions(radius=radius))
-    there = smooth_depth != 0
-    normals[there] = smooth_normals[there]
-    depth[there] = smooth_depth[there]
+    smooth_depth = fit_normals_anew(view, moved, NormalOptions(radius=radius), normals)
+    np.copyto(depth, smooth_depth, where=smooth_depth != 0)
 
 
 def _refine_at_half_size(

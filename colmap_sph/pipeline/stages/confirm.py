@@ -32,7 +32,7 @@ from colmap_sph.stereo.photographs.fringes import drop_fringes, drop_rims
 from colmap_sph.stereo.refinement import RefinementOptions, refine_maps, suits_half_size
 from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside, is_inside
-from colmap_sph.stereo.region.shown import count_focus
+from colmap_sph.stereo.region.shown import count_shown
 from colmap_sph.stereo.region.window import Window
 
 if TYPE_CHECKING:
@@ -44,9 +44,12 @@ if TYPE_CHECKING:
 _FAINT_SECONDS = 0.05
 _CONFIRM_SECONDS = 0.015
 _REFINE_SECONDS = 0.075
-# Largest bytes in use at a time, per pixel of the image: while it is confirmed, or refined beside grey images.
+# Largest bytes in use at a time, per pixel of the image: while it is confirmed, and more where partners share a
+# station; or refined beside grey images, and more at half its size.
 _CONFIRM_BYTES = 40.0
-_REFINE_BYTES = 55.0
+_STATION_BYTES = 11.0
+_REFINE_BYTES = 36.0
+_HALF_SIZE_BYTES = 20.0
 # Per pixel: of an image and of an estimate in the cache; of a partner's image as refinement reads it.
 _IMAGE_BYTES = 1
 _ESTIMATE_BYTES = 9
@@ -110,27 +113,37 @@ def make_geometric_maps(task: ConfirmTask) -> Facts:
     view = task.reference.view
     whole = task.reference.whole
     mask = read_view_mask(task.mask, whole)
+    planes = _planes(task, view, mask)
+    if view.original:
+        drop_fringes(planes[1])
+        drop_rims(planes[1], None if mask is None else task.reference.window.part(mask))
+    drop_other_depths(planes[1], task.depths)
+    drop_outside(view, planes[1], region_of(task.focus))
+    shown = None
+    if task.focus is not None:  # read again: there was no room for it meanwhile
+        shown = count_shown(view, _estimate(task.reference).depth, planes[1], task.focus.near)
+    normals, depth = (task.reference.window.padded(pixels, whole) for pixels in planes)
+    agreement = Agreement(*compare_with_sparse(whole, depth, task.sights, mask))
+    return task.maps.write(normals, depth, task.key, agreement, partners=task.matched, shown=shown)
+
+
+def _planes(
+    task: ConfirmTask, view: View, mask: NDArray[np.uint8] | None
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Normals and depth, confirmed and refined; what else that takes is free again afterwards."""
     others = ((partner.view, _estimate(partner)) for partner in task.partners)
-    estimate = _estimate(task.reference)
-    confirmed = confirm_depth(view, estimate, others, task.confirm_options, task.stations, task.residuals)
+    confirmed = confirm_depth(
+        view, _estimate(task.reference), others, task.confirm_options, task.stations, task.residuals
+    )
     if not task.keep_blank and confirmed.depth.any():
         drop_scattered(confirmed.depth, _faint(task.reference, mask))
     planes = fit_normals(view, confirmed, task.normal_options)
     if task.refinement_options.rounds and confirmed.depth.any():
         sources = [(partner.view, _image(partner)) for partner in task.partners]
         options = _refinement(task.refinement_options, view, task.residuals)
-        image = _image(task.reference)
-        usual = _usual(task.residuals)
+        image, usual = _image(task.reference), _usual(task.residuals)
         planes = refine_maps(view, image, confirmed, *planes, sources, options, usual, half_size=task.half_size)
-    if view.original:
-        drop_fringes(planes[1])
-        drop_rims(planes[1], None if mask is None else task.reference.window.part(mask))
-    drop_other_depths(planes[1], task.depths)
-    drop_outside(view, planes[1], region_of(task.focus))
-    shown = count_focus(view, estimate.depth, planes[1], task.focus)
-    normals, depth = (task.reference.window.padded(pixels, whole) for pixels in planes)
-    agreement = Agreement(*compare_with_sparse(whole, depth, task.sights, mask))
-    return task.maps.write(normals, depth, task.key, agreement, partners=task.matched, shown=shown)
+    return planes
 
 
 def _usual(residuals: Sequence[float]) -> float:
@@ -283,13 +296,15 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         partners = self._partners(name)
         residuals = self._residuals_with(name, partners)
         refinement = _refinement(self.context.options.refinement, self.context.scene.view(name), residuals)
-        seconds = confirm_seconds(
-            len(partners), self.context.options.normals, refinement, half_size=self._half_size(name, residuals)
-        )
-        memory = _CONFIRM_BYTES * pixels
+        half_size = self._half_size(name, residuals)
+        normals = self.context.options.normals
+        seconds = confirm_seconds(len(partners), normals, refinement, half_size=half_size)
+        _, stations = self.context.stations.elsewhere(name, partners)
+        memory = (_CONFIRM_BYTES + _STATION_BYTES * (len({*stations}) < len(stations))) * pixels
         if refinement.rounds:
             of_partners = (_IMAGE_BYTES + _PAIRED_BYTES) * sum(map(self._pixels, partners))
-            memory = (_REFINE_BYTES + _IMAGE_BYTES) * pixels + of_partners
+            refining = _REFINE_BYTES + _HALF_SIZE_BYTES * half_size + _IMAGE_BYTES
+            memory = max(memory, refining * pixels + of_partners)
         memory += bytes_to_reduce(*map(self.context.scene.view, [name, *partners]))
         maps = MAP_BYTES * self.context.scene.view(name).num_pixels
         return Cost(seconds * pixels / 1e6, memory + maps - MAP_BYTES * pixels, maps)

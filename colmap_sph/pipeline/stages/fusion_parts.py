@@ -78,6 +78,7 @@ def make_cloud_part(task: FuseTask) -> Facts:
     unread: dict[str, str] = {}
     partners = _partner_maps(task, needed[1:], unread)
     bands = fuse_view(reference, partners, task.options, task.offset, task.stations)
+    del reference  # of which not all is needed to the end
     points = write_part(task.stem, bands, with_visibility=task.with_visibility)
     return Facts(points=points, unread=unread)
 
@@ -105,6 +106,7 @@ def _partner_maps(task: FuseTask, needed: Sequence[float], unread: dict[str, str
             unread[sources.view.name] = str(error)
             maps = None
         yield maps
+        del maps  # or they are there while the next are read
 
 
 def seconds_per_megapixel(partners: int) -> float:
