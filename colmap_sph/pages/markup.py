@@ -22,6 +22,14 @@ from colmap_sph.project.files import real_path
 
 _FOLDER = Path(__file__).parent
 _ANGLE_BARS = 24
+# One for all pages of a process: templates are compiled once.
+_ENVIRONMENT = Environment(
+    loader=FileSystemLoader(_FOLDER),
+    autoescape=True,
+    undefined=StrictUndefined,
+    # Names of files may hold characters that reorder or hide what stands beside them.
+    finalize=lambda value: value if isinstance(value, Markup) else printable_text(value),
+)
 
 
 def render(content: Content) -> str:
@@ -48,14 +56,7 @@ def render(content: Content) -> str:
 
 def from_template(name: str, values: Mapping[str, Any]) -> str:
     """Fill in a template of this folder."""
-    environment = Environment(
-        loader=FileSystemLoader(_FOLDER),
-        autoescape=True,
-        undefined=StrictUndefined,
-        # Names of files may hold characters that reorder or hide what stands beside them.
-        finalize=lambda value: value if isinstance(value, Markup) else printable_text(value),
-    )
-    return environment.get_template(name).render(values)
+    return _ENVIRONMENT.get_template(name).render(values)
 
 
 def style_and_script(style_name: str, *script_names: str) -> dict[str, str]:
