@@ -195,6 +195,22 @@ def test_check_points_do_not_take_part(workspace: Workspace, tmp_path: Path) -> 
     assert found.residuals[3].difference[2] == pytest.approx(on_map(POINTS["P4"])[2] - 1000, abs=1e-4)
 
 
+def test_a_name_that_begins_as_a_comment_is_told(
+    workspace: Workspace, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    lines = [line.replace("P4", "#4") for line in mark_lines(POINTS)]
+    number = sum(line.startswith("#4") for line in lines)
+    head = ("# a table, of, the, town, in, 1987, spring", "point,x,y,z,image,column,row")
+    align(workspace, write_lines(tmp_path / "gcp.csv", *head, *lines), marked_in=workspace.sparse_dir)
+    assert f"gcp.csv: {number} lines like '#4' not read" in caplog.text
+    caplog.clear()
+    quoted = [line.replace("#4", '"#4"') for line in lines]
+    table = write_lines(tmp_path / "quoted.csv", *head, *quoted)
+    found = align(workspace, table, marked_in=workspace.sparse_dir)
+    assert [each.name for each in found.residuals] == ["P1", "P2", "P3", "#4"]
+    assert "not read" not in caplog.text
+
+
 def test_tables_may_be_european(workspace: Workspace, tmp_path: Path) -> None:
     lines = [
         line.replace(",", ";").replace(".", ",").replace(",png", ".png")
@@ -264,6 +280,7 @@ def test_positions_on_both_sides_of_the_180th_meridian_are_in_a_zone_beside_it(
     [
         ([], "no column"),
         (["image,x,y,z", "a/0.png,1,2"], "line 2, has 3 values"),
+        (["image,x,y,z", f"# {'-' * 200_000}", f"{'a' * 200_000},1,2,3"], "bad.csv is no table (field larger"),
         (["image,x,y,z", "# here", "a/0.png,1,2,north"], "line 3: z is 'north'"),
         (["image,x,y,z", "a/0.png,1,2,nan"], "line 2: z is 'nan'"),
         (["image,x,y,z", "a/0.png,1,2,3", "a/0.png,1,2,3"], "line 3: the image 'a/0.png' is there already"),

@@ -429,6 +429,15 @@ def test_what_is_no_cloud_is_refused(content: bytes, words: str, tmp_path: Path)
         read_some_points(tmp_path / "cloud.ply", 10)
 
 
+def test_a_header_may_have_many_comments(tmp_path: Path) -> None:
+    points = np.arange(12.0).reshape(-1, 3)
+    write_cloud(tmp_path / "cloud.ply", points)
+    first, _, rest = (tmp_path / "cloud.ply").read_bytes().partition(b"element")
+    comments = b"comment station of the scanner\n" * 10_000
+    (tmp_path / "cloud.ply").write_bytes(first + comments + b"element" + rest)
+    assert read_some_points(tmp_path / "cloud.ply", 10)[0].tolist() == points.tolist()
+
+
 def test_points_that_are_none_are_left_out(tmp_path: Path) -> None:
     points = np.array([[1, 2, 3], [np.nan, 0, 0], [np.inf, 0, 0], [1e30, 0, 0], [4, 5, 6]])
     write_cloud(tmp_path / "cloud.ply", points)

@@ -74,6 +74,18 @@ def make_project(
     return sparse
 
 
+def test_negative_focal_lengths_are_told_before_anything_is_made(tmp_path: Path) -> None:
+    sparse = make_project(tmp_path, "PINHOLE")
+    model = pycolmap.Reconstruction(sparse)
+    model.camera(1).params = [FOCAL, -FOCAL, WIDTH / 2, HEIGHT / 2]
+    model.write(sparse)
+    with pytest.raises(InputError) as told:
+        read_originals(Project(model=sparse), UndistortionOptions())
+    assert f"{sparse} has a camera" in str(told.value) and f"camera 1: {FOCAL:g} and -{FOCAL:g} pixels" in str(
+        told.value
+    )
+
+
 def test_points_behind_all_images_are_told_before_anything_is_made(tmp_path: Path) -> None:
     """Of the model as it was given, and not of the one in the workspace."""
     sparse = make_project(tmp_path)

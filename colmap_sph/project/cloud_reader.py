@@ -15,7 +15,8 @@ from colmap_sph.project.cloud_tiles import TileIndex
 from colmap_sph.project.files import open_regular
 from colmap_sph.project.map_coordinates import is_plausible
 
-_HEADER_BYTES = 1 << 14
+# As of other clouds and meshes (`evaluation/ply_files.py`): scanners' programs write long comments.
+_HEADER_BYTES = 1 << 20
 _END = re.compile(rb"\nend_header[ \t]*\r?\n")
 _KINDS = {
     "char": "i1", "uchar": "u1", "short": "<i2", "ushort": "<u2", "int": "<i4", "uint": "<u4",

@@ -7,16 +7,21 @@ Columns are separated by commas, semicolons or tabs. Of camera positions each li
 Of control points each line has a mark in an image; the place may be left out after a point's first line::
 
     point,x,y,z,image,column,row           and maybe role: control or check
+
+Lines that begin with # are comments; a name that begins with it is put into quotes.
 """
 
 import csv
+import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from colmap_sph.errors import InputError, reason_of
+from colmap_sph.errors import InputError, counted, reason_of
 from colmap_sph.project.files import read_small
+
+logger = logging.getLogger(__name__)
 
 _MAX_BYTES = 64 << 20
 # Each column, and what else it is called.
@@ -34,6 +39,7 @@ _COLUMNS = {
     "role": ("role",),
 }
 _CALLED = {name: column for column, names in _COLUMNS.items() for name in names}
+_NUMBERS = ("x", "y", "z", "latitude", "longitude", "height", "column", "row")
 _ROLES = {"": False, "control": False, "check": True}
 
 Place = tuple[float, float, float]
@@ -71,10 +77,11 @@ def read_table(path: Path) -> Positions | list[ControlPoint]:
         raise InputError(f"{path} cannot be read ({reason_of(error)}); check --align.") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is no text in UTF-8; save it as CSV with that encoding.") from error
-    lines = _Lines(path, text)
-    if "point" in lines.columns:
-        return _control_points(lines)
-    return _positions(lines)
+    try:
+        lines = _Lines(path, text)
+        return _control_points(lines) if "point" in lines.columns else _positions(lines)
+    except csv.Error as error:
+        raise InputError(f"{path} is no table ({reason_of(error)}); check --align.") from error
 
 
 class _Lines:
@@ -94,6 +101,29 @@ class _Lines:
         known = [column for column in self.columns if column]
         if len(set(known)) < len(known):
             raise InputError(f"{path} has two columns of one meaning in its first line; leave one out.")
+        self._tell_comments(text.splitlines())
+
+    def _tell_comments(self, lines: Sequence[str]) -> None:
+        """Warn of comments that look like lines of the table: a name may begin with #."""
+        told = [line for line in lines if line.lstrip().startswith("#") and self._is_line(line)]
+        if told:
+            logger.warning(
+                "%s: %s like %r not read, as # begins a comment; put a name that begins with # into quotes",
+                self.path,
+                counted(len(told), "line"),
+                self._split(told[0])[0].strip(),
+            )
+
+    def _is_line(self, comment: str) -> bool:
+        """Whether a comment has a value for each column, numbers where these must be."""
+        try:
+            cells = self._split(comment)
+            pairs = zip(cells, self.columns, strict=False)
+            numbers = [cell for cell, column in pairs if column in _NUMBERS and cell.strip()]
+            [float(cell.replace(",", ".")) for cell in numbers]
+        except (ValueError, csv.Error):
+            return False
+        return len(cells) == len(self.columns) and bool(numbers)
 
     def _split(self, line: str) -> list[str]:
         return next(csv.reader([line], delimiter=self._delimiter), [])

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
 import pycolmap
 
 from colmap_sph.errors import InputError
@@ -16,7 +17,7 @@ from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.files import LENS_FIELDS_NAME, read_lens_fields
 from colmap_sph.project.map_coordinates import check_size
 from colmap_sph.project.project import Project
-from colmap_sph.project.sparse_model import image_names, load_model, model_files
+from colmap_sph.project.sparse_model import cameras_of_images, image_names, load_model, model_files
 from colmap_sph.project.undistortion.options import UndistortionOptions
 from colmap_sph.project.wide.cuts import NO_CUTS, Cuts
 from colmap_sph.project.workspace import Workspace, checked_name, mask_path
@@ -120,13 +121,14 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
     Raises
     ------
     InputError
-        No readable model, one in an impossible unit, points behind its images, a camera that is no lens, damaged
-        lens fields, or no images.
+        No readable model, one in an impossible unit, points behind its images, no camera with possible focal
+        lengths, one that is no lens, damaged lens fields, or no images.
     """
     assert project.model is not None
     model = load_model(project.model)
     check_size(model, project.model)
     check_points_in_front(model, project.model)
+    _check_focal_lengths(model, project.model)
     _tell_newer_text(project.model)
     images = project.images
     if images is None:
@@ -138,6 +140,21 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
         )
     fields = read_lens_fields(project.model)
     return Originals(project.model, images, project.masks, model, fields, options.cuts(model, project.model))
+
+
+def _check_focal_lengths(model: pycolmap.Reconstruction, model_dir: Path) -> None:
+    """Raise `InputError` where no image has a camera with focal lengths above 0; of some, it is told later."""
+    faults = []
+    for camera in cameras_of_images(model).values():
+        focal = np.array(camera.params)[list(camera.focal_length_idxs())]
+        if (focal > 0).all():
+            return
+        words = " and ".join(f"{length:g}" for length in focal)
+        faults.append(f"camera {camera.camera_id}: {words} pixels")
+    raise InputError(
+        f"No image of the model in {model_dir} has a camera with possible focal lengths ({faults[0]}); run "
+        "COLMAP's mapper again, or give the model as it was made."
+    )
 
 
 def _tell_newer_text(model_dir: Path) -> None:
