@@ -13,7 +13,7 @@ pytestmark = pytest.mark.usefixtures("scripts_on_path")
 def test_only_pixels_at_one_border_and_well_inside_another_count():
     script = importlib.import_module("measure_wide")
     # At the border of the first view three times; beside it; too deep; seen by it alone.
-    inside = np.radians([[1, 1.9, 0.5, -1, 5, 1], [9, 20, 30, 20, 20, -500]])
+    inside = np.radians(np.array([[1, 1.9, 0.5, -1, 5, 1], [9, 20, 30, 20, 20, -500]]))
     has = np.array([[True, False, False, True, True, True], [True, True, False, True, True, False]])
     assert script.count_at_borders(inside, has).tolist() == [3, 1, 2]
 

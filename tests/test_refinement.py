@@ -640,12 +640,12 @@ def test_memory_is_what_is_reserved(half_size):
     """Two rounds, with planes fitted anew between them: measured with all that is given."""
     shape = (4096, 256)
     size = shape[0] * shape[1]
-    K = np.array([[1e4, 0, 128], [0, 1e4, 2048], [0, 0, 1]])
-    view, other = (View(k, str(k), *shape[::-1], K, np.eye(3), np.array([-0.1 * k, 0, 0]), None) for k in (0, 1))
+    K, none = np.array([[1e4, 0, 128], [0, 1e4, 2048], [0, 0, 1]]), np.empty(0, np.int64)
+    view, other = (View(k, str(k), *shape[::-1], K, np.eye(3), np.array([-0.1 * k, 0, 0]), none) for k in (0, 1))
     images = [np.roll(texture(shape, 1), -k, axis=1) for k in (0, 1)]
     tracemalloc.start()
     depth = np.full(shape, 1000, np.float32)
-    estimate = DepthEstimate(depth.copy(), depth / 1000, np.full(shape, 2, np.uint8))
+    estimate = DepthEstimate(depth.copy(), np.ones_like(depth), np.full(shape, 2, np.uint8))
     normals = np.zeros((*shape, 3), np.float32)
     normals[..., 2] = -1
     given = (view, images[0], estimate, normals, depth, [(other, images[1])], OPTIONS)
