@@ -207,6 +207,19 @@ def test_poses_off_by_less_without_points_are_told(project: Path) -> None:
     assert "from each other's epipolar lines" in run(project / "sparse/0", options=OPTIONS).doubts
 
 
+@pytest.mark.parametrize("shift", [0.0, 10000.0])
+def test_poses_that_are_world_from_cam_are_called_so(project: Path, shift: float) -> None:
+    without_points(project)
+    model = pycolmap.Reconstruction(project / "sparse/0")
+    for image in model.images.values():
+        pose = image.cam_from_world().inverse()
+        place = pose.translation + np.array([shift, 0.0, 0.0])
+        image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, place)
+    model.write(project / "sparse/0")
+    with pytest.raises(NoResultError, match="fit the inverse of its poses"):
+        run(project / "sparse/0", options=OPTIONS)
+
+
 def test_right_poses_without_points_are_not(project: Path) -> None:
     without_points(project)
     plan = make_plan(Project(project / "sparse/0"), OPTIONS)

@@ -7,7 +7,7 @@ what they look like, and so show how far poses and focal lengths are off, where 
 import logging
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from statistics import median
 
@@ -28,6 +28,7 @@ from colmap_sph.stereo.poses.features import (
     Shown,
     epipolar_distances,
     find_features,
+    inverted,
     match_features,
     with_focal_length,
 )
@@ -69,6 +70,7 @@ class Compared:
     photographs: tuple[Photograph, Photograph]
     features: tuple[Features, Features]
     matches: NDArray[np.int64]
+    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))  # of the views' frame, in the model's
 
     @cached_property
     def distances(self) -> NDArray[np.float64]:
@@ -81,6 +83,16 @@ class Compared:
             return self.distances
         pairs = zip(self.features, self.photographs, strict=True)
         return self._distances_of(*(with_focal_length(shown, of.views[0], factor) for shown, of in pairs))
+
+    @cached_property
+    def fits_inverted(self) -> bool:
+        """Whether it would fit if poses were world_from_cam."""
+        if any(len(photograph.views) > 1 for photograph in self.photographs):
+            return False
+        views = [photograph.views[0] for photograph in self.photographs]
+        first, second = (inverted(shown, view) for shown, view in zip(self.features, views, strict=True))
+        left, right = (view.t - view.R @ self.origin for view in views)  # as they were written: centres, then
+        return bool((epipolar_distances(first, second, self.matches, right - left) <= 1).mean() > _FITTING)
 
     def _distances_of(self, first: Features, second: Features) -> NDArray[np.float64]:
         left, right = self.photographs
@@ -124,6 +136,7 @@ def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[Compared], f
             return find_features([_shown(context, view) for view in context.scene.photograph(lead).views])
         return None
 
+    origin = context.scene.origin + context.scene.anchor
     compared = []
     for left, right in pairs:
         first, second = features_of(left), features_of(right)
@@ -132,7 +145,7 @@ def _compare(context: Context, pairs: Sequence[Pair]) -> tuple[list[Compared], f
         matches = match_features(first, second)
         if len(matches) >= _TELLING:
             photographs = (context.scene.photograph(left), context.scene.photograph(right))
-            compared.append(Compared(photographs, (first, second), matches))
+            compared.append(Compared(photographs, (first, second), matches, origin))
     return compared, median(len(features_of(name) or ()) for pair in pairs for name in pair)
 
 
@@ -190,6 +203,12 @@ def _refuse_poses(compared: Sequence[Compared], asked: Sequence[Pair], usual_fea
     others = [pair for pair in compared if not pair.fits]
     fitting = len(compared) - len(others)
     logger.info("Features fit the poses in %d of %d pairs, of %d asked", fitting, len(compared), len(asked))
+    if 2 * sum(pair.fits_inverted for pair in compared) > max(len(compared), 2 * fitting, _FEWEST_PAIRS):
+        raise NoResultError(
+            "The model has no points to compare with, and features of its images fit the inverse of its poses: "
+            "these are world_from_cam (camera to world), and COLMAP's are cam_from_world. Write R transposed and "
+            "-R transposed * t in place of R and t. What was made is left on disk."
+        )
     if fitting < len(others) and sum(len(pair.matches) for pair in others) >= _ENOUGH:
         finding = f"lie on each other's epipolar lines in only {fitting} of {len(compared)} pairs"
         raise NoResultError(_refusal(finding))

@@ -101,6 +101,11 @@ def match_features(first: Features, second: Features) -> NDArray[np.int64]:
     return np.array(rows, np.int64).reshape(-1, 2)
 
 
+def inverted(features: Features, view: View) -> Features:
+    """The features of a photograph that is one view, if its pose were world_from_cam."""
+    return replace(features, rays=features.rays @ view.R.T @ view.R.T)
+
+
 def with_focal_length(features: Features, view: View, factor: float) -> Features:
     """The features of a photograph that is one view, if its focal length were `factor` times what it is."""
     rays = features.rays @ view.R.T
