@@ -89,11 +89,9 @@ class _Lines:
 
     def __init__(self, path: Path, text: str) -> None:
         self.path = path
-        self._rows = [
-            (number, line)
-            for number, line in enumerate(text.splitlines(), 1)
-            if line.strip() and not line.lstrip().startswith("#")
-        ]
+        lines = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip()]
+        comments = [line for _, line in lines if line.lstrip().startswith("#")]
+        self._rows = [(number, line) for number, line in lines if not line.lstrip().startswith("#")]
         head = self._rows[0][1] if self._rows else ""
         self._delimiter = next((each for each in "\t;" if each in head), ",")
         names = [name.strip().lower().replace(" ", "_") for name in self._split(head)]
@@ -101,11 +99,11 @@ class _Lines:
         known = [column for column in self.columns if column]
         if len(set(known)) < len(known):
             raise InputError(f"{path} has two columns of one meaning in its first line; leave one out.")
-        self._tell_comments(text.splitlines())
+        self._tell_comments(comments)
 
-    def _tell_comments(self, lines: Sequence[str]) -> None:
+    def _tell_comments(self, comments: Sequence[str]) -> None:
         """Warn of comments that look like lines of the table: a name may begin with #."""
-        told = [line for line in lines if line.lstrip().startswith("#") and self._is_line(line)]
+        told = [comment for comment in comments if self._is_line(comment)]
         if told:
             logger.warning(
                 "%s: %s like %r not read, as # begins a comment; put a name that begins with # into quotes",
@@ -118,15 +116,23 @@ class _Lines:
         """Whether a comment has a value for each column, numbers where these must be."""
         try:
             cells = self._split(comment)
-            pairs = zip(cells, self.columns, strict=False)
-            numbers = [cell for cell, column in pairs if column in _NUMBERS and cell.strip()]
-            [float(cell.replace(",", ".")) for cell in numbers]
-        except (ValueError, csv.Error):
+        except csv.Error:
             return False
-        return len(cells) == len(self.columns) and bool(numbers)
+        if len(cells) != len(self.columns):
+            return False
+        pairs = zip(cells, self.columns, strict=True)
+        values = [self._number(cell) for cell, column in pairs if column in _NUMBERS and cell.strip()]
+        return bool(values) and not any(map(math.isnan, values))
 
     def _split(self, line: str) -> list[str]:
         return next(csv.reader([line], delimiter=self._delimiter), [])
+
+    def _number(self, text: str) -> float:
+        """Its value, NaN where it is no number; where commas do not separate columns, they may be decimal."""
+        try:
+            return float(text if self._delimiter == "," else text.replace(",", "."))
+        except ValueError:
+            return math.nan
 
     def require(self, columns: Sequence[str]) -> None:
         """Raise `InputError` where one of the columns is missing."""
@@ -149,14 +155,10 @@ class _Lines:
             yield number, dict(zip(self.columns, cells, strict=True))
 
     def numbers(self, number: int, cells: dict[str, str], columns: Sequence[str]) -> list[float]:
-        """The numbers of some columns; where commas do not separate these, they may be decimal."""
+        """The numbers of some columns."""
         found = []
         for column in columns:
-            text = cells[column] if self._delimiter == "," else cells[column].replace(",", ".")
-            try:
-                value = float(text)
-            except ValueError:
-                value = math.nan
+            value = self._number(cells[column])
             if not math.isfinite(value):
                 raise InputError(
                     f"{self.path}, line {number}: {column} is {cells[column]!r}, which is no number; correct it."
