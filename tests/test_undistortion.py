@@ -81,9 +81,8 @@ def test_negative_focal_lengths_are_told_before_anything_is_made(tmp_path: Path)
     model.write(sparse)
     with pytest.raises(InputError) as told:
         read_originals(Project(model=sparse), UndistortionOptions())
-    assert f"{sparse} has a camera" in str(told.value) and f"camera 1: {FOCAL:g} and -{FOCAL:g} pixels" in str(
-        told.value
-    )
+    assert f"{sparse} has a camera" in str(told.value)
+    assert f"camera 1: {FOCAL:g} and -{FOCAL:g} pixels" in str(told.value)
 
 
 def test_points_behind_all_images_are_told_before_anything_is_made(tmp_path: Path) -> None:

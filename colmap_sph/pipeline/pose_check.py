@@ -72,6 +72,11 @@ class Compared:
     matches: NDArray[np.int64]
     origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))  # of the views' frame, in the model's
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether its photographs are one view each."""
+        return all(len(photograph.views) == 1 for photograph in self.photographs)
+
     @cached_property
     def distances(self) -> NDArray[np.float64]:
         """See `epipolar_distances`."""
@@ -87,7 +92,7 @@ class Compared:
     @cached_property
     def fits_inverted(self) -> bool:
         """Whether it would fit if poses were world_from_cam."""
-        if any(len(photograph.views) > 1 for photograph in self.photographs):
+        if not self.is_whole:
             return False
         views = [photograph.views[0] for photograph in self.photographs]
         first, second = (inverted(shown, view) for shown, view in zip(self.features, views, strict=True))
@@ -154,7 +159,7 @@ def _refuse_focal_length(compared: Sequence[Compared]) -> None:
 
     It would pass else: depth is wrong by as much as the focal length, in all images alike.
     """
-    whole = [pair for pair in compared if all(len(photograph.views) == 1 for photograph in pair.photographs)]
+    whole = [pair for pair in compared if pair.is_whole]
     if len(whole) < _FEWEST_PAIRS:
         return
     factor, nearer, of_pairs = fitting_factor(whole)

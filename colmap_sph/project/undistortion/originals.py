@@ -144,15 +144,15 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
 
 def _check_focal_lengths(model: pycolmap.Reconstruction, model_dir: Path) -> None:
     """Raise `InputError` where no image has a camera with focal lengths above 0; of some, it is told later."""
-    faults = []
+    fault = ""
     for camera in cameras_of_images(model).values():
         focal = np.array(camera.params)[list(camera.focal_length_idxs())]
         if (focal > 0).all():
             return
         words = " and ".join(f"{length:g}" for length in focal)
-        faults.append(f"camera {camera.camera_id}: {words} pixels")
+        fault = fault or f"camera {camera.camera_id}: {words} pixels"
     raise InputError(
-        f"No image of the model in {model_dir} has a camera with possible focal lengths ({faults[0]}); run "
+        f"No image of the model in {model_dir} has a camera with possible focal lengths ({fault}); run "
         "COLMAP's mapper again, or give the model as it was made."
     )
 
