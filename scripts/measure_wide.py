@@ -1,6 +1,6 @@
 """Measure a workspace of fisheyes or panoramas against exact range, counted per original image.
 
-    python scripts/measure_wide.py SCENE [--width 480] [--panoramas] [-- options of colmap_sph run]
+    python scripts/measure_wide.py SCENE [--width 480] [--images 10] [--panoramas] [-- options of colmap_sph run]
 
 SCENE is a folder: where it does not exist, a courtyard is rendered into it. The program runs on it, and of the
 pixels of the original images that show a surface, these shares are printed: covered by their range maps; within
@@ -114,11 +114,13 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("--output", type=Path, help="workspace; default: SCENE/dense")
     parser.add_argument("--width", type=int, default=480, help="pixels of the images")
+    parser.add_argument("--images", type=int, default=10, help="how many are taken")
     parser.add_argument("--panoramas", action="store_true")
     parser.add_argument("--measure-only", action="store_true", help="of a workspace that is there")
     given = parser.parse_args(sys.argv[1:split])
     if not (given.scene / "sparse").exists():
-        make_courtyard(given.scene, CourtyardOptions(width=given.width, panoramas=given.panoramas))
+        options = CourtyardOptions(width=given.width, images=given.images, panoramas=given.panoramas)
+        make_courtyard(given.scene, options)
     output = given.output or given.scene / "dense"
     seconds = ""
     if not given.measure_only:
