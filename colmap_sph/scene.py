@@ -128,6 +128,11 @@ class View:
         """(3,) projection centre in the world frame."""
         return np.asarray(-self.R.T @ self.t)
 
+    @cached_property
+    def inverse_K(self) -> NDArray[np.float64]:
+        """(3, 3): from pixels to rays in the camera frame whose z is 1."""
+        return np.asarray(np.linalg.inv(self.K))
+
     @property
     def viewing_direction(self) -> NDArray[np.float64]:
         """(3,) unit vector of the optical axis in the world frame."""
@@ -278,12 +283,10 @@ def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:
     `target`, whose third coordinate is its z-depth there. Both are integer pixels as the depth maps count them.
     """
     rotation = target.R @ source.R.T
-    return np.hstack(
-        [
-            target.K @ rotation @ np.linalg.inv(source.K),
-            (target.K @ (target.t - rotation @ source.t))[:, None],
-        ]
-    )
+    transfer = np.empty((3, 4))
+    transfer[:, :3] = target.K @ rotation @ source.inverse_K
+    transfer[:, 3] = target.K @ (target.t - rotation @ source.t)
+    return transfer
 
 
 def observed_by(

@@ -225,10 +225,10 @@ def fuse_view(
         _native.fuse_partner(
             reference.depth,
             reference.normals,
-            np.linalg.inv(reference.view.K),
+            reference.view.inverse_K,
             partner.depth,
             partner.normals,
-            np.linalg.inv(partner.view.K),
+            partner.view.inverse_K,
             partner.image,
             pixel_transfer(reference.view, partner.view),
             reference.view.R @ partner.view.R.T,
@@ -246,7 +246,7 @@ def fuse_view(
     step = max(_BAND_PIXELS // shape[1], 1)
     gates = (options.min_num_pixels, _station_bits(stations))
     pixels = (reference.depth, reference.normals, covered, agreeing, colour, *gates)
-    world_from_pixel = view.R.T @ np.linalg.inv(view.K)
+    world_from_pixel = view.R.T @ view.inverse_K
     world_from_camera = view.R.T
     frame = (np.ascontiguousarray(world_from_pixel), np.ascontiguousarray(world_from_camera), view.center + offset)
     for first in range(0, shape[0], step):

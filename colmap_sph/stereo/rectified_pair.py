@@ -152,7 +152,7 @@ def pixel_from_rectified_ray(view: View, pair: RectifiedPair) -> Float:
 
 def rectified_ray_from_pixel(view: View, pair: RectifiedPair) -> Float:
     """(3, 3) matrix from (col, row, 1) of `view` to the ray of depth 1 in the rectified frame."""
-    return np.asarray(pair.rectified_from_world @ view.R.T @ np.linalg.inv(view.K))
+    return np.asarray(pair.rectified_from_world @ view.R.T @ view.inverse_K)
 
 
 def is_fine(view: View, pair: RectifiedPair) -> bool:

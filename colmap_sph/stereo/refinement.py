@@ -348,6 +348,6 @@ def _planes_of_maps(
 ) -> NDArray[np.float32]:
     """(3, h, W) inverse depth and its change per column and row, on `rows` of the maps; 0 where there is none."""
     planes = np.empty((3, len(range(*rows.indices(view.height))), view.width), np.float32)
-    inverse_K = np.ascontiguousarray(np.linalg.inv(view.K))
+    inverse_K = np.ascontiguousarray(view.inverse_K)
     _native.planes_of_maps(normals, depth, inverse_K, rows.start, rows.step, planes)
     return planes

@@ -4,6 +4,7 @@ The views that were cut from a panorama look everywhere. A view is compared with
 of what lies along its rays in their image, at the distances at which its photograph sees sparse points.
 """
 
+import itertools
 from collections.abc import Iterable
 from functools import cached_property
 
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.scene import Scene, View
-from colmap_sph.stereo.partners.frusta import points_in_view, sees
+from colmap_sph.stereo.partners.frusta import points_in_view, seen_by
 
 # Rays of a view along each side, and percentiles of the distances of its photograph's points: all that it may see.
 _RAYS = 8
@@ -55,7 +56,9 @@ class Facing:
                 views = ()
             elif len(views) > 1:
                 samples = self._samples(name) if samples is None else samples
-                views = tuple(view for view in views if not len(samples) or sees(view, samples).any())
+                if len(samples):
+                    are_facing = np.asarray(seen_by(views, samples).any(axis=1))
+                    views = tuple(itertools.compress(views, are_facing))
             found.append([view.name for view in views])
         return found
 
