@@ -165,6 +165,7 @@ def test_originals_are_the_images_of_the_page(finished: Path) -> None:
     assert [text for tag, text in page.texts if tag == "h3"][:4] == names
     assert page.data["names"] == names
     assert "4 of 4 images with depth maps" in page.text("p")
+    assert "a diamond one that looks down or all around" in page.text("p")  # as panoramas do
     ids = {each["id"] for _, each in page.elements if "id" in each}
     assert {(each["href"] or "")[1:] for each in page.all("a") if "href" in each} <= ids
     originals = {name: cut.original for name, cut in read_cuts(workspace.sparse_dir).items()}
@@ -227,6 +228,7 @@ def test_a_page_made_without_range_maps_and_report(finished: Path) -> None:
         workspace.report_path.write_bytes(kept)
     assert len(page.all("article")) == 4
     assert "4 of 4 images with depth maps" in page.text("p")
+    assert "a diamond one that looks down or all around" in page.text("p")  # as panoramas do
 
 
 def test_of_photometric_maps_alone_the_coverage_is_theirs(finished: Path) -> None:

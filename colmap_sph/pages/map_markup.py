@@ -57,7 +57,7 @@ def map_values(content: Content) -> dict[str, Any]:
             if content.scene.origin.any()
             else "Up is as the rows of the images and the surface tell. "
         )
-        + "A triangle is a camera, and points where it looks, a diamond one that looks down; "
+        + "A triangle is a camera, and points where it looks, a diamond one that looks down or all around; "
         + "choose one to see its pictures.",
         "reasons": [
             _reason(reason, content.images)
@@ -127,7 +127,7 @@ def _reason(reason: Reason, images: list[ImageFacts]) -> dict[str, str]:
 
 
 def camera_path(view: View | Photograph, frame: Frame, among: int) -> str:
-    """One of so many cameras: a triangle that points to where it looks, or a diamond where that is down or up."""
+    """One of so many cameras: a triangle that points to where it looks; a diamond: down, up or all around."""
     middle = frame.place(view.center[None])[0] * _drawing_size(frame)
     ahead = looks_towards(view, frame)
     length = float(np.hypot(*ahead))
