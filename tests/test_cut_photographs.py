@@ -1,7 +1,7 @@
 """Photographs that were cut into several views: they are counted once, and matched once on the whole sphere."""
 
 from dataclasses import replace
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
@@ -13,7 +13,7 @@ from colmap_sph.errors import NoResultError, RectificationError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.scene import Scene, View
+from colmap_sph.scene import Photograph, Scene, View
 from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.fusion import FusionOptions, ViewMaps, fuse_view
 from colmap_sph.stereo.matching import MatchingOptions, match_pair
@@ -101,6 +101,10 @@ def test_a_scene_knows_its_photographs():
     assert scene.photograph("up/p0") is scene.photographs[0]
     np.testing.assert_array_equal(scene.photographs[0].point_indices, np.arange(400))
     assert not scene.photographs[0].viewing_direction.any()  # all around
+    for angle in range(0, 90, 10):  # and any five of these, whose axes have a mean of 0.2, however that is rounded
+        views = views_of("p", (0, 0, 0), PANORAMA, R=turned("y", angle) @ turned("x", angle))
+        for five in combinations(views, 5):
+            assert not Photograph("p", five).viewing_direction.any()
     R = turned("y", 30)
     fisheye = scene_of(views_of("f", (1, 2, 3), FISHEYE, R=R), scene.points).photographs[0]
     np.testing.assert_allclose(fisheye.viewing_direction, R[2], atol=1e-12)
