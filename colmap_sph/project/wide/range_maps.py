@@ -22,7 +22,8 @@ Pixels = NDArray[np.float32]
 CHANNELS = ("range", "normal.X", "normal.Y", "normal.Z")
 """Of the file. Normals are unit vectors in the frame of the image's camera, towards it; 0 where there is none."""
 
-_BAND_PIXELS = 1 << 18
+# So few that what is computed of them stays in a processor's cache.
+_BAND_PIXELS = 1 << 15
 # Cosine between ray and normal below which a pixel's plane says nothing of the rays beside it.
 _GRAZING = 0.05
 # By which a plane may change the range within a pixel, relative to it.
@@ -82,7 +83,7 @@ def range_and_normals(lens: Lens, views: Sequence[ViewMaps]) -> tuple[Pixels, Pi
         known = []
         for view in views:
             cosine = _along(view.R[2], rays)
-            seen, here, normal_here = _looked_up(view, rays, np.flatnonzero(cosine > 0))
+            seen, here, normal_here = _looked_up(view, rays, np.flatnonzero(cosine > _least_cosine(view)))
             known.append((seen, here))
             nearer = cosine[seen] > nearest[seen]
             own = seen[nearer]
@@ -111,6 +112,13 @@ def _mean_of_same(
 def _along(row: NDArray[np.float64], rays: NDArray[np.float64]) -> NDArray[np.float64]:
     """Products (n,) of a vector with (3, n) rays; for three numbers each this is quicker than BLAS."""
     return np.asarray(row[0] * rays[0] + row[1] * rays[1] + row[2] * rays[2])
+
+
+def _least_cosine(view: ViewMaps) -> float:
+    """Cosine of the angle between a view's axis and the farthest corner of its image, or a little less."""
+    height, width = view.depth.shape
+    corners = np.array([[x, y, 1.0] for x in (-1, width) for y in (-1, height)]) @ np.linalg.inv(view.K).T
+    return float(1 / np.linalg.norm(corners, axis=1).max())
 
 
 def _looked_up(
