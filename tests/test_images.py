@@ -4,6 +4,7 @@ import io
 import itertools
 import os
 import struct
+import time
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,6 +21,7 @@ from colmap_sph.errors import InputError
 from colmap_sph.project.images.decoding import jpeg_step, read_header, read_pixels
 from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.images.reading import image_problem, read_colours, read_grey, read_whole_grey
+from colmap_sph.project.images.undistorting import write_undistorted
 
 WIDTH, HEIGHT = 53, 37
 TIFF_LAYOUTS: list[dict[str, object]] = [
@@ -130,6 +132,20 @@ def test_copies_are_not_turned(tmp_path: Path, extension: str) -> None:
                     shown = np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
                     assert np.abs(shown.astype(int) - truth).max() <= 1
     assert turned >= 7 * 3
+
+
+@pytest.mark.parametrize("date", [None, "2001:02:03 04:05:06"])
+def test_the_same_image_is_undistorted_to_the_same_bytes_at_any_time(tmp_path: Path, date: str | None) -> None:
+    """COLMAP's library puts the time of writing into TIFF files of which no date is known; a known one stays."""
+    pixels = noise(3, "uint8")
+    Image.fromarray(pixels).save(tmp_path / "a.tif", tiffinfo={} if date is None else {306: date})
+    for name in ("b.tif", "c.tif"):
+        write_undistorted(pycolmap.Bitmap.read(tmp_path / "a.tif", True), tmp_path / "a.tif", tmp_path / name)
+        time.sleep(1.1)  # dates have seconds
+    assert (tmp_path / "b.tif").read_bytes() == (tmp_path / "c.tif").read_bytes()
+    with Image.open(tmp_path / "b.tif") as made:
+        np.testing.assert_array_equal(np.asarray(made), pixels)
+        assert str(made.tag_v2[306]).strip(": ") == (date or "")
 
 
 def test_orientation_in_xmp_goes_too(tmp_path: Path) -> None:

@@ -306,6 +306,32 @@ def test_cameras_are_refined_into_a_model_of_their_own(project: Path) -> None:
     assert (project / "sparse/0/cameras.bin").read_bytes() == given
 
 
+def test_what_is_said_of_refined_cameras_holds_later(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From where the project lies by then, and while the refined model is there."""
+    change_model(project, wrong_lens)
+    options = replace(OFF, polish=PolishOptions("on", cameras=True))
+    (project / "here").mkdir()
+    monkeypatch.chdir(project / "here")
+    report = colmap_sph.run("../sparse/0", output=".", options=options)
+    assert "colmap_sph run --model colmap_sph/refined --images" in report.polishing
+    assert report.polishing.endswith(f"--output {project / 'here_refined'}")
+    monkeypatch.chdir(tmp_path)
+    moved = project.rename(tmp_path / "moved")
+    again = colmap_sph.run(moved / "sparse/0", output=moved / "here", options=options)
+    assert made(again) == {}
+    refined = moved / "here/colmap_sph/refined"
+    assert again.polishing.endswith(
+        f"--model {refined} --images {moved / 'images'} --output {moved / 'here_refined'}"
+    )
+    cameras = (refined / "cameras.bin").read_bytes()
+    shutil.rmtree(refined)
+    anew = colmap_sph.run(moved / "sparse/0", output=moved / "here", options=options)
+    assert (refined / "cameras.bin").read_bytes() == cameras
+    assert anew.polishing == again.polishing
+
+
 def test_cameras_without_tracks_are_kept_with_the_poses(project: Path) -> None:
     change_model(project, no_tracks)
     report = run(project, replace(OFF, polish=PolishOptions("on", cameras=True)))
@@ -315,7 +341,9 @@ def test_cameras_without_tracks_are_kept_with_the_poses(project: Path) -> None:
 
 
 def test_right_cameras_are_kept(project: Path) -> None:
+    """Refined ones of an earlier run, with other images say, do not stay."""
     shutil.rmtree(project / "dense")
+    shutil.copytree(project / "sparse/0", project / "dense/colmap_sph/refined")
     report = run(project, replace(OFF, polish=PolishOptions("on", cameras=True)))
     assert "The cameras are kept as given" in report.polishing
     assert not (project / "dense/colmap_sph/refined").exists()

@@ -3,6 +3,7 @@
 import runpy
 import shlex
 import shutil
+import sys
 from pathlib import Path
 
 import pycolmap
@@ -70,6 +71,31 @@ def test_default_output_of_links(tmp_path: Path, link: str, target: str, model: 
     assert project.database() == tmp_path / "mine/database.db"
     (tmp_path / "store/database.db").touch()  # of which the model was made; the other may be anything's
     assert project.database() == tmp_path / "store/database.db"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="there .. is taken out of the text")
+@pytest.mark.parametrize(
+    ("model", "expected"),
+    [
+        ("link/../sparse/0", "store/dense"),
+        ("link/../other/../sparse/1", "store/dense-1"),
+        ("sparse/../sparse/0", "store/dense"),
+        ("sparse/0/../1", "mine/dense-1"),
+        ("../mine/./sparse/0", "mine/dense"),
+    ],
+)
+def test_default_output_on_ways_back_over_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, model: str, expected: str
+) -> None:
+    """The system goes back from where a link leads to: the model is there, and so is its result."""
+    for folder in ("store/other", "store/sparse/0", "store/sparse/1", "mine/dense"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "mine/link").symlink_to(tmp_path / "store/other")
+    (tmp_path / "mine/sparse").symlink_to(tmp_path / "store/sparse")
+    monkeypatch.chdir(tmp_path / "mine")
+    assert Path(model).samefile(tmp_path / "store/sparse" / Path(model).name)
+    assert Project(Path(model)).root == tmp_path / expected
+    assert runpy.run_path(str(SUMMARY))["default_output"](Path(model)) == tmp_path / expected
 
 
 def test_output_and_workspace_are_taken_as_given(tmp_path: Path) -> None:

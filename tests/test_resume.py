@@ -427,6 +427,8 @@ def test_a_changed_mask_redoes_the_cloud(finished: Finished) -> None:
     second = finished.rerun(**options)
     assert second.made == NOTHING | {"fuse": 1}
     assert second.points < first.points
+    moved = masks.rename(finished.project / "elsewhere")
+    assert finished.rerun(fusion=FusionOptions(mask_path=moved)).made == NOTHING
 
 
 def test_a_changed_program_redoes_everything(finished: Finished, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 from pathlib import Path
 
 import cv2
@@ -475,6 +476,16 @@ def test_range_is_the_mean_of_the_views_that_agree() -> None:
     error = np.abs(distance.ravel() - expected)
     assert (error < 1e-3).mean() > 0.97  # but for the outermost half of a pixel of a view
     assert np.einsum("ni,ni->n", normals.reshape(-1, 3), rays).max() < -0.999
+
+
+def test_the_same_range_map_is_the_same_file_at_any_time(tmp_path: Path) -> None:
+    maps = (np.ones((4, 6), np.float32), np.ones((4, 6, 3), np.float32))
+    digests = []
+    for name in ("a.exr", "b.exr"):
+        digests.append(range_maps.write_range_map(tmp_path / name, *maps))
+        time.sleep(1.1)  # dates in OpenEXR have seconds
+    assert digests[0] == digests[1]
+    assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
 
 
 def test_a_kill_while_a_range_map_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,7 @@
 """The keys of a run's results: each names everything that its result depends on, and nothing else."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from colmap_sph.pipeline.digests import digest, file_digest, stamp_of
@@ -252,7 +253,7 @@ class Keys:
             pairs,
             (scene.origin, scene.anchor, scene.image_ids, [(view.name, view.original) for view in scene.views]),
             [] if self.fresh else [file_digest(path) for path in model_files(self._workspace.sparse_dir)],
-            self._options.fusion,
+            replace(self._options.fusion, mask_path=None),  # wherever the masks lie
             [self._mask_digest(mask_path(folder, name)) for name in maps] if folder else [],
         )
 

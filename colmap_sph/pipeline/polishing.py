@@ -9,11 +9,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+from colmap_sph.errors import shell_word
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.stages.facts import Polish
 from colmap_sph.pipeline.stages.match import MatchStage
 from colmap_sph.pipeline.stages.polish import GivenModel, PolishStage, kept_as_given
+from colmap_sph.platforms.files import plain_path
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.partners.pairing import Pair
@@ -51,11 +53,11 @@ def with_polished_poses(
     Context
     """
     if given.reason_to_keep:
-        return _told(context, kept_as_given(given.reason_to_keep, context.options.polish))
+        return _told(context, given, kept_as_given(given.reason_to_keep, context.options.polish))
     polish = _outcome(context, pairs, executor, given)
     if polish is None:
         return replace(context, keys=Keys(context.workspace, context.options, fresh=True))
-    context = _told(context, polish)
+    context = _told(context, given, polish)
     if not polish.is_polished:
         return context
     names = context.scene.index_of
@@ -76,8 +78,16 @@ def _outcome(context: Context, pairs: Sequence[Pair], executor: "Executor", give
     return result.facts.polish
 
 
-def _told(context: Context, polish: Polish) -> Context:
-    context.report.polishing = f"{polish.words} {polish.advice}".strip()
+def _told(context: Context, given: GivenModel, polish: Polish) -> Context:
+    words = [polish.words, polish.advice]
+    if polish.is_refined:  # by the paths of this run: the outcome may be that of one from another folder
+        refined, root = context.workspace.refined_model_dir, plain_path(context.workspace.root)
+        output = root.with_name(f"{root.name}_refined")
+        words.append(
+            f"Use them in another run: colmap_sph run --model {shell_word(refined)} --images "
+            f"{shell_word(given.image_dir)} --output {shell_word(output)}"
+        )
+    context.report.polishing = " ".join(filter(None, words))
     logger.info("%s", context.report.polishing)
     context.report.pose_movement = dict(polish.movement)
     return context

@@ -60,6 +60,19 @@ def is_link(path: Path) -> bool:
     return path.is_symlink() or is_junction(path)
 
 
+def plain_path(path: Path) -> Path:
+    """The same place as an absolute path without ``..``, through the links that are typed: only where ``..`` goes
+    back over one, by where that leads to. Windows takes ``..`` out of the text before it looks at any link.
+    """
+    typed = Path.cwd() / path
+    if sys.platform == "win32":
+        return Path(os.path.normpath(typed))
+    plain = Path(typed.anchor)
+    for part in typed.parts[1:]:
+        plain = plain / part if part != ".." else Path(os.path.realpath(plain) if is_link(plain) else plain).parent
+    return plain
+
+
 def is_junction(path: Path) -> bool:
     """Whether a path is a junction of Windows; Python before 3.12 takes it for a folder."""
     if sys.platform == "win32":

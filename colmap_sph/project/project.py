@@ -1,10 +1,10 @@
 """What a run works on, as the user gives it: one record, checked; a dense workspace given is opened."""
 
-import os
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 from colmap_sph.errors import InputError, OptionError, shell_word
+from colmap_sph.platforms.files import plain_path
 from colmap_sph.project.database import find_database
 from colmap_sph.project.files import real_path
 from colmap_sph.project.masks import check_masks
@@ -81,7 +81,7 @@ class Project:
         if self.output is not None:
             return self.output
         assert self.model is not None
-        project = Path(os.path.normpath(Path.cwd() / self.model))
+        project = plain_path(self.model)
         if "sparse" not in (project.name, project.parent.name if project.name.isdigit() else ""):
             project = real_path(self.model)  # a link to a model, such as sparse/best, says nothing of its project
         number = project.name if project.name.isdigit() else ""

@@ -54,12 +54,15 @@ class Polish:
         Image name → how far its points moved in it, pixels (median); empty where nothing moved.
     advice : str
         What would help more, in sentences.
+    is_refined : bool
+        Whether a model with refined cameras was left in the workspace.
     """
 
     words: str
     is_polished: bool = False
     movement: Mapping[str, float] = field(default_factory=dict)
     advice: str = ""
+    is_refined: bool = False
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ What is accepted is decided by ties that had no part in the adjustment, and by t
 """
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,7 +14,7 @@ import numpy as np
 from colmap_sph.pipeline.stages.facts import Facts, Polish
 from colmap_sph.pipeline.stages.fine_ties import CACHE_BYTES, fine_ties
 from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
-from colmap_sph.project.files import scratch_folder
+from colmap_sph.project.files import remove, scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
 from colmap_sph.project.polishing.options import PolishOptions
 from colmap_sph.project.polishing.polished import (
@@ -25,7 +25,7 @@ from colmap_sph.project.polishing.polished import (
     write_model,
 )
 from colmap_sph.project.scene_reader import scene_of_model
-from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.sparse_model import has_model, load_model
 from colmap_sph.project.state.typed import from_plain
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
@@ -88,6 +88,8 @@ class PolishTask:
 def polish_poses(task: PolishTask) -> Facts:
     """Polish the poses of a workspace's model; puts the polished one into its place where it is better."""
     workspace = task.workspace
+    if task.options.cameras:  # what an earlier run found of other images
+        remove(workspace.refined_model_dir)
     folder = starting_model(workspace)
     given = load_model(folder)
     scene = scene_of_model(given, folder)
@@ -102,12 +104,13 @@ def polish_poses(task: PolishTask) -> Facts:
         return _kept(task, "their adjustment does not converge")
     after = scene_of_model(adjusted, folder)
     judgement = judged(held_out, scene, after)
-    advice = _advice(task, tracks, scene, judgement)
+    advice, is_refined = _advice(task, tracks, scene, judgement)
     reason = judgement.refusal(task.options.least_gain)
     if reason:
-        return _kept(task, reason, advice)
+        return _kept(task, reason, advice, is_refined=is_refined)
     moved = movements(scene, after, tracks)
-    polish = Polish(_success(judgement, moved), is_polished=True, movement=moved, advice=advice)
+    success = _success(judgement, moved)
+    polish = Polish(success, is_polished=True, movement=moved, advice=advice, is_refined=is_refined)
     with scratch_folder(workspace.polishing_scratch_dir):
         made = workspace.polishing_scratch_dir / "polished"
         write_model(adjusted, made)
@@ -134,32 +137,35 @@ def kept_as_given(reason: str, options: PolishOptions, advice: str = "") -> Poli
     return Polish(f"The poses are kept as given: {reason}.", advice=advice)
 
 
-def _kept(task: PolishTask, reason: str, advice: str = "") -> Facts:
-    polish = kept_as_given(reason, task.options, advice)
+def _kept(task: PolishTask, reason: str, advice: str = "", *, is_refined: bool = False) -> Facts:
+    polish = replace(kept_as_given(reason, task.options, advice), is_refined=is_refined)
     keep_given(task.workspace, task.key, asdict(polish))
     return Facts(polish=polish)
 
 
-def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
-    """What to do about images that are bent alike; where it was asked for, that it was done."""
+def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> tuple[str, bool]:
+    """What to do about images that are bent alike; where it was asked for, whether it was done."""
     if task.options.cameras:
         return _with_refined_cameras(task, tracks, scene, judgement)
     bent = [bend for bend in common_bends(tracks, scene) if bend.share > _BENT_SHARE]
-    return " ".join(
+    words = (
         f"The {len(bend.views)} images with the camera of {scene.views[bend.views[0]].name} are bent alike, by "
         f"{bend.pixels:.2f} px beyond what poses can take up: its lens model is imprecise; try --polish-cameras."
         for bend in bent
     )
+    return " ".join(words), False
 
 
-def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
+def _with_refined_cameras(
+    task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement
+) -> tuple[str, bool]:
     """Refine the cameras of the original model, and leave it in the workspace where it is better."""
     # Not before: what it is solved with takes its time to load.
     from colmap_sph.pipeline.stages.refine_cameras import CamerasToRefine, refine_cameras
 
     used, held_out = _divided(tracks)
     to_refine = CamerasToRefine(
-        task.given.model_dir, task.given.image_dir, task.undistortion, scene, _observations(used, scene), held_out
+        task.given.model_dir, task.undistortion, scene, _observations(used, scene), held_out
     )
     before = min(judgement.before, judgement.after)
     return refine_cameras(to_refine, before, task.options.least_gain, task.workspace.refined_model_dir)
@@ -219,6 +225,8 @@ class PolishStage(Stage[str, PolishTask]):
         if outcome is None:
             return None
         try:
-            return Facts(polish=from_plain(outcome, Polish))
+            polish = from_plain(outcome, Polish)
         except msgspec.ValidationError:
             return None
+        is_lost = polish.is_refined and not has_model(self.context.workspace.refined_model_dir)
+        return None if is_lost else Facts(polish=polish)

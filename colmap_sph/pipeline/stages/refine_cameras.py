@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.errors import shell_word
 from colmap_sph.project.lens.files import read_lens_fields
 from colmap_sph.project.polishing.adjustment import Observations
 from colmap_sph.project.polishing.cameras import Lenses, straightened, with_distortion, with_fields
@@ -25,8 +24,8 @@ class CamerasToRefine:
 
     Attributes
     ----------
-    model_dir, image_dir : Path
-        The original model and its images.
+    model_dir : Path
+        The original model.
     options : UndistortionOptions
         How these were undistorted.
     scene : Scene
@@ -36,14 +35,13 @@ class CamerasToRefine:
     """
 
     model_dir: Path
-    image_dir: Path
     options: UndistortionOptions
     scene: Scene
     used: Observations
     held_out: Tracks
 
 
-def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, target: Path) -> str:
+def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, target: Path) -> tuple[str, bool]:
     """Refine cameras; writes the model with those that fit clearly better.
 
     Parameters
@@ -58,11 +56,13 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
 
     Returns
     -------
-    str
-        What came of it, and how to use it: sentences.
+    words : str
+        What came of it, in a sentence.
+    is_refined : bool
+        Whether there is such a model now.
     """
     if read_lens_fields(task.model_dir):
-        return "The cameras are kept as given: they have lens fields already."
+        return "The cameras are kept as given: they have lens fields already.", False
     given = Lenses(load_model(task.model_dir))
     best = given
     error = before
@@ -79,15 +79,12 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
             error = fits
     if best is given:
         found = f"({tried:.2f} px)" if np.isfinite(tried) else "(none could be found)"
-        return f"The cameras are kept as given: refined ones are not clearly better {found}."
+        return f"The cameras are kept as given: refined ones are not clearly better {found}.", False
     best.write(target)
-    output = target.parents[1].with_name(f"{target.parents[1].name}_refined")
     return (
         f"Cameras were refined ({best.words(given)}): ties that had no part in it fit to {error:.2f} px, before "
-        f"{before:.2f} px. "
-        f"Use them in another run: colmap_sph run --model {shell_word(target)} --images "
-        f"{shell_word(task.image_dir)} --output {shell_word(output)}"
-    )
+        f"{before:.2f} px."
+    ), True
 
 
 def _error(task: CamerasToRefine, given: Lenses, refined: Lenses) -> float:

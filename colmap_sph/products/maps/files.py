@@ -120,6 +120,7 @@ def write_image(path: Path, pixels: NDArray[Any], channels: list[str]) -> None:
     spec = OpenImageIO.ImageSpec(pixels.shape[1], pixels.shape[0], 1, _TYPES[pixels.dtype])
     spec.channelnames = channels
     spec.attribute("compression", "zip")
+    spec.attribute("DateTime", "")  # else that of writing: the same maps make the same bytes
     output = OpenImageIO.ImageOutput.create(str(path))
     if output is None or not output.open(str(path), spec):
         raise OSError(OpenImageIO.geterror() if output is None else output.geterror())

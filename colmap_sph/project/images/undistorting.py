@@ -5,6 +5,7 @@ image.
 """
 
 import os
+import struct
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,6 +23,7 @@ from colmap_sph.project.images.decoding import is_jpeg, read_pixels, unreadable
 from colmap_sph.project.images.depth import ValueRange, stretched
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.orientation import copy_without_orientation
+from colmap_sph.project.images.tiff import entries
 from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.straight import place_in_original, straight_camera
 
@@ -30,6 +32,8 @@ _BAND_PIXELS = 1 << 18
 # Endings of names for which COLMAP knows how to write the file; under others JPEG or PNG is written.
 _ENDINGS = {".bmp", ".exr", ".hdr", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tga", ".tif", ".tiff"}
 _WHITE = 65535
+_DATE_TIME = 306
+_NO_DATE = b"    :  :     :  :  "  # as Exif writes one that is not known
 
 
 def undistort_deep(
@@ -132,9 +136,25 @@ def write_undistorted(bitmap: pycolmap.Bitmap, source: Path, target: Path) -> No
     try:
         if not bitmap.write(written):
             raise OutputError(f"{target} cannot be written; check space and permissions.")
+        if ending.lower() in (".tif", ".tiff"):
+            _forget_time_of_writing(written, source)
         copy_without_orientation(written, target)
     finally:
         written.unlink(missing_ok=True)
+
+
+def _forget_time_of_writing(written: Path, source: Path) -> None:
+    """Blank the date of a TIFF file but where it is the original's: the same image makes the same bytes again."""
+    original = oiio.ImageInput.open(str(source))
+    date = b"" if original is None else str(original.spec().getattribute("DateTime")).encode(errors="replace")
+    data = written.read_bytes()
+    for entry in entries(data):
+        if entry.tag == _DATE_TIME:
+            (place,) = struct.unpack_from(entry.order + entry.offset, data, entry.place)
+            if data[place : place + len(_NO_DATE)] != date:
+                with written.open("r+b") as file:
+                    file.seek(place)
+                    file.write(_NO_DATE)
 
 
 def _stretched(pixels: NDArray[Any], values: ValueRange) -> NDArray[np.uint16]:

@@ -186,6 +186,7 @@ def write_range_map(path: Path, distance: Pixels, normals: Pixels) -> str:
     spec = oiio.ImageSpec(width, height, len(CHANNELS), "float")
     spec.channelnames = CHANNELS
     spec["compression"] = "zip"
+    spec["DateTime"] = ""  # else the time of writing: the same input makes the same bytes
     image = oiio.ImageBuf(spec)
     image.set_pixels(image.roi, np.ascontiguousarray(np.dstack([distance, normals]), np.float32))
     try:
