@@ -339,9 +339,13 @@ def transfer_disparity(left, max_step, right_width):
         for x, d in enumerate(row):
             if np.isnan(d):
                 continue
+            before = row[x - 1] if x > 0 else np.nan
             beside = row[x + 1] if x + 1 < len(row) else np.nan
-            if not abs(beside - d) <= max_step:
-                claims.setdefault(int(np.rint(x - d)), []).append(d)
+            nearest = int(np.rint(x - d))
+            to_left, to_right = (abs(other - d) <= max_step for other in (before, beside))
+            if not (to_right and nearest >= x - d) and not (to_left and nearest <= x - d):
+                claims.setdefault(nearest, []).append(d)
+            if not to_right:
                 continue
             start, end = x - d, x + 1 - beside
             if end > start:

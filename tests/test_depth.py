@@ -266,6 +266,19 @@ def test_transfer_is_the_oracles(height, widths, spread, quantum, holes, max_ste
     np.testing.assert_allclose(right, oracle.transfer_disparity(left, max_step, widths[1]), atol=1e-4)
 
 
+@pytest.mark.parametrize("pixels", [1, 2, 150])
+def test_surfaces_are_as_wide_in_the_right_image(pixels):
+    """Wherever a surface lies between two columns, it covers one for each of its pixels, as in the left image."""
+    for disparity in (0.25, 0.75, 4.25, 4.75):
+        left = np.full((1, 300), np.nan, dtype=np.float32)
+        left[0, 100 : 100 + pixels] = disparity
+        right = np.zeros((1, 300), dtype=np.float32)
+        _native.transfer_disparity(left, 2.0, right)
+        expected = np.round(np.arange(100, 100 + pixels) - disparity).astype(int)
+        np.testing.assert_array_equal(np.flatnonzero(~np.isnan(right[0])), expected)
+        assert (right[0, expected] == disparity).all()
+
+
 @pytest.mark.parametrize("name", RENDERED)
 def test_transfer_agrees_with_exact_geometry(name):
     """The left image's exact map, carried over, is the right image's, where both see the surface."""

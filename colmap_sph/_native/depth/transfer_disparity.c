@@ -30,7 +30,7 @@ static void put_segment(float *row, ptrdiff_t width, ptrdiff_t x, float d0, floa
 typedef struct {
     int32_t column[BLOCK];  /* the first of a segment to the next pixel */
     float disparity[BLOCK]; /* there */
-    int32_t columns[BLOCK]; /* how many: 0, 1 or MANY; MANY also of a pixel that is joined to no other */
+    int32_t columns[BLOCK]; /* how many: 0, 1 or MANY; MANY also of the first and the last pixel of a surface */
 } block;
 
 /* Straight loops, so that the compiler vectorises them. */
@@ -51,15 +51,19 @@ static inline void find_columns(const float *d, ptrdiff_t first, ptrdiff_t width
         const int32_t before = (int32_t)bounded, column = before + (r0 > (float)before);
         const float at = (float)column;
         /* False for NaN. */
-        const int joined = fabsf(d1 - d0) <= max_step;
+        const int joined = fabsf(d1 - d0) <= max_step, joined_before = fabsf(d0 - d[i - 1]) <= max_step;
         const int some = (r1 > r0) & (r1 >= at) & (at < end), more = (r1 >= at + 1) & (at + 1 < end);
         k->column[i] = column;
         k->disparity[i] = d0 + (at - r0) * ((d1 - d0) / (r1 - r0));
-        k->columns[i] = joined ? (some ? (more ? MANY : 1) : 0) : d0 == d0 ? MANY : 0;
+        const int amid = joined & joined_before;
+        k->columns[i] = amid ? (some ? (more ? MANY : 1) : 0) : d0 == d0 ? MANY : 0;
     }
 }
 
-/* What the pixels from `first` on leave in a row of the right image; `d` holds one more, NaN behind the last. */
+/* What the pixels from `first` on leave in a row of the right image; `d` holds one more on either side, NaN beyond
+ * the ends of the row. A surface ends half a pixel beyond the centre of its last, as in the left image: if the
+ * column nearest to that centre lies beyond it, it gets the last pixel's disparity, at the surface's begin
+ * likewise. */
 static void put_block(const float *d, ptrdiff_t first, ptrdiff_t pixels, ptrdiff_t width, float max_step,
                       float *row) {
     if (!has_any(d)) {
@@ -73,10 +77,15 @@ static void put_block(const float *d, ptrdiff_t first, ptrdiff_t pixels, ptrdiff
             float *at = k.columns[i] ? row + k.column[i] : &nowhere;
             nowhere = 0;
             *at = *at >= k.disparity[i] ? *at : k.disparity[i];
-        } else if (fabsf(d[i + 1] - d[i]) <= max_step) {
+            continue;
+        }
+        const int joined = fabsf(d[i + 1] - d[i]) <= max_step, joined_before = fabsf(d[i] - d[i - 1]) <= max_step;
+        if (joined) {
             put_segment(row, width, first + i, d[i], d[i + 1]);
-        } else {
-            put(row, width, (ptrdiff_t)llrintf((float)(first + i) - d[i]), d[i]);
+        }
+        const float r = (float)(first + i) - d[i], nearest = rintf(r);
+        if (!(joined && nearest >= r) && !(joined_before && nearest <= r)) {
+            put(row, width, (ptrdiff_t)nearest, d[i]);
         }
     }
 }
@@ -89,14 +98,18 @@ void transfer_disparity(const float *left, ptrdiff_t height, ptrdiff_t left_widt
         for (ptrdiff_t r = 0; r < right_width; r++) {
             row[r] = NAN;
         }
-        ptrdiff_t first = 0;
-        for (; first + BLOCK < left_width; first += BLOCK) {
-            put_block(d + first, first, BLOCK, right_width, max_step, row);
+        for (ptrdiff_t first = 0; first < left_width; first += BLOCK) {
+            const ptrdiff_t left_over = left_width - first, pixels = left_over < BLOCK ? left_over : BLOCK;
+            float around[BLOCK + 2];
+            const float *block_of_row = d + first;
+            if (first == 0 || left_over <= BLOCK) {
+                for (ptrdiff_t i = 0; i < BLOCK + 2; i++) {
+                    const ptrdiff_t x = first + i - 1;
+                    around[i] = x >= 0 && x < left_width ? d[x] : NAN;
+                }
+                block_of_row = around + 1;
+            }
+            put_block(block_of_row, first, pixels, right_width, max_step, row);
         }
-        float last[BLOCK + 1];
-        for (ptrdiff_t i = 0; i <= BLOCK; i++) {
-            last[i] = first + i < left_width ? d[first + i] : NAN;
-        }
-        put_block(last, first, left_width - first, right_width, max_step, row);
     }
 }
