@@ -997,6 +997,13 @@ def test_bounds_of_the_passes_over_offsets_are_kept(function, name, wrong):
         call(function, {**arguments(function), name: wrong})
 
 
+@pytest.mark.parametrize("count", [0, 2049])
+def test_impossible_numbers_of_seeds_are_refused(count):
+    seeds = {name: np.zeros(count) for name in ("columns", "rows", "values")}
+    with pytest.raises(ValueError, match="1 to 2048 seeds"):
+        call("seed_planes", {**arguments("seed_planes"), **seeds})
+
+
 @pytest.mark.parametrize("size", [(0, 5), (33, 32)])
 def test_windows_of_impossible_sizes_are_refused(size):
     places = {f"out {name}": np.zeros((3, *size), np.float32) for name in ("columns", "rows")}
