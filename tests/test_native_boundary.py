@@ -456,6 +456,7 @@ def ties_arguments():
             "out roughness": floats(count),
         },
         "place_windows": {
+            "backend": "scalar",
             "places": np.zeros((count, 2)),
             "slopes": np.ones((count, 2)),
             "pixel_from_ray": np.eye(3),
