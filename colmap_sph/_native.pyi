@@ -812,6 +812,7 @@ def fit_surfaces(
     """
 
 def place_windows(
+    backend: str,
     places: NDArray[np.floating[Any]],
     slopes: NDArray[np.floating[Any]],
     pixel_from_ray: NDArray[np.floating[Any]],
@@ -825,6 +826,7 @@ def place_windows(
 ) -> None:
     """Where an image shows the pixels of sloping windows around places of a rectified pair.
 
+    backend : str
     places : (POINTS, 2) float64
     slopes : (POINTS, 2) float64
     pixel_from_ray : (3, 3) float64

@@ -301,7 +301,8 @@ def place_windows(rng: Random) -> Arguments:
     inputs = [filled(rng, shape, np.float64) for shape in ((count, 2), (count, 2), (3, 3))]
     pairs = (number(rng), number(rng)), (number(rng), number(rng))
     shape = (count, *rng.integers(1, 33, 2).tolist())
-    return [*inputs, *pairs, bool(rng.integers(2)), number(rng), *(np.zeros(shape, np.float32) for _ in range(2))]
+    values = [*inputs, *pairs, bool(rng.integers(2)), number(rng)]
+    return [backend(rng), *values, *(np.zeros(shape, np.float32) for _ in range(2))]
 
 
 def make_templates(rng: Random) -> Arguments:

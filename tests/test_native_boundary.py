@@ -456,6 +456,7 @@ def ties_arguments():
             "out roughness": floats(count),
         },
         "place_windows": {
+            "backend": "scalar",
             "places": np.zeros((count, 2)),
             "slopes": np.ones((count, 2)),
             "pixel_from_ray": np.eye(3),
@@ -995,6 +996,13 @@ def test_windows_about_numbers_out_of_this_world():
 def test_bounds_of_the_passes_over_offsets_are_kept(function, name, wrong):
     with pytest.raises(ValueError, match="must"):
         call(function, {**arguments(function), name: wrong})
+
+
+@pytest.mark.parametrize("count", [0, 2049])
+def test_impossible_numbers_of_seeds_are_refused(count):
+    seeds = {name: np.zeros(count) for name in ("columns", "rows", "values")}
+    with pytest.raises(ValueError, match="1 to 2048 seeds"):
+        call("seed_planes", {**arguments("seed_planes"), **seeds})
 
 
 @pytest.mark.parametrize("size", [(0, 5), (33, 32)])

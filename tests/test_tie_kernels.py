@@ -64,7 +64,8 @@ def test_maps_smaller_than_a_window_have_no_plane(shape):
     ("surface", "columns_by"), [("spherical", "flat"), ("spherical", "angles"), ("frame", "flat")]
 )
 @pytest.mark.parametrize("coarse", [1.0, 0.02])
-def test_windows_are_placed_where_the_geometry_says(surface, columns_by, coarse):
+@pytest.mark.parametrize("backend", _native.backends())
+def test_windows_are_placed_where_the_geometry_says(surface, columns_by, coarse, backend):
     """Coarse ones are wider than sines of small angles are good for."""
     scene, left, right = scene_of_pair(syn.convergent_pair())
     options = RectificationOptions(surface=surface, columns=columns_by)
@@ -74,6 +75,7 @@ def test_windows_are_placed_where_the_geometry_says(surface, columns_by, coarse)
     slopes = rng.uniform((0.5, -0.5), (1.5, 0.5), (40, 2))
     columns, rows = np.empty((40, 5, 7), np.float32), np.empty((40, 5, 7), np.float32)
     _native.place_windows(
+        backend,
         places,
         slopes,
         pixel_from_rectified_ray(right, geometry),
@@ -95,11 +97,30 @@ def test_windows_are_placed_where_the_geometry_says(surface, columns_by, coarse)
     np.testing.assert_allclose(found[near], expected[near], rtol=1e-5, atol=0.01)
 
 
+@pytest.mark.parametrize("backend", _native.backends())
+@pytest.mark.parametrize("size", [(15, 15), (17, 17), (3, 40), (33, 1)])
+@pytest.mark.parametrize("flatness", [None, 0.0, 0.7])
+def test_all_versions_place_windows_alike(backend, size, flatness):
+    """On a plane, on the sphere, with flat columns; narrow ones and wide ones, and where there is no place."""
+    rng = np.random.default_rng(2)
+    places, slopes = rng.uniform(-900, 900, (50, 2)), rng.uniform((0.5, -0.5), (1.5, 0.5), (50, 2))
+    places[:5, 0], places[5:9, 1] = [np.nan, np.inf, -np.inf, 1e300, 1e9], [np.nan, np.inf, 1e300, -1e9]
+    camera = np.array([[700, 3, 320], [-2, 690, 240], [0.01, -0.02, 1]])
+    for scale in (50.0, 800.0):
+        found = []
+        for version in (backend, "scalar"):
+            found.append(np.empty((2, 50, *size), np.float32))
+            origins, scales = (20.5, -3.5), (scale, scale + 1)
+            how = origins, scales, flatness is not None, flatness or 0.0
+            _native.place_windows(version, places, slopes, camera, *how, *found[-1])
+        np.testing.assert_array_equal(*found)
+
+
 def test_what_lies_behind_is_outside_of_the_image():
     columns, rows = np.empty((1, 3, 3), np.float32), np.empty((1, 3, 3), np.float32)
     behind = np.diag([1.0, 1.0, -1.0])
     _native.place_windows(
-        np.zeros((1, 2)), np.ones((1, 2)), behind, (0.0, 0.0), (9.0, 9.0), True, 0.9, columns, rows
+        "scalar", np.zeros((1, 2)), np.ones((1, 2)), behind, (0.0, 0.0), (9.0, 9.0), True, 0.9, columns, rows
     )
     assert (columns < -1).all() and (rows < -1).all()
 

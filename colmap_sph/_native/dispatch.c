@@ -47,6 +47,7 @@
      source_pixels_##version, \
      resample_##version, \
      sharpen_##version, \
+     place_windows_##version, \
      depth_candidates_##version, \
      vote_depth_##version, \
      compare_depths_##version, \
@@ -85,6 +86,7 @@ static const kernel_table avx512_kernels = TABLE(avx512);
 #define source_pixels_neon source_pixels_scalar
 #define resample_neon resample_scalar
 #define sharpen_neon sharpen_scalar
+#define place_windows_neon place_windows_scalar
 #define depth_candidates_neon depth_candidates_scalar
 #define vote_depth_neon vote_depth_scalar
 #define compare_depths_neon compare_depths_scalar

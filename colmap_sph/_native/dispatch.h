@@ -5,6 +5,7 @@
 #include "depth/depth.h"
 #include "images/images.h"
 #include "matching/matching.h"
+#include "ties/ties.h"
 
 typedef struct {
     const char *name;
@@ -21,6 +22,7 @@ typedef struct {
     source_pixels_fn *source_pixels;
     resample_fn *resample;
     sharpen_fn *sharpen;
+    place_windows_fn *place_windows;
     depth_candidates_fn *depth_candidates;
     vote_depth_fn *vote_depth;
     compare_depths_fn *compare_depths;

@@ -15,7 +15,6 @@ static void run_transfer_disparity(const kernel_table *k, image_size size) {
 }
 
 static void run_place_windows(const kernel_table *k, image_size size) {
-    (void)k;
     FILL(double, places, 2 * PIXELS, real_between(-4000, 4000))
     FILL(double, slopes, 2 * PIXELS, 1 + real_between(-0.5f, 0.5f))
     const double matrix[] = {700, 3, 320, -2, 690, 240, 0.01, -0.02, 1};
@@ -26,7 +25,7 @@ static void run_place_windows(const kernel_table *k, image_size size) {
     for (int kind = 0; kind < 3; kind++) {
         for (int scale = 6; scale <= 600; scale *= 10) { /* wide and narrow windows have sines of two kinds */
             const rectified_camera camera = {matrix, 20.5, -3.5, scale, scale + 1, kind > 0, flatness[kind]};
-            place_windows(places, slopes, camera, PIXELS, 7, 9, columns, rows);
+            k->place_windows(places, slopes, camera, PIXELS, 7, 9, columns, rows);
             add_floats_to_hash(columns, WINDOW * PIXELS);
             add_floats_to_hash(rows, WINDOW * PIXELS);
         }

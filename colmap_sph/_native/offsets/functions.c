@@ -267,7 +267,7 @@ ARGUMENTS(seed_planes, SEED_PLANES);
 
 static int check_seed_planes(const void *arguments) {
     const seed_planes_arguments *a = arguments;
-    return check(a->size.POINTS > 0, "there must be a seed") &&
+    return check(a->size.POINTS > 0 && a->size.POINTS <= MAX_SEEDS, "there must be 1 to 2048 seeds") &&
            check(a->neighbours > 0 && a->neighbours <= MAX_NEIGHBOURS, "the neighbours must lie in 1..32") &&
            check(a->cell > 0, "a cell must have a pixel");
 }

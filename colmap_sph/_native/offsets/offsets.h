@@ -65,7 +65,7 @@ void disparity_range(const float *disparity, ptrdiff_t pixels, float ends[2]);
 void code_disparity(const float *disparity, ptrdiff_t pixels, float least, float step, uint16_t *codes);
 void decode_disparity(const uint16_t *codes, ptrdiff_t pixels, float least, float step, float *disparity);
 
-enum { MAX_NEIGHBOURS = 32 };
+enum { MAX_SEEDS = 2048, MAX_NEIGHBOURS = 32 };
 
 /* Sparse points of a pair: what is known (`values`) at some places of an image. */
 typedef struct {

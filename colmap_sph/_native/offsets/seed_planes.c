@@ -1,34 +1,30 @@
 /* What sparse points tell of the places between them. */
 #include <float.h>
+#include <math.h>
 
 #include "offsets/offsets.h"
 
-enum { BLOCK = 64 };
+/* Cells of a tile's side: what may be near one of them is found for all of a tile at once. */
+enum { TILE = 4 };
 
-/* The seeds around a place, nearest first; of those as near as each other, that with the lower number. */
+/* Seeds around a place, nearest first; of those as near as each other, that with the lower number. */
 typedef struct {
-    int count;
-    ptrdiff_t seed[MAX_NEIGHBOURS];
-    double distance_squared[MAX_NEIGHBOURS];
+    int count, seed[MAX_SEEDS];
+    double distance_squared[MAX_SEEDS];
 } nearest_seeds;
 
-static double distance_squared_to(seed_list seeds, ptrdiff_t s, double x, double y) {
-    const double dx = seeds.columns[s] - x, dy = seeds.rows[s] - y;
-    return dx * dx + dy * dy;
-}
-
-/* Adds a seed that is near enough, unless it is there. */
-static void add_seed(nearest_seeds *near, int neighbours, ptrdiff_t seed, double distance_squared) {
+/* Adds a seed if it is among the nearest `most`. */
+ALWAYS_INLINE void add_seed(nearest_seeds *near, int most, int seed, double distance_squared) {
     int place = near->count;
     while (place > 0 &&
            (near->distance_squared[place - 1] > distance_squared ||
             (near->distance_squared[place - 1] == distance_squared && near->seed[place - 1] > seed))) {
         place--;
     }
-    if (place == neighbours || (place > 0 && near->seed[place - 1] == seed)) {
+    if (place == most) {
         return;
     }
-    near->count += near->count < neighbours;
+    near->count += near->count < most;
     for (int i = near->count - 1; i > place; i--) {
         near->seed[i] = near->seed[i - 1];
         near->distance_squared[i] = near->distance_squared[i - 1];
@@ -37,27 +33,21 @@ static void add_seed(nearest_seeds *near, int neighbours, ptrdiff_t seed, double
     near->distance_squared[place] = distance_squared;
 }
 
-/* From those near the place before, which most often are near this one, too: what is farther than all of them is
- * soon passed over. */
-static nearest_seeds seeds_near(seed_list seeds, int neighbours, double x, double y, const nearest_seeds *before) {
-    nearest_seeds near = {.count = 0};
-    for (int i = 0; i < before->count; i++) {
-        add_seed(&near, neighbours, before->seed[i], distance_squared_to(seeds, before->seed[i], x, y));
+/* Of the first `count` of those numbered, the nearest `most` within a distance of a place. */
+static void find_near(seed_list seeds, const int *numbers, ptrdiff_t count, double x, double y, int most,
+                      double max_squared, nearest_seeds *near) {
+    double distance_squared[MAX_SEEDS];
+    for (ptrdiff_t i = 0; i < count; i++) {
+        const double dx = seeds.columns[numbers[i]] - x, dy = seeds.rows[numbers[i]] - y;
+        distance_squared[i] = dx * dx + dy * dy;
     }
-    for (ptrdiff_t first = 0; first < seeds.count; first += BLOCK) {
-        const ptrdiff_t left = seeds.count - first, count = left < BLOCK ? left : BLOCK;
-        double distance_squared[BLOCK];
-        for (ptrdiff_t i = 0; i < count; i++) {
-            distance_squared[i] = distance_squared_to(seeds, first + i, x, y);
-        }
-        for (ptrdiff_t i = 0; i < count; i++) {
-            const double farthest = near.count < neighbours ? DBL_MAX : near.distance_squared[neighbours - 1];
-            if (distance_squared[i] <= farthest) {
-                add_seed(&near, neighbours, first + i, distance_squared[i]);
-            }
+    near->count = 0;
+    for (ptrdiff_t i = 0; i < count; i++) {
+        const double farthest = near->count < most ? max_squared : near->distance_squared[most - 1];
+        if (distance_squared[i] <= farthest) {
+            add_seed(near, most, numbers[i], distance_squared[i]);
         }
     }
-    return near;
 }
 
 /* The value at (x, y) of the plane through the seeds near it, by least squares. */
@@ -88,15 +78,37 @@ static double plane_at(seed_list seeds, seed_weights weights, double x, double y
     return (c0 * b0 + c1 * b1 + c2 * b2) / (n * c0 + sx * c1 + sy * c2);
 }
 
+static double centre_of(ptrdiff_t cells, ptrdiff_t cell) { return ((double)cells + 0.5) * (double)cell - 0.5; }
+
 void seed_planes(seed_list seeds, seed_weights weights, ptrdiff_t cell, ptrdiff_t height, ptrdiff_t width,
                  float *values) {
-    nearest_seeds near = {.count = 0};
-    for (ptrdiff_t y = 0; y < height; y++) {
-        for (ptrdiff_t x = 0; x < width; x++) {
-            const double column = ((double)x + 0.5) * (double)cell - 0.5;
-            const double row = ((double)y + 0.5) * (double)cell - 0.5;
-            near = seeds_near(seeds, weights.neighbours, column, row, &near);
-            values[y * width + x] = (float)plane_at(seeds, weights, column, row, &near);
+    /* What is near a cell is no farther from its tile's middle than the farthest of as many that are near that,
+     * and two ways from there to the cell; a little is left for rounding. */
+    const double ways = (double)cell * (TILE - 1) * sqrt(2), middle = 0.5 * (double)cell * (TILE - 1);
+    const double enough = 1 + 1e-9;
+    const int most = weights.neighbours;
+    int all[MAX_SEEDS];
+    for (int s = 0; s < (int)seeds.count; s++) {
+        all[s] = s;
+    }
+    nearest_seeds listed, near;
+    for (ptrdiff_t top = 0; top < height; top += TILE) {
+        for (ptrdiff_t left = 0; left < width; left += TILE) {
+            const double column = centre_of(left, cell) + middle, row = centre_of(top, cell) + middle;
+            find_near(seeds, all, seeds.count, column, row, most, DBL_MAX, &near);
+            double reach = DBL_MAX;
+            if (near.count == most) {
+                reach = (sqrt(near.distance_squared[most - 1]) + ways) * enough;
+                reach *= reach;
+            }
+            find_near(seeds, all, seeds.count, column, row, MAX_SEEDS, reach, &listed);
+            for (ptrdiff_t y = top; y < top + TILE && y < height; y++) {
+                for (ptrdiff_t x = left; x < left + TILE && x < width; x++) {
+                    const double at_column = centre_of(x, cell), at_row = centre_of(y, cell);
+                    find_near(seeds, listed.seed, listed.count, at_column, at_row, most, DBL_MAX, &near);
+                    values[y * width + x] = (float)plane_at(seeds, weights, at_column, at_row, &near);
+                }
+            }
         }
     }
 }

@@ -30,6 +30,7 @@ FUNCTION(fit_surfaces, FIT_SURFACES, any,
          "Planes through the disparities around places, and how far these are from them; infinite where too few.");
 
 #define PLACE_WINDOWS(X) \
+    X(VALUE, backend, backend) \
     X(IN, float64, places, POINTS, 2) \
     X(IN, float64, slopes, POINTS, 2) \
     X(IN, float64, pixel_from_ray, 3, 3) \
@@ -50,7 +51,8 @@ static int run_place_windows(void *arguments) {
     const place_windows_arguments *a = arguments;
     const rectified_camera camera = {a->pixel_from_ray, a->origins.first, a->origins.second, a->scales.first,
                                      a->scales.second,  a->spherical,     a->flatness};
-    place_windows(a->places, a->slopes, camera, a->size.POINTS, a->size.H, a->size.W, a->columns, a->rows);
+    a->backend->place_windows(a->places, a->slopes, camera, a->size.POINTS, a->size.H, a->size.W, a->columns,
+                              a->rows);
     return 0;
 }
 

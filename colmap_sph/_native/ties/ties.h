@@ -1,5 +1,4 @@
-/* Kernels of ties: small windows of the left image of a pair, found in the right one by least squares. They are
- * few; one version serves all processors. */
+/* Kernels of ties: small windows of the left image of a pair, found in the right one by least squares. */
 #ifndef COLMAP_SPH_TIES_H
 #define COLMAP_SPH_TIES_H
 
@@ -33,8 +32,10 @@ typedef struct {
 
 /* Where the image shows the pixels of windows around places, as cv2.remap counts; far outside where it does not.
  * A window's pixel (i, j) from its middle lies in column place + slopes · (i, j), row place + j. */
-void place_windows(const double *places, const double *slopes, rectified_camera camera, ptrdiff_t count,
-                   ptrdiff_t height, ptrdiff_t width, float *columns, float *rows);
+typedef void place_windows_fn(const double *places, const double *slopes, rectified_camera camera, ptrdiff_t count,
+                              ptrdiff_t height, ptrdiff_t width, float *columns, float *rows);
+
+place_windows_fn place_windows_scalar, place_windows_avx2, place_windows_avx512bw, place_windows_avx512;
 
 /* Windows, without their rim of one pixel, with mean 0 and standard deviation 1, but for `least_contrast`; how
  * they change with each parameter, 4 rows of pixels; and the 4 x 4 normal matrix of that. */

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.scene import View
+from colmap_sph.stereo.kernels import backend
 from colmap_sph.stereo.rectified_pair import (
     Float,
     RectifiedPair,
@@ -299,6 +300,7 @@ def read_windows(
     columns = np.empty((len(places), length, length), dtype=np.float32)
     rows = np.empty_like(columns)
     _native.place_windows(
+        backend(),
         places,
         slopes,
         pixel_from_rectified_ray(view, geometry),
