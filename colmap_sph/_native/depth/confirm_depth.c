@@ -43,7 +43,7 @@ static float surface_share(const float *depth, const float *sigma, const uint8_t
 
 void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                    const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
-                   uint8_t *contradicting, float *weighted_depth, float *weight) {
+                   uint8_t *contradicting, float *weighted_shift, float *weight) {
     const int least = options->min_consistent > 0, may_miss = options->min_surface > 0 ? options->may_miss : 0;
     uint8_t *fates = contradicting;
     for (ptrdiff_t p = 0; p < height * width; p++) {
@@ -53,8 +53,8 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
         const int enough = missing <= (contradicting[p] > 0 ? 0 : may_miss);
         fates[p] = fits ? enough ? KEPT : OF_SURFACE : DROPPED;
         const float squared = depth[p] * depth[p], own = squared * squared / (sigma[p] * sigma[p]);
-        const float mean = 1 / (1 / depth[p] + weighted_depth[p] / (weight[p] + own));
-        weighted_depth[p] = mean;
+        const float mean = 1 / (1 / depth[p] + weighted_shift[p] / (weight[p] + own));
+        weighted_shift[p] = mean;
         weight[p] = mean * mean / __builtin_sqrtf(weight[p] + own);
     }
     for (ptrdiff_t row = 0; row < height; row++) {
@@ -63,7 +63,7 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
             if (fates[p] == KEPT && agreeing[p] < WELL_CONFIRMED) {
                 const int wanted = wanted_views(options, observing[p]);
                 const float share =
-                    surface_share(weighted_depth, weight, fates, height, width, row, column, options->steepest);
+                    surface_share(weighted_shift, weight, fates, height, width, row, column, options->steepest);
                 /* Either way it stays part of its neighbours' surfaces. */
                 fates[p] = share < least_surface(options->min_surface, agreeing[p], wanted) ? OF_SURFACE : KEPT;
             }
@@ -71,7 +71,7 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
     }
     for (ptrdiff_t p = 0; p < height * width; p++) {
         if (fates[p] != KEPT) {
-            weighted_depth[p] = weight[p] = 0;
+            weighted_shift[p] = weight[p] = 0;
             agreeing[p] = 0;
         }
     }
