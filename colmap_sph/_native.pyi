@@ -420,7 +420,7 @@ def compare_depths(
     observing: NDArray[np.uint8],
     agreeing: NDArray[np.uint8],
     contradicting: NDArray[np.uint8],
-    weighted_depth: NDArray[np.float32],
+    weighted_shift: NDArray[np.float32],
     weight: NDArray[np.float32],
     /,
 ) -> None:
@@ -441,7 +441,7 @@ def compare_depths(
     observing : (H, W) uint8, written
     agreeing : (H, W) uint8, written
     contradicting : (H, W) uint8, written
-    weighted_depth : (H, W) float32, written
+    weighted_shift : (H, W) float32, written
     weight : (H, W) float32, written
     """
 
@@ -456,11 +456,11 @@ def confirm_depth(
     observing: NDArray[np.uint8],
     agreeing: NDArray[np.uint8],
     contradicting: NDArray[np.uint8],
-    weighted_depth: NDArray[np.float32],
+    weighted_shift: NDArray[np.float32],
     weight: NDArray[np.float32],
     /,
 ) -> None:
-    """Turn the sums of compare_depths into the geometric map: `weighted_depth` becomes depth, `weight` its
+    """Turn the sums of compare_depths into the geometric map: `weighted_shift` becomes depth, `weight` its
     deviation, `agreeing` its support; `contradicting` is spoilt.
 
     depth : (H, W) float32
@@ -473,7 +473,7 @@ def confirm_depth(
     observing : (H, W) uint8
     agreeing : (H, W) uint8, written
     contradicting : (H, W) uint8, written
-    weighted_depth : (H, W) float32, written
+    weighted_shift : (H, W) float32, written
     weight : (H, W) float32, written
     """
 

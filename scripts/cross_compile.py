@@ -4,11 +4,11 @@
     apt install llvm qemu-user libc6-arm64-cross wine64
     python scripts/cross_compile.py --output FOLDER
 
-For each target, zig's clang makes a wheel, and the program of tests/kernel_hashes; a warning is an error. Checked
-of the wheel's module: the file's format; that it exports PyInit__native, takes of Python only the stable interface
-(abi3audit) and of other libraries only the system's, of glibc what 2.28 has; and that it holds what only the
-kernels of the target's instruction sets have (llvm-objdump). The program runs here, under qemu-user and Wine: it
-compares the versions of kernels with the scalar ones, and must say the same on every target.
+For each target, zig's clang makes a wheel, and of its kernels the program of tests/kernel_hashes; a warning is an
+error. Checked of the wheel's module: the file's format; that it exports PyInit__native, takes of Python only the
+stable interface (abi3audit) and of other libraries only the system's, of glibc what 2.28 has; and that it holds
+what only the kernels of the target's instruction sets have (llvm-objdump). The program runs here, under qemu-user
+and Wine: it compares the versions of kernels with the scalar ones, and must say the same on every target.
 
 Exit code 0: all passed, 1: something failed, 2: nothing failed, but something was not checked, for want of a
 program of those above. What no program can check here, macOS's kernels at work, is said and no failure.
@@ -66,7 +66,7 @@ class Build:
 
     @property
     def program(self) -> Path:
-        return self.folder / "hashes" / f"kernel_hashes{self.target.program_suffix}"
+        return self.folder / "wheel" / f"kernel_hashes{self.target.program_suffix}"
 
     @property
     def module(self) -> Path:
@@ -105,28 +105,20 @@ def definitions(build: Build) -> dict[str, str]:
         "CMAKE_SYSTEM_NAME": build.target.system,
         "CMAKE_SYSTEM_PROCESSOR": build.target.processor,
         "CMAKE_COMPILE_WARNING_AS_ERROR": "ON",
+        "COLMAP_SPH_KERNEL_HASHES": "ON",
         "CMAKE_LINK_DEPENDS_USE_LINKER": "OFF",  # zig's linker writes no such lists
     }
 
 
-def build_program(build: Build) -> None:
-    """Compile the kernels with the program that hashes their results."""
-    defined = {**definitions(build), "CMAKE_BUILD_TYPE": "Release", "COLMAP_SPH_KERNEL_HASHES": "ON"}
-    words = [f"-D{name}={value}" for name, value in defined.items()]
-    folder = build.program.parent
-    run([sys.executable, "-m", "cmake", "-G", "Ninja", "-S", _REPOSITORY, "-B", folder, *words])
-    run([sys.executable, "-m", "cmake", "--build", folder])
-
-
 def build_wheel(build: Build) -> Path:
-    """The target's wheel, made as `pip wheel` would make it there."""
+    """The target's wheel, made as `pip wheel` would make it there; and, of its kernels, `Build.program`."""
     defined = {**definitions(build), "Python_INCLUDE_DIR": str(write_headers(build.folder, build.target))}
     if build.target.system == "Windows":
         defined["Python_SABI_LIBRARY"] = str(
             write_import_library(build.folder, _REPOSITORY / "colmap_sph/_native")
         )
     settings = {f"cmake.define.{name}": value for name, value in defined.items()}
-    settings |= {"build-dir": str(build.folder / "wheel"), "install.strip": "false"}
+    settings |= {"build-dir": str(build.program.parent), "install.strip": "false"}
     call = f"from scikit_build_core.build import build_wheel as b; print(b({str(build.folder)!r}, {settings!r}))"
     environment = {"_PYTHON_HOST_PLATFORM": build.target.platform, "CMAKE_GENERATOR": "Ninja"}
     wheel = build.folder / run([sys.executable, "-c", call], environment).splitlines()[-1]
@@ -241,7 +233,6 @@ def check_target(build: Build, hashes: dict[str, list[str]]) -> tuple[list[str],
     build.folder.mkdir(parents=True, exist_ok=True)
     wheel = build_wheel(build)
     right.append(f"built {wheel.name} without a warning")
-    build_program(build)
     checks: list[Callable[[], str]] = [
         lambda: check_interface(build),
         lambda: check_stable_interface(build, wheel),

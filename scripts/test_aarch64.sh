@@ -12,7 +12,6 @@ folder=$(realpath -m "${1:?give a folder for builds and an aarch64 Python}")
 shift
 cd "$(dirname "${BASH_SOURCE[0]}")/.."
 root=$folder/root site=$folder/site package=$folder/package
-aarch64=(-DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc)
 emulator=(nice -n 5 qemu-aarch64 -L "$root")
 
 unpack_python() {
@@ -42,24 +41,25 @@ install_packages() {
 build() {  # build NAME OPTIONS...
     local name=$1
     shift
-    cmake -G Ninja -S . -B "$folder/$name" --log-level=WARNING -DCMAKE_BUILD_TYPE=Release -DCMAKE_C_FLAGS=-Werror "$@"
+    cmake -G Ninja -S . -B "$folder/$name" --log-level=WARNING -DCMAKE_BUILD_TYPE=Release -DCMAKE_C_FLAGS=-Werror \
+        -DCOLMAP_SPH_KERNEL_HASHES=ON "$@"
     cmake --build "$folder/$name" -- --quiet
 }
 
 [ -x "$root/usr/bin/python3" ] || unpack_python
 [ -d "$site/numpy" ] || install_packages
 
-build hashes -DCOLMAP_SPH_KERNEL_HASHES=ON
-build hashes-aarch64 -DCOLMAP_SPH_KERNEL_HASHES=ON "${aarch64[@]}"
-"$folder/hashes/kernel_hashes" >"$folder/hashes.txt"
-"${emulator[@]}" "$folder/hashes-aarch64/kernel_hashes" >"$folder/hashes-aarch64.txt"
+include=$(echo "$root"/usr/include/python3.*)
+build here -DCOLMAP_SPH_MODULE=OFF
+build aarch64 -DCMAKE_SYSTEM_NAME=Linux -DCMAKE_SYSTEM_PROCESSOR=aarch64 -DCMAKE_C_COMPILER=aarch64-linux-gnu-gcc \
+    -DPython_INCLUDE_DIR="$include" -DCMAKE_C_FLAGS="-Werror -isystem $root/usr/include"
+"$folder/here/kernel_hashes" >"$folder/hashes.txt"
+"${emulator[@]}" "$folder/aarch64/kernel_hashes" >"$folder/hashes-aarch64.txt"
 cmp "$folder"/hashes{,-aarch64}.txt
 
-include=$(echo "$root"/usr/include/python3.*)
-build module "${aarch64[@]}" -DPython_INCLUDE_DIR="$include" -DCMAKE_C_FLAGS="-Werror -isystem $root/usr/include"
 rm -rf "$package" && mkdir "$package"
-cp -r colmap_sph "$package" && cp "$folder"/module/_native*.so "$package/colmap_sph"
-# Without conftest.py, which needs pycolmap: that is not made for aarch64.
-PYTHONSAFEPATH=1 PYTHONDONTWRITEBYTECODE=1 PYTHONPATH=$package:$site "${emulator[@]}" "$root/usr/bin/python3" \
-    -m pytest -q --noconftest -p no:cacheprovider -k "not the_stub" \
-    tests/test_kernels.py tests/test_native_boundary.py "$@"
+cp -r colmap_sph "$package" && cp "$folder"/aarch64/_native*.so "$package/colmap_sph"
+# Without conftest.py, which needs pycolmap: that is not made for aarch64. Each file by a process of its own.
+export PYTHONSAFEPATH=1 PYTHONDONTWRITEBYTECODE=1 PYTHONPATH=$package:$site
+printf '%s\n' tests/test_{kernels,native_boundary}.py | xargs -P "$(nproc)" -I FILE \
+    "${emulator[@]}" "$root/usr/bin/python3" -m pytest -q --noconftest -p no:cacheprovider -k "not the_stub" "$@" FILE

@@ -578,6 +578,29 @@ def test_averaging_with_partners_reduces_noise():
     assert confirmed.sigma[kept].mean() == pytest.approx(0.02 / np.sqrt(5), rel=1e-3)
 
 
+@pytest.mark.parametrize("exponent", [-40, 40])
+def test_depth_is_confirmed_alike_in_all_units(exponent):
+    """Also where a power of depths that is no float enters: powers of two change nothing else."""
+    rng = np.random.default_rng(4)
+    views, maps = wall_views(5)
+    noisy = [depth + np.float32(0.02) * rng.standard_normal(depth.shape).astype(np.float32) for depth in maps]
+    unit = np.float32(2.0**exponent)
+    rescaled = [replace(view, t=view.t * float(unit)) for view in views]
+
+    def confirmed(views, unit):
+        first, *others = (
+            DepthEstimate(depth * unit, np.full_like(depth, 0.02) * unit, np.full(depth.shape, 4, np.uint8))
+            for depth in noisy
+        )
+        return confirm_depth(views[0], first, zip(views[1:], others, strict=True), CONFIRM)
+
+    usual, other = confirmed(views, np.float32(1)), confirmed(rescaled, unit)
+    assert (usual.support >= 4).any()
+    np.testing.assert_array_equal(other.support, usual.support)
+    np.testing.assert_array_equal(other.depth, usual.depth * unit)
+    np.testing.assert_array_equal(other.sigma, usual.sigma * unit)
+
+
 def in_view(reference, other, depth):
     """Where the other view has the plane point of a reference pixel inside its image."""
     column, row = np.meshgrid(np.arange(reference.width), np.arange(reference.height))

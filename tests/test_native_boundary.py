@@ -198,7 +198,7 @@ def arguments(function):
             "out observing": np.zeros((H, W), u8),
             "out agreeing": np.zeros((H, W), u8),
             "out contradicting": np.zeros((H, W), u8),
-            "out weighted_depth": np.zeros((H, W), f32),
+            "out weighted_shift": np.zeros((H, W), f32),
             "out weight": np.zeros((H, W), f32),
         },
         "fuse_partner": {
@@ -285,7 +285,7 @@ def arguments(function):
             "observing": np.ones((H, W), u8),
             "out agreeing": np.ones((H, W), u8),
             "out contradicting": np.zeros((H, W), u8),
-            "out weighted_depth": np.zeros((H, W), f32),
+            "out weighted_shift": np.zeros((H, W), f32),
             "out weight": np.zeros((H, W), f32),
         },
         "fit_planes": {

@@ -84,6 +84,13 @@ def finished(pristine: Finished, tmp_path: Path) -> Iterator[Finished]:
     yield Finished(tmp_path / "project", pristine.report)
 
 
+@pytest.fixture
+def project(pristine: Finished, tmp_path: Path) -> Path:
+    """Its images and model alone."""
+    shutil.copytree(pristine.project, tmp_path / "project", ignore=shutil.ignore_patterns("dense"))
+    return tmp_path / "project"
+
+
 def results(dense: Path) -> dict[str, tuple[int, bytes]]:
     """Time stamp and content of everything that a stage wrote, but for the cloud's and the maps' records."""
     files = [*dense.glob("stereo/*_maps/*.bin"), *Workspace(dense).cloud_paths]
@@ -724,7 +731,6 @@ def test_two_runs_in_one_workspace(finished: Finished) -> None:
 
 def test_plan_of_a_new_workspace(project: Path) -> None:
     """Before undistortion: from the model's cameras, and nothing is written."""
-    keep_images(project, NAMES)
     before = sorted(project.rglob("*"))
     plan = make_plan(Project(project / "sparse/0"), OPTIONS)
     assert sorted(project.rglob("*")) == before
@@ -739,9 +745,8 @@ def test_plan_of_a_new_workspace(project: Path) -> None:
 
 
 def test_plan_of_reduced_images(project: Path) -> None:
-    keep_images(project, NAMES)
     whole = make_plan(Project(project / "sparse/0"), OPTIONS)
-    reduced = replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=160))
+    reduced = replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=WIDTH // 2))
     half = make_plan(Project(project / "sparse/0"), reduced)
     assert half.disk == pytest.approx(whole.disk / 4, rel=0.15)
     assert half.pairs == whole.pairs

@@ -50,10 +50,6 @@ def faces(rows: str, count: int = 1, kind: str = "uchar") -> bytes:
     return start + b"0 0 0\n1 0 0\n1 1 0\n0 1 0\n" + rows.encode()
 
 
-def many(what: str, count: int) -> bytes:
-    return header(*(what.format(number) for number in range(count)))
-
-
 BAD_PLY = {
     "index beyond": faces("3 0 1 4\n"),
     "index below": faces("3 0 1 -1\n"),
@@ -82,8 +78,6 @@ BAD_PLY = {
         f"element vertex 0\n{XYZ}element face 999999999\nproperty list uchar int vertex_indices",
         style="binary_little_endian",
     ),
-    "million elements": many("element e{0} 0", 1_000_000),
-    "million properties": many("property float x{0}", 1_000_000),
     "words": header(f"element vertex 2\n{XYZ}") + b"1 2 3\n1 two 3\n",
     "short row": header(f"element vertex 2\n{XYZ}") + b"1 2 3\n1 2\n",
     "long row": header(f"element vertex 1\n{XYZ}") + b"1 2 3 4\n",
@@ -127,6 +121,11 @@ def refuse_soon(path: Path, content: bytes) -> str:
 @pytest.mark.parametrize("case", BAD_PLY)
 def test_bad_ply(tmp_path: Path, case: str) -> None:
     refuse_soon(tmp_path / "x.ply", BAD_PLY[case])
+
+
+@pytest.mark.parametrize("line", ["element e{} 0", "property float x{}"])
+def test_a_million_lines_of_header(tmp_path: Path, line: str) -> None:
+    refuse_soon(tmp_path / "x.ply", header(*map(line.format, range(1_000_000))))
 
 
 @pytest.mark.parametrize("case", BAD_OBJ)

@@ -73,6 +73,18 @@ def test_other_errors_end_the_stage(error: type[BaseException]) -> None:
     assert len(begun) < 20
 
 
+def test_of_two_errors_that_of_the_first_item_is_told() -> None:
+    """Not that of the faster one; and not that of one that has not begun."""
+
+    def work(item: int) -> None:
+        time.sleep((0.0, 0.2, 0.0, 0.4)[item])
+        if item:
+            raise OutputError(f"no room for {item}")
+
+    with pytest.raises(OutputError, match="no room for 1"):
+        run(work, range(4), threads=2)
+
+
 def test_a_failed_item_keeps_no_memory() -> None:
     """The traceback of its error would keep all arrays of the work."""
     arrays: list[weakref.ref] = []

@@ -42,7 +42,8 @@ def for_all(
         Called once per item, in this thread, with its result, or None where there is none.
     skip : callable
         Called with an item that raised a `ColmapSphError` or found no memory, and the reason. Any other error,
-        a wrong option and an output that cannot be written end the stage.
+        a wrong option and an output that cannot be written end the stage; of two of these the first item's is
+        raised, whichever came first.
 
     Returns
     -------
@@ -58,8 +59,9 @@ def for_all(
                 result = None
                 try:
                     results[item] = result = future.result()
-                except _FATAL:
-                    raise
+                except _FATAL as error:
+                    pool.shutdown(wait=True, cancel_futures=True)
+                    raise _first_told(futures, items, {item: error}) from None
                 except ColmapSphError as error:
                     skip(item, str(error))
                 except (MemoryError, cv2.error) as error:
@@ -74,6 +76,15 @@ def for_all(
             pool.shutdown(wait=True, cancel_futures=True)
             raise
     return {item: results[item] for item in items if item in results}
+
+
+def _first_told(futures: dict[Future[R], T], items: Sequence[T], told: dict[T, BaseException]) -> BaseException:
+    """Of what ends a stage the error of the first item: items begin in their order, so it is always the same."""
+    for future, item in futures.items():
+        error = None if future.cancelled() else future.exception()
+        if isinstance(error, _FATAL):
+            told[item] = error
+    return next(told[item] for item in items if item in told)
 
 
 def refusal_of(error: BaseException) -> OutOfMemoryError | None:

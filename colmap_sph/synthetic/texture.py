@@ -8,6 +8,7 @@ Colours are RGB in [0, 1] as displayed.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -25,6 +26,23 @@ class Material(Protocol):
 
     def colour(self, coordinates: FloatArray) -> Float32Array:
         """RGB (N, 3) at texture coordinates (2, N) in metres."""
+
+
+@lru_cache(maxsize=4)
+def _random_fields(seed: int, size: int) -> tuple[Float32Array, Float32Array]:
+    """(size * size,) noise in octaves and (_CELLS, _CELLS) white noise: not to be changed, scenes share them."""
+    rng = np.random.default_rng(seed)
+    frequency = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size)[None, :])
+    spectrum = np.fft.rfft2(rng.standard_normal((size, size)))
+    lowest = 2.0 / 300.0
+    highest = 0.5 / 3.0
+    spectrum *= np.hypot(frequency, lowest) ** -0.75 / (1.0 + (frequency / highest) ** 8)
+    spectrum[0, 0] = 0.0
+    noise = np.fft.irfft2(spectrum, s=(size, size))
+    tile: Float32Array = (noise / noise.std()).astype(np.float32).ravel()
+    cells: Float32Array = rng.random((_CELLS, _CELLS), dtype=np.float32)
+    tile.flags.writeable = cells.flags.writeable = False
+    return tile, cells
 
 
 class Noise:
@@ -46,19 +64,10 @@ class Noise:
     """
 
     def __init__(self, gsd: float, seed: int = 0, *, tile: int = 1024) -> None:
-        rng = np.random.default_rng(seed)
         self.gsd = float(gsd)
         self._scale = 2.0 / self.gsd
         self._size = tile
-        frequency = np.hypot(np.fft.fftfreq(tile)[:, None], np.fft.rfftfreq(tile)[None, :])
-        spectrum = np.fft.rfft2(rng.standard_normal((tile, tile)))
-        lowest = 2.0 / 300.0
-        highest = 0.5 / 3.0
-        spectrum *= np.hypot(frequency, lowest) ** -0.75 / (1.0 + (frequency / highest) ** 8)
-        spectrum[0, 0] = 0.0
-        field_ = np.fft.irfft2(spectrum, s=(tile, tile))
-        self._tile: Float32Array = (field_ / field_.std()).astype(np.float32).ravel()
-        self._cells: Float32Array = rng.random((_CELLS, _CELLS), dtype=np.float32)
+        self._tile, self._cells = _random_fields(seed, tile)
 
     def sample(self, u: FloatArray, v: FloatArray, stretch: float = 1.0) -> Float32Array:
         """Field of zero mean and unit variance.

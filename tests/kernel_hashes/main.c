@@ -4,7 +4,8 @@
  * from the scalar kernels. The standard output depends on the results alone, so that those of two builds (another
  * processor, compiler or system) can be compared as files. Needs no Python:
  *
- *     cmake -S . -B build -DCOLMAP_SPH_KERNEL_HASHES=ON && cmake --build build && build/kernel_hashes
+ *     cmake -S . -B build -DCOLMAP_SPH_MODULE=OFF -DCOLMAP_SPH_KERNEL_HASHES=ON
+ *     cmake --build build && build/kernel_hashes
  *
  * `kernel_hashes --run VERSION KERNEL TIMES` calls one kernel so many times on a larger and calmer input, for
  * tools that count instructions, and prints the pixels of a call, or slots where it has 64 of them per pixel. */

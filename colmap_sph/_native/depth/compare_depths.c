@@ -163,7 +163,7 @@ void VERSION_OF(compare_depths)(const depth_map *reference, const depth_map *par
             add_counts(k.observed, count, sums->observing + first);
             add_counts(k.agreed, count, sums->agreeing + first);
             add_counts(k.contradicted, count, sums->contradicting + first);
-            add_depths(k.shift, k.agreed, count, sums->weighted_depth + first);
+            add_depths(k.shift, k.agreed, count, sums->weighted_shift + first);
             add_depths(k.weight, k.agreed, count, sums->weight + first);
         }
     }

@@ -43,7 +43,7 @@ static float surface_share(const float *depth, const float *sigma, const uint8_t
 
 void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                    const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
-                   uint8_t *contradicting, float *weighted_depth, float *weight) {
+                   uint8_t *contradicting, float *weighted_shift, float *weight) {
     const int least = options->min_consistent > 0, may_miss = options->min_surface > 0 ? options->may_miss : 0;
     uint8_t *fates = contradicting;
     for (ptrdiff_t p = 0; p < height * width; p++) {
@@ -52,18 +52,20 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
         const int fits = depth[p] > 0 && agreeing[p] >= least && (float)contradicting[p] <= most;
         const int enough = missing <= (contradicting[p] > 0 ? 0 : may_miss);
         fates[p] = fits ? enough ? KEPT : OF_SURFACE : DROPPED;
-        const float squared = depth[p] * depth[p], own = squared * squared / (sigma[p] * sigma[p]);
-        const float mean = 1 / (1 / depth[p] + weighted_depth[p] / (weight[p] + own));
-        weighted_depth[p] = mean;
-        weight[p] = mean * mean / __builtin_sqrtf(weight[p] + own);
+        /* Divided before it is squared: the fourth power of a depth in tiny or huge units is no float. */
+        const float precision = depth[p] * depth[p] / sigma[p], total = weight[p] + precision * precision;
+        const float mean = 1 / (1 / depth[p] + weighted_shift[p] / total);
+        weighted_shift[p] = mean;
+        weight[p] = mean * mean / __builtin_sqrtf(total);
     }
+    float *const confirmed = weighted_shift, *const deviation = weight;
     for (ptrdiff_t row = 0; row < height; row++) {
         for (ptrdiff_t column = 0; column < width; column++) {
             const ptrdiff_t p = row * width + column;
             if (fates[p] == KEPT && agreeing[p] < WELL_CONFIRMED) {
                 const int wanted = wanted_views(options, observing[p]);
                 const float share =
-                    surface_share(weighted_depth, weight, fates, height, width, row, column, options->steepest);
+                    surface_share(confirmed, deviation, fates, height, width, row, column, options->steepest);
                 /* Either way it stays part of its neighbours' surfaces. */
                 fates[p] = share < least_surface(options->min_surface, agreeing[p], wanted) ? OF_SURFACE : KEPT;
             }
@@ -71,7 +73,7 @@ void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptr
     }
     for (ptrdiff_t p = 0; p < height * width; p++) {
         if (fates[p] != KEPT) {
-            weighted_depth[p] = weight[p] = 0;
+            confirmed[p] = deviation[p] = 0;
             agreeing[p] = 0;
         }
     }

@@ -114,10 +114,11 @@ typedef struct {
 } consistency_gates;
 
 /* Of the partners so far, per pixel: how many observe the point, and see nothing in front of it, agree, and
- * contradict; and the running weighted sums of their inverse depths, carried to the pixel's ray, less its own. */
+ * contradict; and the running sums of weights, and of how much, so weighted, their inverse depths, carried to the
+ * pixel's ray, exceed its own. */
 typedef struct {
     uint8_t *observing, *agreeing, *contradicting;
-    float *weighted_depth, *weight;
+    float *weighted_shift, *weight;
 } consistency_sums;
 
 /* Adds the partner's verdict on every pixel of the reference. */
@@ -148,12 +149,12 @@ typedef struct {
     float steepest;          /* largest relative change of depth per pixel there */
 } confirmation;
 
-/* Turns the verdicts of all partners into the geometric map, in place: `weighted_depth` becomes depth, `weight`
+/* Turns the verdicts of all partners into the geometric map, in place: `weighted_shift` becomes depth, `weight`
  * its standard deviation, `agreeing` its support; zeros where the depth is not confirmed. `contradicting` is
  * spoilt. */
 void confirm_depth(const float *depth, const float *sigma, ptrdiff_t height, ptrdiff_t width,
                    const confirmation *options, const uint8_t *observing, uint8_t *agreeing,
-                   uint8_t *contradicting, float *weighted_depth, float *weight);
+                   uint8_t *contradicting, float *weighted_shift, float *weight);
 
 /* Moves the depths of fitted planes towards those they were fitted to, where neighbouring planes bend by more than
  * the depths' standard deviation tells: by the mean by which the 3 x 3 depths around lie off their planes, no

@@ -118,7 +118,7 @@ FUNCTION(
     X(OUT, uint8, observing, H, W) \
     X(OUT, uint8, agreeing, H, W) \
     X(OUT, uint8, contradicting, H, W) \
-    X(OUT, float32, weighted_depth, H, W) \
+    X(OUT, float32, weighted_shift, H, W) \
     X(OUT, float32, weight, H, W)
 ARGUMENTS(compare_depths, COMPARE_DEPTHS);
 
@@ -133,7 +133,7 @@ static int run_compare_depths(void *arguments) {
     const depth_map partner = {a->partner_depth, a->partner_sigma, a->partner_support, a->size.PARTNER_H,
                                a->size.PARTNER_W};
     const consistency_gates gates = {a->max_reprojection_error, a->tolerance, a->min_support, a->silence_counts};
-    const consistency_sums sums = {a->observing, a->agreeing, a->contradicting, a->weighted_depth, a->weight};
+    const consistency_sums sums = {a->observing, a->agreeing, a->contradicting, a->weighted_shift, a->weight};
     view_transfer transfer;
     split_transfer(a->partner_from_reference, transfer.pixel_from_reference, transfer.translation);
     split_transfer(a->reference_from_partner, transfer.reference_from_pixel, transfer.back_translation);
@@ -155,7 +155,7 @@ FUNCTION(compare_depths, COMPARE_DEPTHS, check_compare_depths,
     X(IN, uint8, observing, H, W) \
     X(OUT, uint8, agreeing, H, W) \
     X(OUT, uint8, contradicting, H, W) \
-    X(OUT, float32, weighted_depth, H, W) \
+    X(OUT, float32, weighted_shift, H, W) \
     X(OUT, float32, weight, H, W)
 ARGUMENTS(confirm_depth, CONFIRM_DEPTH);
 
@@ -164,12 +164,12 @@ static int run_confirm_depth(void *arguments) {
     const confirmation options = {a->min_consistent, a->may_miss, a->max_contradiction, a->min_surface,
                                   a->steepest};
     confirm_depth(a->depth, a->sigma, a->size.H, a->size.W, &options, a->observing, a->agreeing, a->contradicting,
-                  a->weighted_depth, a->weight);
+                  a->weighted_shift, a->weight);
     return 0;
 }
 
 FUNCTION(confirm_depth, CONFIRM_DEPTH, any,
-         "Turn the sums of compare_depths into the geometric map: `weighted_depth` becomes depth, `weight` its\n"
+         "Turn the sums of compare_depths into the geometric map: `weighted_shift` becomes depth, `weight` its\n"
          "deviation, `agreeing` its support; `contradicting` is spoilt.");
 
 #define FIT_PLANES(X) \

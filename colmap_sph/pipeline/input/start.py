@@ -97,7 +97,7 @@ def start(
     _report_missing(context, request.expected)
     context = with_good_images(context, executor, verify=request.verify)
     if request.needs_all and report.skipped_images:
-        reason = next(iter(sorted(report.skipped_images.items())))[1]
+        reason = min(report.skipped_images.items())[1]
         raise InputError(f"{reason}; mend it, or allow images to be left out (allow_missing_files).")
     context = _without_misplaced(context)
     workspace.create_stereo_dirs(context.scene.index_of)

@@ -220,7 +220,7 @@ def _lacking(context: "Context", num_fused: int) -> str:
     skipped = context.report.skipped_images
     if len(skipped) <= num_fused:
         return ""
-    name, reason = next(iter(skipped.items()))
+    name, reason = min(skipped.items())
     images = f"{len(skipped)} of {len(skipped) + num_fused} images"
     return f"{images} without maps: {name}, as {reason.removesuffix('.')}"
 

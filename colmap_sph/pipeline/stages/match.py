@@ -379,7 +379,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
         """See `Stage.close`."""
         report = self.context.report
         if not results:
-            reason = next(iter(report.skipped_pairs.values()), "no pair")
+            reason = min(report.skipped_pairs.items())[1] if report.skipped_pairs else "no pair"
             raise NoResultError(f"None of the {len(self.items)} pairs could be matched ({reason}).")
         report.pairs = len(results)
         self.remember(results)

@@ -286,5 +286,5 @@ class UndistortStage(Stage[str, UndistortTask]):
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""
         if not results:
-            reason = next(iter(self.context.report.skipped_images.values()))
+            reason = min(self.context.report.skipped_images.items())[1]
             raise InputError(f"None of the images could be undistorted ({reason})")

@@ -80,28 +80,35 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
     NoResultError
         No map has any depth.
     """
-    scene = read_scene(workspace.sparse_dir)
-    views = []
-    missing = 0
-    for view in scene.views:
-        path = workspace.depth_map_path(view.name, "geometric")
-        if not path.is_file():
-            missing += 1
-        elif has_depth(path, possible=True):
-            views.append(at_map_size(view, path))
+    scene, mapped = views_with_maps(workspace)
+    views = [at_map_size(view, path) for _, view, path in mapped if has_depth(path, possible=True)]
     if not views:
-        raise no_maps(workspace, are_missing=missing == len(scene.views))
+        raise no_depth(workspace)
     if len(views) < len(scene.views):
         logger.warning("%d of %d images have no depth; left out", len(scene.views) - len(views), len(scene.views))
     return MappedScene(workspace, replace(scene, views=tuple(views)))
 
 
-def no_maps(workspace: Workspace, *, are_missing: bool) -> InputError | NoResultError:
-    """The error of a workspace without geometric maps, or with none that has any depth."""
-    command = f"`colmap_sph run --workspace {shell_word(workspace.root)}`"
-    if are_missing:
-        return InputError(f"{workspace.root} has no geometric depth map; run {command} first.")
-    return NoResultError(f"{workspace.root} has no depth in any geometric depth map; {command} says why.")
+def views_with_maps(workspace: Workspace) -> tuple[Scene, list[tuple[int, View, Path]]]:
+    """A workspace's scene, and number, view and geometric depth map of those that have one; `InputError`: none."""
+    scene = read_scene(workspace.sparse_dir)
+    paths = (workspace.depth_map_path(view.name, "geometric") for view in scene.views)
+    numbered = zip(range(len(scene.views)), scene.views, paths, strict=True)
+    mapped = [each for each in numbered if each[2].is_file()]
+    if not mapped:
+        raise InputError(f"{workspace.root} has no geometric depth map; run {_command(workspace)} first.")
+    return scene, mapped
+
+
+def no_depth(workspace: Workspace) -> NoResultError:
+    """The error of a workspace whose geometric maps have no depth."""
+    return NoResultError(
+        f"{workspace.root} has no depth in any geometric depth map; {_command(workspace)} says why."
+    )
+
+
+def _command(workspace: Workspace) -> str:
+    return f"`colmap_sph run --workspace {shell_word(workspace.root)}`"
 
 
 def at_map_size(view: View, path: Path) -> View:

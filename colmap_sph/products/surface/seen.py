@@ -2,15 +2,15 @@
 
 import logging
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
-from colmap_sph.products.maps.reading import no_maps
+from colmap_sph.products.maps.reading import at_map_size, no_depth, views_with_maps
 from colmap_sph.project.images.reading import read_colours
-from colmap_sph.project.map_files import is_depth, map_size, read_some_pixels
-from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.map_files import is_depth, read_some_pixels
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 
@@ -59,27 +59,18 @@ def seen_views(workspace: Workspace) -> tuple[Scene, list[SeenView]]:
     NoResultError
         No map has any depth.
     """
-    scene = read_scene(workspace.sparse_dir)
-    found = []
-    missing = 0
-    for index, view in enumerate(scene.views):
-        if not workspace.depth_map_path(view.name, "geometric").exists():
-            missing += 1
-        elif (seen := _seen(workspace, view, index)) is not None:
-            found.append(seen)
+    scene, mapped = views_with_maps(workspace)
+    found = [seen for each in mapped if (seen := _seen(*each)) is not None]
     if not found:
-        raise no_maps(workspace, are_missing=missing == len(scene.views))
-    if missing:
+        raise no_depth(workspace)
+    if missing := len(scene.views) - len(mapped):
         logger.warning("%d of %d images have no geometric depth map; left out", missing, len(scene.views))
     return scene, found
 
 
-def _seen(workspace: Workspace, view: View, index: int) -> SeenView | None:
-    path = workspace.depth_map_path(view.name, "geometric")
-    width, height = map_size(path)
-    if not view.may_be_reduced_to(width, height):
-        raise InputError(f"The map {path} is not of its image's size; compute it again.")
-    view = view.resized(width, height)
+def _seen(index: int, view: View, path: Path) -> SeenView | None:
+    view = at_map_size(view, path)
+    width, height = view.width, view.height
     step = max(1, -(-max(width, height) // _SAMPLES))
     rows = np.arange(min(step // 2, height - 1), height, step)
     columns = np.arange(min(step // 2, width - 1), width, step)

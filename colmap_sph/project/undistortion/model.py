@@ -74,14 +74,19 @@ def undistort_model(task: ModelToUndistort) -> None:
         COLMAP cannot do it, or nothing more can be written.
     """
     model = load_model(task.model_dir)
+    fields = read_lens_fields(task.model_dir)
     cuts = task.options.cuts(model, task.model_dir)
     if cuts.views:
-        made = model_with_views(model, cuts, task.names, read_lens_fields(task.model_dir), task.options)
+        made = model_with_views(model, cuts, task.names, fields, task.options)
         make_dir(task.final_dir)
         made.write_binary(task.final_dir)
         _load_written_model(task.final_dir)
         write_cuts({name: cuts.views[name] for name in task.names if name in cuts.views}, task.final_dir)
         return
+    straight = {
+        number: straight_camera(model.camera(number), task.options.for_colmap(), fields[number])
+        for number in fields.keys() & model.cameras.keys()
+    }
     plain = task.folder / "plain"
     _write_plain_model(model, plain)
     # COLMAP undistorts the images that it is told of, or all: it gets one, and does not find it.
@@ -101,9 +106,7 @@ def undistort_model(task: ModelToUndistort) -> None:
         raise_if_disk_is_full(task.folder)
         raise InputError(f"COLMAP cannot undistort {task.model_dir}: {reason_of(error)}") from error
     undistorted = _load_written_model(task.folder / "sparse")
-    fields = read_lens_fields(task.model_dir)
-    if fields:
-        _straighten(undistorted, load_model(task.model_dir), fields, task.options)
+    _straighten(undistorted, straight, fields)
     _write_final_model(undistorted, task.final_dir, task.names)
 
 
@@ -129,22 +132,19 @@ def model_with_views(
 
 def _straighten(
     undistorted: pycolmap.Reconstruction,
-    original: pycolmap.Reconstruction,
+    straight: Mapping[int, pycolmap.Camera],
     fields: Mapping[int, LensField],
-    options: UndistortionOptions,
 ) -> None:
-    """Take lens fields out of a model, in place, that COLMAP undistorted without."""
-    for camera_id in sorted(fields.keys() & undistorted.cameras.keys()):
-        field = fields[camera_id]
+    """Take lens fields out of a model, in place, that COLMAP undistorted without; to cameras by their numbers."""
+    for camera_id in sorted(straight):
         bent = undistorted.camera(camera_id)
-        straight = straight_camera(original.camera(camera_id), options.for_colmap(), field)
         for image in undistorted.images.values():
             if image.camera_id == camera_id and image.num_points2D():
                 pixels = np.array([point.xy for point in image.points2D])
-                moved = ray_pixels(straight, field.straightened(pixel_rays(bent, pixels)))
-                for point, xy in zip(image.points2D, moved, strict=True):
+                rays = fields[camera_id].straightened(pixel_rays(bent, pixels))
+                for point, xy in zip(image.points2D, ray_pixels(straight[camera_id], rays), strict=True):
                     point.xy = xy
-        change_camera(bent, straight)
+        change_camera(bent, straight[camera_id])
 
 
 def _write_plain_model(model: pycolmap.Reconstruction, folder: Path) -> None:

@@ -6,7 +6,7 @@ towards both ends, at once where a thread is idle. The result is that of one pie
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -208,6 +208,10 @@ def match_whole(rows: LevelRows, limits: Limits, scratch: Scratch) -> NDArray[np
     return offset
 
 
+Keep = Callable[[NDArray[np.int32], LevelRows, int, int], None]
+"""Takes what a band has found, to columns of the target; what was compared; and the band's first row and end."""
+
+
 class BandMatcher:
     """Matches a level in bands of rows."""
 
@@ -226,25 +230,28 @@ class BandMatcher:
         self._forward: dict[int, State] = {}
         self._backward: dict[int, State] = {}
         self._offset = np.empty((height, width), np.int32)
-        # Whether offsets are to be fitted; None: those to columns of the target are wanted.
-        self._fit: bool | None = None
         # Fits look at rows on both sides: of those near the ends of bands, what was found, by row.
         self._beside: dict[int, NDArray[np.int32]] = {}
 
+    def target_offset(self) -> NDArray[np.int32]:
+        """(H, W) int32 offsets to columns of the target, 1/256 pixel."""
+        self._match_bands(self._keep)
+        return self._offset
+
     def offset(self, *, fit: bool) -> NDArray[np.int32]:
         """(H, W) int32 offsets to columns of the right image, 1/256 pixel, fitted to the raw costs or not."""
-        self._fit = fit
-        self.target_offset()
         if not fit:
+            self._match_bands(self._keep_to_right)
             return self._offset
+        self._match_bands(self._keep_fitted)
         for first, _ in self._bands[1:]:
             low, high = max(first - 2 * _FIT_ROWS, 0), min(first + 2 * _FIT_ROWS, self._height)
             found = np.stack([self._beside[row] for row in range(low, high)])
-            self._keep(found, self._level.rows(low, high), low, high)
+            self._fit(found, self._level.rows(low, high), low, high)
         return self._offset
 
-    def target_offset(self) -> NDArray[np.int32]:
-        """(H, W) int32 offsets to columns of the target, 1/256 pixel."""
+    def _match_bands(self, keep: Keep) -> None:
+        """Match all bands, and have kept what is found in each."""
         last = len(self._bands) - 1
         before, behind = range(self._middle), range(last, self._middle, -1)
         at_once(
@@ -252,9 +259,8 @@ class BandMatcher:
             partial(self._sweep, behind, self._backward, backward=True),
         )
         forward, backward = self._forward.pop(self._middle), self._backward.pop(self._middle)
-        self._match(self._middle, Sweeps(forward, backward))
-        at_once(partial(self._match_up, backward), partial(self._match_down, forward))
-        return self._offset
+        self._match(self._middle, Sweeps(forward, backward), keep)
+        at_once(partial(self._match_up, backward, keep), partial(self._match_down, forward, keep))
 
     def _sweep(self, bands: range, states: dict[int, State], *, backward: bool) -> None:
         """Sweep over bands, up to the middle, and note the states before each."""
@@ -283,27 +289,21 @@ class BandMatcher:
             )
         states[self._middle] = state
 
-    def _match_up(self, backward: State) -> None:
+    def _match_up(self, backward: State, keep: Keep) -> None:
         for number in range(self._middle - 1, -1, -1):
-            self._match(number, Sweeps(self._forward.pop(number), backward))
+            self._match(number, Sweeps(self._forward.pop(number), backward), keep)
 
-    def _match_down(self, forward: State) -> None:
+    def _match_down(self, forward: State, keep: Keep) -> None:
         for number in range(self._middle + 1, len(self._bands)):
-            self._match(number, Sweeps(forward, self._backward.pop(number)))
+            self._match(number, Sweeps(forward, self._backward.pop(number)), keep)
 
-    def _match(self, number: int, sweeps: Sweeps) -> None:
+    def _match(self, number: int, sweeps: Sweeps, keep: Keep) -> None:
         rows, band = self._band(number)
         first, end = self._bands[number]
         found = np.empty((end - first, rows.grey.shape[1]), np.int32)
         with self._scratches.lent() as scratch:
             match_rows(rows, band, sweeps, self._limits, scratch, found)
-        if self._fit is None:
-            self._offset[first:end] = found
-            return
-        near = 2 * _FIT_ROWS if self._fit else 0
-        for row in {*range(first, min(first + near, end)), *range(max(end - near, first), end)}:
-            self._beside[row] = found[row - first].copy()
-        self._keep(found, rows.rows(slice(band.first, band.end)), first, end)
+        keep(found, rows.rows(slice(band.first, band.end)), first, end)
 
     def _band(self, number: int) -> tuple[LevelRows, Band]:
         """What is compared in a band and in the rows beside it, to which paths go, and its place among these."""
@@ -312,10 +312,23 @@ class BandMatcher:
         return self._level.rows(low, high), Band(first - low, end - low, first, self._height - end)
 
     def _keep(self, found: NDArray[np.int32], rows: LevelRows, first: int, end: int) -> None:
-        """Set the offsets of the rows from `first` to before `end`; none is fitted next to the ends of these."""
-        near = _FIT_ROWS if self._fit else 0
-        kept = slice(first + near * (first > 0), end - near * (end < self._height))
+        """Set the offsets of the rows from `first` to before `end`."""
+        self._offset[first:end] = found
+
+    def _keep_to_right(self, found: NDArray[np.int32], rows: LevelRows, first: int, end: int) -> None:
+        """Set them to columns of the right image."""
+        self._offset[first:end] = rows.target.offsets_to_right(found)
+
+    def _keep_fitted(self, found: NDArray[np.int32], rows: LevelRows, first: int, end: int) -> None:
+        """Fit them, too, and note what fits beside this band look at."""
+        near = 2 * _FIT_ROWS
+        for row in {*range(first, min(first + near, end)), *range(max(end - near, first), end)}:
+            self._beside[row] = found[row - first].copy()
+        self._fit(found, rows, first, end)
+
+    def _fit(self, found: NDArray[np.int32], rows: LevelRows, first: int, end: int) -> None:
+        """Set fitted offsets to columns of the right image but for those next to the ends of these rows."""
+        kept = slice(first + _FIT_ROWS * (first > 0), end - _FIT_ROWS * (end < self._height))
         if kept.start < kept.stop:
             own = slice(kept.start - first, kept.stop - first)
-            fitted = rows.fitted(found) if self._fit else found
-            self._offset[kept] = rows.target.rows(own).offsets_to_right(fitted[own])
+            self._offset[kept] = rows.target.rows(own).offsets_to_right(rows.fitted(found)[own])
