@@ -22,7 +22,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.project.given import image_places
 from colmap_sph.project.given.image_places import find_images, tell_problems
-from colmap_sph.project.images.reading import Damaged, Missing, Problem, Unreadable, WrongSize
+from colmap_sph.project.images.reading import Damaged, Missing, Problem, Unreadable, Unsupported, WrongSize
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -277,6 +277,10 @@ def test_sizes_without_a_rule_are_told_one_by_one(tmp_path: Path, caplog: pytest
     [
         ([WrongSize((96, 55), (96, 64))] * 3, "give the images that the model was made from as --images"),
         ([Damaged("is cut off"), Damaged("is no image"), Missing("is missing")], "copy them again from where"),
+        (
+            [Unsupported("cannot be used: webp files are not read")] * 3,
+            "convert them to PNG, under the same names",
+        ),
         ([Unreadable("cannot be read (Permission denied)")] * 3, "check their permissions"),
         ([Missing("is missing")] * 3, "check --images"),
         ([Problem("needs 2 GiB")] * 3, "check --images"),

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from colmap_sph.errors import InputError, shell_word
 from colmap_sph.project.files import real_path
-from colmap_sph.project.images.reading import Damaged, Problem, Unreadable, WrongSize
+from colmap_sph.project.images.reading import Damaged, Problem, Unreadable, Unsupported, WrongSize
 
 _Size = tuple[int, int]
 
@@ -26,6 +26,7 @@ _UNDISTORT = "give the sparse model with --model to have them undistorted anew"
 _REMEDIES: dict[type[Problem], str] = {
     WrongSize: "give the images that the model was made from as --images",
     Damaged: "copy them again from where they came from",
+    Unsupported: "convert them to PNG, under the same names",
     Unreadable: "check their permissions",
 }
 _SHARES = {2: "half", 3: "a third of", 4: "a quarter of", 8: "an eighth of"}
