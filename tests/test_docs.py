@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import colmap_sph
 from colmap_sph.app import cli
 from colmap_sph.app.colmap.options import COMMANDS
 from colmap_sph.app.colmap.parser import parse
@@ -163,3 +164,18 @@ def test_options_in_backticks_are_there() -> None:
         for code in _CODE.findall(document.read_text(encoding="utf-8")):
             if code.startswith("--"):
                 assert set(re.findall(r"(?<!\S)--[A-Za-z][\w.-]*", code)) <= known, (document.name, code)
+
+
+def test_python_in_pages_calls_what_there_is() -> None:
+    blocks = [
+        (document.name, block)
+        for document in _CURRENT
+        for block in re.findall(
+            r"^```python\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        )
+    ]
+    assert {page for page, _ in blocks} >= {"README.md", "usage.md", "wide.md"}
+    for page, block in blocks:
+        compile(block, page, "exec")
+        called = set(re.findall(r"\b(?:cs|(?<!from )colmap_sph)\.([A-Za-z]\w*)", block))
+        assert called <= set(dir(colmap_sph)), page
