@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from pathlib import Path
@@ -140,9 +141,26 @@ def test_a_run_loads_no_other_commands() -> None:
 
 @pytest.mark.parametrize("name", cli.commands())
 def test_every_text_of_the_help_is_a_sentence(name: str) -> None:
+    """In which options are called as they are typed, and not as in Python."""
     for group in option_groups(cli.commands()[name]):
+        in_python = {option.field.name for option in group.options}
         for text in (group.text, *(option.text for option in group.options)):
             assert text[0].isupper() and text[-1] in ".)", text
+            assert not in_python & set(re.findall(r"`(\w+)`", text)), text
+
+
+@pytest.mark.parametrize("width", [60, 80])
+@pytest.mark.parametrize("line", ["run --help", "run --help-all", "evaluate --help", "patch_match_stereo --help"])
+def test_help_has_whole_words_at_any_width(
+    line: str, width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = {}
+    for columns in (400, width):
+        monkeypatch.setenv("COLUMNS", str(columns))
+        code, output = command(capsys, *line.split())
+        assert code == 0
+        words[columns] = Counter(output.split())
+    assert words[width] == words[400]
 
 
 @pytest.mark.parametrize(

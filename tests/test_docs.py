@@ -1,11 +1,18 @@
 """The documents: links lead somewhere, named modules exist, the README is short."""
 
 import re
+import shlex
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
 import pytest
+
+import colmap_sph
+from colmap_sph.app import cli
+from colmap_sph.app.colmap.options import COMMANDS
+from colmap_sph.app.colmap.parser import parse
+from colmap_sph.app.option_list import option_groups
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "colmap_sph"
@@ -94,3 +101,81 @@ def test_formulas_are_closed(document: Path) -> None:
 def test_ci_finds_its_command() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
     assert ".venv/bin/pytest" in next(line for line in lines if ".[test]" in line)
+
+
+# ---- what is typed -----------------------------------------------------------------------------------------
+
+# Options in backticks that are those of other programs and of scripts.
+_OF_OTHERS = {
+    *(f"--{kind}.use_gpu" for kind in ("FeatureExtraction", "FeatureMatching", "SiftExtraction", "SiftMatching")),
+    *(
+        "--cpus-per-task",
+        "--executor",
+        "--keep-going",
+        "--memory-limit",
+        "--nthreads",
+        "--platform",
+        "--resources",
+        "--scene",
+    ),
+}
+_COMMAND = re.compile(r"\s*(?:(?:\S*/)?colmap_sph|colmap(?= (?:patch|stereo))) (\w+ [^#|>;&]+)")
+# Something is left out of it, or to be filled in.
+_PATTERN = re.compile(r"…|[\[\]$]|\b[A-Z]+\b(?!:)")
+# Not of what was so in earlier versions.
+_CURRENT = [document for document in DOCUMENTS if document.name != "CHANGELOG.md"]
+
+
+def commands_in(document: Path) -> list[str]:
+    """Commands of ours in blocks of code and in backticks, without what the shell does."""
+    text = document.read_text(encoding="utf-8")
+    blocks = [match[0] for match in _FENCE.finditer(text)] + re.findall(r"^ {4}.*$", text, re.MULTILINE)
+    lines = [line for block in blocks for line in block.splitlines()] + _CODE.findall(prose(document))
+    found = (_COMMAND.match(line) for line in lines)
+    return [match[1].strip() for match in found if match and not _PATTERN.search(match[1])]
+
+
+COMMAND_LINES = sorted({(document.name, line) for document in _CURRENT for line in commands_in(document)})
+
+
+def test_pages_have_commands() -> None:
+    told = {page for page, _ in COMMAND_LINES}
+    assert {"README.md", "usage.md", "surveyor.md", "cluster.md", "surface.md", "splats.md", "wide.md"} <= told
+
+
+@pytest.mark.parametrize(("page", "line"), COMMAND_LINES)
+def test_commands_are_understood(page: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By the parser; nothing is done."""
+    monkeypatch.setattr(cli, "_do", lambda *_: 0)
+    name, *options = shlex.split(line)
+    if name in COMMANDS:
+        parse(COMMANDS[name], options)
+    else:
+        assert cli.main([name, *options]) == 0
+
+
+def test_options_in_backticks_are_there() -> None:
+    known = {"--help", "--help-all", "--project_path", *_OF_OTHERS}
+    for name in cli.commands():
+        known |= {option.flag for group in option_groups(cli.commands()[name]) for option in group.options}
+    known |= {flag.replace("--", "--no-", 1) for flag in known}
+    known |= {f"--{flag}" for command in COMMANDS.values() for flag in command.flags()}
+    for document in _CURRENT:
+        for code in _CODE.findall(document.read_text(encoding="utf-8")):
+            if code.startswith("--"):
+                assert set(re.findall(r"(?<!\S)--[A-Za-z][\w.-]*", code)) <= known, (document.name, code)
+
+
+def test_python_in_pages_calls_what_there_is() -> None:
+    blocks = [
+        (document.name, block)
+        for document in _CURRENT
+        for block in re.findall(
+            r"^```python\n(.*?)^```", document.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+        )
+    ]
+    assert {page for page, _ in blocks} >= {"README.md", "usage.md", "wide.md"}
+    for page, block in blocks:
+        compile(block, page, "exec")
+        called = set(re.findall(r"\b(?:cs|(?<!from )colmap_sph)\.([A-Za-z]\w*)", block))
+        assert called <= set(dir(colmap_sph)), page

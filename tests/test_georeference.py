@@ -134,7 +134,7 @@ def test_gross_errors_are_left_out_and_told(workspace: Workspace, tmp_path: Path
     assert [each.name for each in found.residuals if each.is_check] == [NAMES[3]]
     assert found.residuals[3].length == pytest.approx(np.linalg.norm([40, -10, 5]), abs=0.2)
     np.testing.assert_allclose(found.to_map(centers()), on_map(centers()), atol=0.1)
-    assert any("1 left out as gross errors" in line for line in report_lines(found))
+    assert any(line.startswith("1 gross error, left out: root mean square") for line in report_lines(found))
 
 
 @pytest.mark.parametrize("is_distorted", [False, True])
@@ -147,6 +147,14 @@ def test_control_points_give_the_similarity(workspace: Workspace, tmp_path: Path
     np.testing.assert_allclose(found.to_map(centers()), on_map(centers()), atol=1e-4)
     assert {each.name for each in found.residuals} == set(POINTS)
     assert max(each.pixels or 0.0 for each in found.residuals) < 1e-5
+
+
+def test_check_points_are_counted(workspace: Workspace, tmp_path: Path) -> None:
+    _write_model(tmp_path / "photographs", "SIMPLE_RADIAL", [FOCAL, WIDTH / 2, HEIGHT / 2, 0.0])
+    lines = [f"{line},{'check' if line.startswith('P1') else 'control'}" for line in mark_lines(POINTS, 0.0)]
+    table = write_lines(tmp_path / "gcp.csv", "point,x,y,z,image,column,row,role", *lines)
+    found = align(workspace, table, "EPSG:25832", tmp_path / "photographs")
+    assert list(report_lines(found))[1].startswith("1 check point: root mean square")
 
 
 def test_control_points_may_be_marked_in_panoramas(workspace: Workspace, tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.project.given import image_places
 from colmap_sph.project.given.image_places import find_images, tell_problems
-from colmap_sph.project.images.reading import Damaged, Missing, Problem, Unreadable, WrongSize
+from colmap_sph.project.images.reading import Damaged, Missing, Problem, Unreadable, Unsupported, WrongSize
 from colmap_sph.project.pair_lists import read_lines, read_patch_match_cfg, write_fusion_cfg, write_patch_match_cfg
 from colmap_sph.project.project import Project, open_workspace
 from colmap_sph.project.scene_reader import read_scene
@@ -130,7 +130,9 @@ def test_other_spellings(tmp_path: Path, name: str, there: str) -> None:
     (tmp_path / "images" / there).touch()
     with pytest.raises(InputError) as error:
         find_images(sparse, [name, "b.png"])
-    assert f"'{name}'" in str(error.value) and repr(there) in str(error.value)
+    # Accents that are written in two ways look alike: their code points tell them apart.
+    called, found = (ascii(name), ascii(there)) if "é" in name else (f"'{name}'", repr(there))
+    assert f"calls an image {called}, and" in str(error.value) and f"has {found} " in str(error.value)
     assert "rename the files as the model has them" in str(error.value)
 
 
@@ -160,13 +162,19 @@ def test_two_files_that_could_be_meant(tmp_path: Path) -> None:
         find_images(sparse, ["x.png"])
 
 
-def test_some_are_spelled_differently(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+@pytest.mark.parametrize(
+    ("name", "there", "told"), [("b.png", "B.png", "'B.png'"), ("é.png", "e\u0301.png", r"'e\u0301.png'")]
+)
+def test_some_are_spelled_differently(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, there: str, told: str
+) -> None:
     """The others go on; the one is named with what is there."""
     sparse = make_project(tmp_path)
-    (tmp_path / "images" / "b.png").rename(tmp_path / "images" / "B.png")
+    rename(sparse, {"b.png": name})
+    (tmp_path / "images" / "b.png").rename(tmp_path / "images" / there)
     workspace = prepare(sparse, tmp_path / "dense")
     assert [view.name for view in read_scene(workspace.sparse_dir).views] == ["a.png", *NAMES[2:]]
-    assert "b.png is missing, but there is 'B.png'; left out" in caplog.text
+    assert f"{name} is missing, but there is {told}; left out" in caplog.text
 
 
 @pytest.mark.parametrize("target", ["nowhere.png", "b.png"])
@@ -277,6 +285,10 @@ def test_sizes_without_a_rule_are_told_one_by_one(tmp_path: Path, caplog: pytest
     [
         ([WrongSize((96, 55), (96, 64))] * 3, "give the images that the model was made from as --images"),
         ([Damaged("is cut off"), Damaged("is no image"), Missing("is missing")], "copy them again from where"),
+        (
+            [Unsupported("cannot be used: webp files are not read")] * 3,
+            "convert them to PNG, under the same names",
+        ),
         ([Unreadable("cannot be read (Permission denied)")] * 3, "check their permissions"),
         ([Missing("is missing")] * 3, "check --images"),
         ([Problem("needs 2 GiB")] * 3, "check --images"),

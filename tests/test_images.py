@@ -20,7 +20,13 @@ from projects import read_picture
 from colmap_sph.errors import InputError
 from colmap_sph.project.images.decoding import jpeg_step, read_header, read_pixels
 from colmap_sph.project.images.orientation import copy_without_orientation
-from colmap_sph.project.images.reading import image_problem, read_colours, read_grey, read_whole_grey
+from colmap_sph.project.images.reading import (
+    Unsupported,
+    image_problem,
+    read_colours,
+    read_grey,
+    read_whole_grey,
+)
 from colmap_sph.project.images.undistorting import write_undistorted
 
 WIDTH, HEIGHT = 53, 37
@@ -361,6 +367,27 @@ def test_what_colmap_cannot_read_is_refused(tmp_path: Path, channels: int) -> No
     assert f"images of {channels} channels are not read" in str(image_problem(path, WIDTH, HEIGHT))
     write(tmp_path / "image.fits", noise(1, "uint16"), "uint16")
     assert "fits files are not read" in str(image_problem(tmp_path / "image.fits", WIDTH, HEIGHT))
+
+
+@pytest.mark.parametrize(
+    ("kind", "data"),
+    [
+        ("webp", cv2.imencode(".webp", np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1].tobytes()),
+        ("jpeg2000", cv2.imencode(".jp2", np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1].tobytes()),
+        ("HEIC", b"\0\0\0\x1cftypheic\0\0\0\0mif1heicmiaf" + bytes(100)),
+        ("AVIF", b"\0\0\0\x1cftypavif\0\0\0\0avifmif1miaf" + bytes(100)),
+    ],
+)
+def test_whole_images_of_other_kinds_are_not_called_damaged(tmp_path: Path, kind: str, data: bytes) -> None:
+    """The remedy is another than for those: a PNG file under the same name is read."""
+    path = tmp_path / f"image.{kind}"
+    path.write_bytes(data)
+    assert pycolmap.Bitmap.read(path, as_rgb=True) is None
+    problem = image_problem(path, WIDTH, HEIGHT)
+    assert isinstance(problem, Unsupported)
+    assert f"{kind} files are not read (convert it to PNG, under the same name)" in problem
+    path.write_bytes(cv2.imencode(".png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1].tobytes())
+    assert image_problem(path, WIDTH, HEIGHT) is None
 
 
 # ---- values ------------------------------------------------------------------------------------------------

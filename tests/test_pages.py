@@ -193,6 +193,9 @@ def test_coverage_and_what_was_lost_add_up(finished: FinishedRun, page: Page) ->
         assert sum(map(float, shares.values())) == pytest.approx(100, abs=0.5)
         # Of a sample of the pixels.
         assert float(shares["confirmed"]) == pytest.approx(100 * finished.report.coverage[name], abs=2)
+    # Of all pixels, as the summary of the run says it.
+    mean = 100 * np.mean(list(finished.report.coverage.values()))
+    assert re.search(rf"\bcoverage\s+{mean:.1f} %", page.text())
 
 
 def test_a_page_that_fails_does_not_fail_the_run(

@@ -148,6 +148,24 @@ def test_missing_model_is_named(tmp_path: Path) -> None:
     write(make_model(), tmp_path / "sparse" / "0", text=False)
     with pytest.raises(InputError, match=r"did you mean .*sparse/0\?"):
         read_scene(tmp_path / "sparse")
+    # Which of several is for the user to say; a workspace's own is no other one.
+    write(make_model(), tmp_path / "sparse" / "1", text=True)
+    write(make_model(), tmp_path / "dense" / "sparse", text=False)
+    with pytest.raises(InputError, match=r"did you mean [^ ]*sparse/0 or [^ ]*sparse/1\?"):
+        read_scene(tmp_path / "sparse")
+    with pytest.raises(InputError, match=r"did you mean [^ ]*sparse/0 or [^ ]*sparse/1\?"):
+        read_scene(tmp_path)
+
+
+@pytest.mark.parametrize("is_text", [False, True])
+@pytest.mark.parametrize("name", ["cameras", "points3D"])
+def test_a_file_that_a_model_lacks_is_named(tmp_path: Path, name: str, is_text: bool) -> None:
+    sparse = write(make_model(), tmp_path / "sparse", text=is_text)
+    (lacking,) = sparse.glob(f"{name}.*")
+    lacking.unlink()
+    with pytest.raises(InputError, match=rf"but no {name}\.(bin|txt); copy it") as error:
+        read_scene(sparse)
+    assert ("(an empty one where" in str(error.value)) == (lacking.name == "points3D.txt")
 
 
 def test_model_without_registered_image(tmp_path: Path) -> None:

@@ -157,6 +157,7 @@ def word(number: int, value: str) -> Callable[[list[str]], list[str]]:
         ("points3D", word(4, "7.5"), "line 3.*this is not POINT3D_ID"),
         ("points3D", word(9, ""), "line 3.*this is not POINT3D_ID"),
         ("points3D", word(1, "1,5"), "line 3.*this is not POINT3D_ID"),
+        ("cameras", lambda _: ["1 PINHOLE 96.0 64.0 90 90 48 32"], "line 1.*this is not CAMERA_ID"),
         ("cameras", lambda _: ["1 PINHOLE 96 64 90 90 48"], "line 1.*a PINHOLE camera has 4 parameters, not 3"),
         ("cameras", lambda _: ["1 PINHOLE 96 64 90 90 48 32 0"], "line 1.*has 4 parameters, not 5"),
         ("cameras", lambda _: ["1 PINHOLE 96 64 90 90 48 x"], "line 1.*this is not CAMERA_ID"),

@@ -3,7 +3,8 @@
 import ast
 import inspect
 import io
-from collections.abc import Iterable, Iterator
+import re
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import MISSING, Field, dataclass, fields, is_dataclass
 from functools import cache
 from pathlib import Path
@@ -12,7 +13,9 @@ from types import NoneType, UnionType
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import tyro
+from rich.cells import cell_len
 from rich.console import Console
+from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
@@ -74,8 +77,11 @@ class Option:
 
     @property
     def text(self) -> str:
-        """What it does, in whole sentences."""
-        return _texts_of(self.record)[self.field.name]
+        """What it does, in whole sentences, in which other options of its record are called as they are typed."""
+        texts = _texts_of(self.record)
+        stage = self.place.rpartition(".")[0]
+        flags = {name: flag_of(f"{stage}.{name}" if stage else name) for name in texts}
+        return re.sub(r"`(\w+)`", lambda match: flags.get(match[1], match[0]), texts[self.field.name])
 
     @property
     def text_with_default(self) -> str:
@@ -94,6 +100,8 @@ class OptionGroup:
 
 # Characters of help that an option and its values take, beside its text.
 _WIDEST = 48
+# And that are left for the text at least, where it stands beside these.
+_NARROWEST = 30
 # Records whose options have no prefix.
 _TAKEN_APART = ("project", "options", "georeference")
 
@@ -197,12 +205,24 @@ def help_of(name: str, command: type) -> str:
 
 
 def print_options(options: Iterable[Option], console: Console) -> None:
-    """Print options, each with its text beside it."""
+    """Print options, each with its text."""
+    print_explained([(_as_typed(option), option.text_with_default) for option in options], console)
+
+
+def print_explained(rows: Sequence[tuple[str, str]], console: Console) -> None:
+    """Print words with what they mean: beside them, or below where the console is too narrow for that."""
+    widest = max((cell_len(line) for words, _ in rows for line in words.splitlines()), default=0)
+    longest = max((cell_len(word) for _, meaning in rows for word in meaning.split()), default=0)
+    if console.width - widest - 2 < max(longest, _NARROWEST):
+        for words, meaning in rows:
+            console.print(Text(words), soft_wrap=True)
+            console.print(Padding(Text(meaning), (0, 0, 0, 6)))
+        return
     table = Table.grid(padding=(0, 2))
     table.add_column(no_wrap=True)
     table.add_column()
-    for option in options:
-        table.add_row(Text(_as_typed(option)), Text(option.text_with_default))
+    for words, meaning in rows:
+        table.add_row(Text(words), Text(meaning))
     console.print(table)
 
 

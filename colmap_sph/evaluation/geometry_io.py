@@ -77,7 +77,7 @@ def read_geometry(path: Path) -> PointCloud | Mesh:
     path = Path(path)
     if not path.is_file():
         lack = "is not a regular file" if path.exists() else "does not exist"
-        raise InputError(f"{path} {lack}: give the path of a cloud or mesh")
+        raise InputError(f"{path} {lack}; give a cloud or a mesh, or as --reference a folder of exact depth maps.")
     kind = path.suffix.lower()
     if kind in (".las", ".laz"):
         points, crs = _read(path, "LAS/LAZ", partial(read_las, laspy=require("laspy")))

@@ -137,7 +137,9 @@ def _coverage(content: Content, run: RunFacts) -> list[float]:
 
 
 def _facts(content: Content, run: RunFacts) -> list[tuple[str, str, str]]:
-    coverage = [share for share in _coverage(content, run) if share > 0]
+    # The run counted all pixels, as its summary says it, the page some.
+    counts = zip(content.images, _coverage(content, run), strict=True)
+    coverage = [run.coverage.get(image.name, share) for image, share in counts if share > 0]
     gsd = [image.gsd for image in content.images if image.gsd is not None]
     angles = [pair.angle for pair in content.pairs if pair.angle is not None]
     facts = [

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, OptionError
+from colmap_sph.errors import InputError, OptionError, counted
 from colmap_sph.products.alignment.aligning import align_by_points, align_by_positions, positions_of_photographs
 from colmap_sph.products.alignment.tables import Positions, read_table
 from colmap_sph.products.crs import from_gps, is_in_area, read_crs, utm_zone_of, wkt_of
@@ -171,8 +171,9 @@ def report_lines(georeference: Georeference) -> Iterator[str]:
     where = georeference.crs or "map coordinates"
     yield f"aligned to {where} by {len(used)} {what}: scale {georeference.scale:.8g}, {_summary(used)}"
     if others:
-        kind = "left out as gross errors" if georeference.aligned_by == "positions" else "check points"
-        yield f"{len(others)} {kind}: {_summary(others)}"
+        is_of_points = georeference.aligned_by == "points"
+        told = counted(len(others), "check point" if is_of_points else "gross error")
+        yield f"{told}{'' if is_of_points else ', left out'}: {_summary(others)}"
     if len(used) == 3:
         yield "three places determine a similarity: what is left at them says little of how right it is"
     unused = "left out" if georeference.aligned_by == "positions" else "check"

@@ -20,7 +20,7 @@ class Project:
     model: Path | None = None
     """Sparse model (binary or text), such as sparse/0. Its images are undistorted into --output."""
     images: Path | None = None
-    """Original images. Default: the folder `images` beside or above the model."""
+    """Original images. Default: the folder "images" beside or above the model."""
     masks: Path | None = None
     """Masks: a.jpg.png or a.png for image a.jpg, with its folders; black = ignored. Of the original images, or
     with --workspace of the undistorted ones."""

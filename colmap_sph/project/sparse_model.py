@@ -86,7 +86,10 @@ def model_files(sparse_dir: Path) -> list[Path]:
     files = _files_in(sparse_dir)
     if not files:
         inside = models_inside(sparse_dir)
-        hint = f"did you mean {inside[0]}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
+        if not inside:
+            _refuse_incomplete(sparse_dir)
+        meant = " or ".join(str(path) for path in inside if path.parent == inside[0].parent)
+        hint = f"did you mean {meant}?" if inside else "give the folder of a COLMAP model, such as sparse/0."
         raise InputError(
             f"No COLMAP model in {sparse_dir}: cameras, images and points3D (.bin or .txt) are needed; {hint}"
         )
@@ -98,6 +101,20 @@ def model_files(sparse_dir: Path) -> list[Path]:
             f"or remove {rigs[0].name} if it has no rigs."
         )
     return files
+
+
+def _refuse_incomplete(folder: Path) -> None:
+    """Name the files that a model lacks, where the others are there."""
+    for extension in _EXTENSIONS:
+        names = [f"{stem}{extension}" for stem in MODEL_FILES]
+        there = [name for name in names if (folder / name).exists()]
+        if 2 * len(there) > len(names):
+            (lacking,) = set(names) - set(there)
+            empty = " (an empty one where it has no points)" if lacking == "points3D.txt" else ""
+            raise InputError(
+                f"The model in {folder} has {' and '.join(there)}, but no {lacking}; "
+                f"copy it from where the model was made{empty}."
+            )
 
 
 def has_model(folder: Path) -> bool:

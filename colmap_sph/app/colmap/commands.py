@@ -6,8 +6,6 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from colmap_sph.app.colmap.fusion import make_cloud
 from colmap_sph.app.colmap.names import OWN, hand_over
@@ -16,6 +14,7 @@ from colmap_sph.app.colmap.parser import Given, parse
 from colmap_sph.app.colmap.patch_match import make_maps
 from colmap_sph.app.display import Display
 from colmap_sph.app.log_file import workspace_log
+from colmap_sph.app.option_list import print_explained
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE, header, print_summary
 from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.terminal import Terminal, standard_output
@@ -79,22 +78,19 @@ def _print_help(command: ColmapCommand) -> None:
         console.print(f"usage: colmap_sph {command.name} [options]\n")
         console.print("COLMAP's options, on the command line or in a project file:\n")
         acting = {flag: option for flag, option in flags.items() if option.acts}
-        console.print(_help_table({"project_path": _PROJECT, **acting}))
+        print_explained(_explained({"project_path": _PROJECT, **acting}), console)
         console.print("\nAccepted, but without effect here:\n")
-        console.print(_help_table({flag: option for flag, option in flags.items() if not option.acts}))
+        idle = {flag: option for flag, option in flags.items() if not option.acts}
+        print_explained(_explained(idle), console)
 
 
 _PROJECT = ColmapOption("project_path", "", "file of options, as COLMAP writes it; the command line goes first")
 
 
-def _help_table(flags: dict[str, ColmapOption]) -> Table:
-    table = Table.grid(padding=(0, 2))
-    table.add_column(no_wrap=True)
-    table.add_column()
-    for flag, option in flags.items():
-        default = "" if option.default == "" else f" (={_word(option)})"
-        table.add_row(Text(f"  --{flag}{default}"), Text(option.text))
-    return table
+def _explained(flags: dict[str, ColmapOption]) -> list[tuple[str, str]]:
+    """Each option with its default as COLMAP has it, and what it does here."""
+    defaults = {flag: "" if option.default == "" else f" (={_word(option)})" for flag, option in flags.items()}
+    return [(f"  --{flag}{defaults[flag]}", option.text) for flag, option in flags.items()]
 
 
 def _word(option: ColmapOption) -> str:

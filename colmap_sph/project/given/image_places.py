@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from colmap_sph.errors import InputError, shell_word
 from colmap_sph.project.files import real_path
-from colmap_sph.project.images.reading import Damaged, Problem, Unreadable, WrongSize
+from colmap_sph.project.images.reading import Damaged, Problem, Unreadable, Unsupported, WrongSize
 
 _Size = tuple[int, int]
 
@@ -26,6 +26,7 @@ _UNDISTORT = "give the sparse model with --model to have them undistorted anew"
 _REMEDIES: dict[type[Problem], str] = {
     WrongSize: "give the images that the model was made from as --images",
     Damaged: "copy them again from where they came from",
+    Unsupported: "convert them to PNG, under the same names",
     Unreadable: "check their permissions",
 }
 _SHARES = {2: "half", 3: "a third of", 4: "a quarter of", 8: "an eighth of"}
@@ -112,7 +113,7 @@ def tell_problems(
     spelled = other_spellings(files, missing)
     alike: dict[str, list[str]] = {}
     for name, problem in problems.items():
-        instead = f", but there is {spelled[name]!r}" if name in spelled else ""
+        instead = f", but there is {_told_from(name, spelled[name])}" if name in spelled else ""
         alike.setdefault(f"{problem}{instead}", []).append(name)
     for words, names in alike.items():
         for name in names if len(names) <= _MOST_TOLD else ():
@@ -180,6 +181,12 @@ def _folded(name: str) -> str:
     return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
 
 
+def _told_from(other: str, name: str) -> str:
+    """A name in quotes; with code points where it looks like the other one, as accents written in two ways do."""
+    same = unicodedata.normalize("NFC", name) == unicodedata.normalize("NFC", other)
+    return ascii(name) if same else repr(name)
+
+
 def _common_misspelling(model_dir: Path, folder: Path, files: Sequence[str], names: Sequence[str]) -> str | None:
     """Say how a folder spells the names of a model's images, of which it has none; None where it does not."""
     spelled = other_spellings(files, names)
@@ -197,9 +204,9 @@ def _common_misspelling(model_dir: Path, folder: Path, files: Sequence[str], nam
         remedy = "rename the files as the model has them"
     name = min(spelled)
     # As it is typed: `repr` doubles each \.
-    called = repr(name).replace(r"\\", "\\")
+    called = _told_from(spelled[name], name).replace(r"\\", "\\")
     return (
-        f"The model {model_dir} calls an image {called}, and {folder} has {spelled[name]!r} "
+        f"The model {model_dir} calls an image {called}, and {folder} has {_told_from(name, spelled[name])} "
         f"(so for {len(spelled)} of {len(names)} images); {remedy}."
     )
 

@@ -26,6 +26,9 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 # Its first chunk: length, kind, width, height, bits, kind of colours, compression, filter, interlacing, checksum.
 _PNG_HEADER = struct.Struct(">I4sIIBB3xI")
 _PNG_GREY = (0, 4)
+# Of what phones write: a box of this kind behind its length, then the kind of the file.
+_HEIF_BOX = b"ftyp"
+_HEIF_KINDS = dict.fromkeys((b"heic", b"heix", b"mif1", b"msf1"), "HEIC") | {b"avif": "AVIF", b"avis": "AVIF"}
 # Headers with a preview and profiles of colour are mostly shorter.
 _JPEG_HEADER_BYTES = 1 << 17
 # COLMAP leaves out the last channel of two or four: transparency.
@@ -37,6 +40,10 @@ _LIBRARY_TYPES = {"uint8": "uint8", "uint16": "uint16", "float32": "float"}
 # Worker threads decode an image each.
 oiio.attribute("threads", 1)
 oiio.attribute("exr_threads", -1)
+
+
+class UnsupportedError(DamagedError):
+    """The file is whole, but of a kind that is not read; the message names the kind."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +95,10 @@ def read_header(path: Path) -> Header:
 
     Raises
     ------
+    UnsupportedError
+        It is an image of a kind that COLMAP does not read.
     DamagedError
-        It is no image that COLMAP reads.
+        It is no image, or damaged.
     OSError
         It cannot be read.
     """
@@ -161,6 +170,13 @@ def _starts_with(path: Path, start: bytes) -> bool:
         return file.read(len(start)) == start
 
 
+def _heif_kind(path: Path) -> str | None:
+    """What a file of phones is called that OpenImageIO does not know; None: it is none."""
+    with path.open("rb") as file:
+        start = file.read(12)
+    return _HEIF_KINDS.get(start[8:]) if start[4:8] == _HEIF_BOX else None
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     # As COLMAP does.
@@ -172,7 +188,10 @@ def _opened(path: Path) -> Iterator[Any]:
     except (UnicodeError, TypeError):
         raise DamagedError("its name is not UTF-8") from None
     if image is None:
-        raise DamagedError(_in_short(oiio.geterror(), path))
+        message = oiio.geterror()
+        if (kind := _heif_kind(path)) is not None:
+            raise UnsupportedError(f"{kind} files are not read")
+        raise DamagedError(_in_short(message, path))
     try:
         yield image
     finally:
@@ -182,9 +201,9 @@ def _opened(path: Path) -> Iterator[Any]:
 def _header(image: Any) -> Header:
     spec = image.spec()
     if image.format_name() not in _FORMATS:
-        raise DamagedError(f"{image.format_name()} files are not read; convert it to PNG")
+        raise UnsupportedError(f"{image.format_name()} files are not read")
     if spec.deep or spec.depth > 1 or spec.nchannels not in _COLOUR_CHANNELS:
-        raise DamagedError(f"images of {spec.nchannels} channels are not read; convert it to PNG")
+        raise UnsupportedError(f"images of {spec.nchannels} channels are not read")
     stored = str(spec.format)
     dtype = {"uint8": "uint8", "int8": "uint8", "uint16": "uint16"}.get(stored, "float32")
     return Header(spec.width, spec.height, _COLOUR_CHANNELS[spec.nchannels], dtype)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.platforms.files import is_link
 from colmap_sph.project.images import jpeg
-from colmap_sph.project.images.decoding import is_jpeg, read_header, read_pixels, unreadable
+from colmap_sph.project.images.decoding import UnsupportedError, is_jpeg, read_header, read_pixels, unreadable
 from colmap_sph.project.images.depth import narrow_range, stretched
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.scene import View
@@ -52,7 +52,11 @@ class Missing(Problem):
 
 
 class Damaged(Problem):
-    """It is empty, damaged, or no image that is read."""
+    """It is empty, damaged, or no image."""
+
+
+class Unsupported(Problem):
+    """It is an image of a kind that is not read."""
 
 
 class Unreadable(Problem):
@@ -91,6 +95,8 @@ def image_problem(path: Path, width: int, height: int, *, decode: bool = True) -
             read_pixels(path)
     except OSError as error:
         return Unreadable(f"cannot be read ({reason_of(error)})")
+    except UnsupportedError as error:
+        return Unsupported(f"cannot be used: {error} (convert it to PNG, under the same name)")
     except DamagedError as error:
         return Damaged(f"is damaged or no image ({error})")
     return None
