@@ -26,6 +26,7 @@ from colmap_sph.scene import POINT, View, pixel_transfer
 from colmap_sph.stereo import fusion
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, PackedMaps, ViewMaps, fuse_view
 from colmap_sph.stereo.fusion_losses import explain_losses
+from colmap_sph.stereo.photographs import owners
 from colmap_sph.stereo.search.idle import lending
 
 STONE = syn.Mottled(syn.Noise(0.1, seed=1))
@@ -636,10 +637,11 @@ def test_fusion_takes_what_is_reserved(partners, reserved, monkeypatch):
 @pytest.mark.parametrize("ending", ["jpg", "png"])
 @pytest.mark.parametrize("of_image", [1, 2])
 @pytest.mark.parametrize("of_maps", [1, 2])
-@pytest.mark.parametrize("with_mask", [False, True])
-def test_reading_takes_what_is_reserved(ending, of_image, of_maps, with_mask, tmp_path, monkeypatch):
+@pytest.mark.parametrize("taken_by", ["nothing", "mask", "view beside"])
+def test_reading_takes_what_is_reserved(ending, of_image, of_maps, taken_by, tmp_path, monkeypatch):
     """Images and maps may have more pixels than are fused."""
     monkeypatch.setattr(map_files, "_BAND_VALUES", 1 << 12)
+    monkeypatch.setattr(owners, "_BAND_PIXELS", 1 << 10)
     view, map_view, file_view = large_view(), large_view(of_maps), large_view(of_image)
     if of_image > 1:
         view = replace(view, full_size=(file_view.width, file_view.height))
@@ -651,11 +653,14 @@ def test_reading_takes_what_is_reserved(ending, of_image, of_maps, with_mask, tm
     cv2.imwrite(str(paths[3]), np.full((file_view.height, file_view.width), 255, np.uint8))
     del maps
     larger = map_view if of_maps > 1 else None
-    sources = MapSources(view, 0, *paths[:3], paths[3] if with_mask else None, map_view=larger)
+    turned = replace(view, name="b.png", R=cv2.Rodrigues(np.array([0, 1.5, 0]))[0])
+    beside = (turned,) if taken_by == "view beside" else ()
+    mask = paths[3] if taken_by == "mask" else None
+    sources = MapSources(view, 0, *paths[:3], mask, map_view=larger, beside=beside)
     tracemalloc.start()
     read = read_view_maps(sources)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
-    assert np.abs(read.depth - 10).max() < 1e-5
+    assert np.abs(read.depth[:, 300:500] - 10).max() < 1e-5
     reserved = fusion_parts._bytes_to_read(sources)
     assert 0.4 * reserved < peak < reserved + 0.5 * view.num_pixels

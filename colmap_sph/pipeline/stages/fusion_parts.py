@@ -43,7 +43,8 @@ _PARTNER_SECONDS = 0.009
 _MAPS_BYTES = 19.0
 _FUSE_BYTES = 23.0
 _PARTNER_BYTES = 1 / 8
-# Of a mask while it takes depths away; of larger maps that are reduced, and of what is reduced to meanwhile.
+# Of a mask, or of which pixels are a view's own, while depths are taken away; of larger maps that are reduced, and
+# of what is reduced to meanwhile.
 _MASK_BYTES = 2.0
 _LARGER_BYTES = 16.0
 _REDUCED_BYTES = 48.0
@@ -236,7 +237,8 @@ def _bytes_to_fuse(partners: int, *, is_packed: bool = False) -> float:
 def _bytes_to_read(sources: MapSources, *, is_packed: bool = False) -> float:
     """Largest bytes in use while the maps of a view are read, and from then on."""
     view, larger = sources.view, sources.map_view
-    each = _MAPS_BYTES + _UNPACKING_BYTES * is_packed + _MASK_BYTES * (sources.mask is not None)
+    is_masked = sources.mask is not None or bool(sources.beside)
+    each = _MAPS_BYTES + _UNPACKING_BYTES * is_packed + _MASK_BYTES * is_masked
     maps = each * view.num_pixels
     if larger is not None:
         maps = max(maps, _LARGER_BYTES * larger.num_pixels + _REDUCED_BYTES * view.num_pixels)
