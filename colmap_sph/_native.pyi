@@ -620,12 +620,14 @@ def fuse_partner(
     min_normal_cosine: float,
     partner_wins: bool,
     bit: int,
+    first_row: int,
+    end_row: int,
     covered: NDArray[np.uint8],
-    agreeing: NDArray[np.uint64],
+    agreeing: NDArray[np.uint8],
     colour: NDArray[np.uint16],
     /,
 ) -> None:
-    """Add a partner's verdict on a view's pixels: covered by a finer pixel, or seen by it, too.
+    """Add a partner's verdict on the pixels of a view's rows: covered by a finer pixel, or seen by it, too.
 
     depth : (H, W) float32
     normals : (3, H, W) float32
@@ -641,8 +643,10 @@ def fuse_partner(
     min_normal_cosine : float
     partner_wins : bool
     bit : int
+    first_row : int
+    end_row : int
     covered : (H, W) uint8, written
-    agreeing : (H, W) uint64, written
+    agreeing : (BYTES, H, W) uint8, written
     colour : (H, W, 3) uint16, written
     """
 
@@ -709,7 +713,7 @@ def count_points(
     depth: NDArray[np.float32],
     normals: NDArray[np.float32],
     covered: NDArray[np.uint8],
-    agreeing: NDArray[np.uint64],
+    agreeing: NDArray[np.uint8],
     colour: NDArray[np.uint16],
     min_stations: int,
     stations: NDArray[np.uint64],
@@ -722,7 +726,7 @@ def count_points(
     depth : (H, W) float32
     normals : (3, H, W) float32
     covered : (H, W) uint8
-    agreeing : (H, W) uint64
+    agreeing : (BYTES, H, W) uint8
     colour : (H, W, 3) uint16
     min_stations : int
     stations : (2) uint64
@@ -736,7 +740,7 @@ def write_points(
     depth: NDArray[np.float32],
     normals: NDArray[np.float32],
     covered: NDArray[np.uint8],
-    agreeing: NDArray[np.uint64],
+    agreeing: NDArray[np.uint8],
     colour: NDArray[np.uint16],
     min_stations: int,
     stations: NDArray[np.uint64],
@@ -756,7 +760,7 @@ def write_points(
     depth : (H, W) float32
     normals : (3, H, W) float32
     covered : (H, W) uint8
-    agreeing : (H, W) uint64
+    agreeing : (BYTES, H, W) uint8
     colour : (H, W, 3) uint16
     min_stations : int
     stations : (2) uint64

@@ -371,8 +371,10 @@ def fuse_partner(rng: Random) -> Arguments:
     image = filled(rng, (*partner[0].shape, 3), np.uint8)
     gates = [number(rng) for _ in range(3)]
     rays = [filled(rng, (3, 3), np.float64) for _ in range(2)]
-    flags = [bool(rng.integers(2)), int(rng.integers(64))]
-    return [*reference, rays[0], *partner, rays[1], image, *matrices, *gates, *flags, *verdicts(rng, shape)]
+    verdict = verdicts(rng, shape)
+    flags = [bool(rng.integers(2)), int(rng.integers(8 * len(verdict[1])))]
+    given = [*reference, rays[0], *partner, rays[1], image, *matrices, *gates, *flags]
+    return [*given, *some_rows(rng, shape[0]), *verdict]
 
 
 def find_gates(rng: Random) -> Arguments:
@@ -398,9 +400,8 @@ def unpack_normals(rng: Random) -> Arguments:
 
 def count_points(rng: Random) -> Arguments:
     maps = fused_maps(rng)
-    first, end = sorted(int(row) for row in rng.integers(0, maps[0].shape[0] + 1, 2))
     least, stations = int(rng.integers(0, 5)), filled(rng, (2,), np.uint64)
-    return [*maps, *verdicts(rng, maps[0].shape), least, stations, first, end]
+    return [*maps, *verdicts(rng, maps[0].shape), least, stations, *some_rows(rng, len(maps[0]))]
 
 
 def write_points(rng: Random) -> Arguments:
@@ -421,9 +422,14 @@ def fused_maps(rng: Random) -> Arguments:
     return [filled(rng, (h, w), np.float32), filled(rng, (3, h, w), np.float32)]
 
 
+def some_rows(rng: Random, height: int) -> Arguments:
+    return sorted(int(row) for row in rng.integers(0, height + 1, 2))
+
+
 def verdicts(rng: Random, shape: tuple[int, ...]) -> Arguments:
     covered = rng.integers(0, 2, shape, np.uint8)
-    return [covered, filled(rng, shape, np.uint64), filled(rng, (*shape, 3), np.uint16)]
+    agreeing = filled(rng, (int(rng.integers(1, 9)), *shape), np.uint8)
+    return [covered, agreeing, filled(rng, (*shape, 3), np.uint16)]
 
 
 def fit_planes(rng: Random) -> Arguments:

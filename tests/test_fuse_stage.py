@@ -221,7 +221,7 @@ def test_threads_do_not_matter(workspace, threads):
     assert cloud_bytes(workspace) == expected
 
 
-NEEDED = int(1.15 * 60 * WIDTH * HEIGHT)
+NEEDED = int(1.15 * 43 * WIDTH * HEIGHT)
 
 
 @contextmanager
@@ -264,7 +264,7 @@ def test_little_memory_changes_nothing(workspace, monkeypatch):
 
 
 def test_memory_is_what_is_reserved(workspace, monkeypatch):
-    """Arrays of one image at a time, without a cache: measured, against 60 bytes per pixel."""
+    """Arrays of one image at a time, without a cache: measured, against 43 bytes per pixel."""
     monkeypatch.setattr(memory, "resident", lambda: 100 << 20)
     monkeypatch.setattr(fusion, "_BAND_PIXELS", 1 << 10)  # the image is smaller than a band otherwise
     options = {"memory": f"{(100 << 20) + NEEDED + 1000}B", "fusion": FusionOptions(min_num_pixels=1)}

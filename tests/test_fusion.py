@@ -1,6 +1,7 @@
 """Our fusion of exact maps against exact surfaces, of noisy ones against the oracle, and what its options do."""
 
 import itertools
+import tracemalloc
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,12 +17,17 @@ from colmap_sph import _native
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, OptionError
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.stages import fusion_parts
 from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
+from colmap_sph.project import map_files
+from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.scene import POINT, View, pixel_transfer
 from colmap_sph.stereo import fusion
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, PackedMaps, ViewMaps, fuse_view
 from colmap_sph.stereo.fusion_losses import explain_losses
+from colmap_sph.stereo.photographs import owners
+from colmap_sph.stereo.search.idle import lending
 
 STONE = syn.Mottled(syn.Noise(0.1, seed=1))
 SIZE = (120, 90)
@@ -335,17 +341,26 @@ def noisy_maps(seed):
     ],
     ids=["default", "narrow", "wide"],
 )
-@pytest.mark.parametrize(("seed", "stations"), [(0, None), (1, None), (1, [0, 1, 2]), (1, [1, 1, 2])])
-def test_fusion_is_the_oracles(seed, stations, options):
-    maps = noisy_maps(seed)
+@pytest.mark.parametrize(
+    ("seeds", "stations"), [([0], None), ([1], None), ([1], [0, 1, 2]), ([1], [1, 1, 2]), ([2, 3, 4], None)]
+)
+def test_fusion_is_the_oracles(seeds, stations, options, monkeypatch):
+    """Also with more partners than a byte has bits, and where threads share the rows."""
+    monkeypatch.setattr(fusion, "_BAND_ROWS", 7)
+    maps = [one for seed in seeds for one in noisy_maps(seed)]
+    fused = maps
+    if len(seeds) > 1:
+        maps = [replace(one, index=5 * number % len(maps)) for number, one in enumerate(maps)]
+        fused = maps[10:11]  # one of the finest
     num_found = 0
-    for one in maps:
+    for one in fused:
         others = [other for other in maps if other is not one]
         numbers = list(range(1, 1 + len(others))) if stations is None else stations
         expected, clearance = oracle.fuse_view(one, others, options, numbers)
         clear = clearance > 1e-4
         assert clear.mean() > 0.98
-        (points, words), *more = fuse_view(one, others, options, stations=stations)
+        with lending(2):
+            (points, words), *more = fuse_view(one, others, options, stations=stations)
         assert not more
         found = {}
         position = 0
@@ -429,12 +444,13 @@ def test_no_pixel_is_passed_over_that_a_partner_has_in_view(seed):
     for one, other in itertools.permutations(random_maps(np.random.default_rng(seed), 10), 2):
         transfer, turn = pixel_transfer(one.view, other.view), one.view.R @ other.view.R.T
         covered, colour = np.zeros(one.depth.shape, np.uint8), np.zeros((*one.depth.shape, 3), np.uint16)
-        agreeing = np.zeros(one.depth.shape, np.uint64)
+        agreeing = np.zeros((1, *one.depth.shape), np.uint8)
         rays = [np.linalg.inv(maps.view.K) for maps in (one, other)]
         _native.fuse_partner(
             one.depth, one.normals, rays[0], other.depth, other.normals, rays[1], other.image, transfer, turn,
-            0.0, *gates, False, 0, covered, agreeing, colour,
+            0.0, *gates, False, 0, 0, len(one.depth), covered, agreeing, colour,
         )  # fmt: skip
+        agreeing = agreeing[0]
         rows, columns = np.nonzero(one.depth > 0)
         gate, distance = np.empty(len(rows), np.uint8), np.empty(len(rows), np.float32)
         places = (rows.astype(np.int32), columns.astype(np.int32))
@@ -586,3 +602,65 @@ def test_what_is_no_unit_vector_is_not_packed(normal):
     normals = unit_vectors(np.random.default_rng(0), 200).reshape(20, 10, 3)
     normals[7, 3] = normal
     assert PackedMaps.of(maps_with(normals)) is None
+
+
+def large_view(scale=1):
+    size = (800 * scale, 600 * scale)
+    K = syn.pinhole(500.0 * scale, *size)
+    return View(1, "a.png", *size, K, np.eye(3), np.zeros(3), np.empty(0, np.int64))
+
+
+def plain_maps(view, index):
+    """Maps of a plane before the camera, which only the caller has."""
+    shape = (view.height, view.width)
+    normals = np.zeros((3, *shape), np.float32)
+    normals[2] = -1
+    return ViewMaps(view, index, np.full(shape, 10, np.float32), normals, np.full((*shape, 3), 100, np.uint8))
+
+
+@pytest.mark.parametrize(("partners", "reserved"), [(1, 43), (9, 44)])
+def test_fusion_takes_what_is_reserved(partners, reserved, monkeypatch):
+    """16 bytes per pixel of a view's maps, 19 of a partner's, 6 of colours, 1 of being covered; and the bits."""
+    monkeypatch.setattr(fusion, "_BAND_PIXELS", 1 << 12)
+    view = large_view()
+    tracemalloc.start()
+    others = (plain_maps(view, index) for index in range(1, 1 + partners))
+    parts = fuse_view(plain_maps(view, 0), others, EVERY_PIXEL, stations=range(1, 1 + partners))
+    points = sum(len(some) for some, _ in parts)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert points == view.num_pixels
+    assert fusion_parts._bytes_to_fuse(partners) + fusion_parts._MAPS_BYTES == reserved
+    assert reserved - 0.5 < peak / view.num_pixels < reserved + 0.5
+
+
+@pytest.mark.parametrize("ending", ["jpg", "png"])
+@pytest.mark.parametrize("of_image", [1, 2])
+@pytest.mark.parametrize("of_maps", [1, 2])
+@pytest.mark.parametrize("taken_by", ["nothing", "mask", "view beside"])
+def test_reading_takes_what_is_reserved(ending, of_image, of_maps, taken_by, tmp_path, monkeypatch):
+    """Images and maps may have more pixels than are fused."""
+    monkeypatch.setattr(map_files, "_BAND_VALUES", 1 << 12)
+    monkeypatch.setattr(owners, "_BAND_PIXELS", 1 << 10)
+    view, map_view, file_view = large_view(), large_view(of_maps), large_view(of_image)
+    if of_image > 1:
+        view = replace(view, full_size=(file_view.width, file_view.height))
+    paths = [tmp_path / name for name in ("depth.bin", "normals.bin", f"image.{ending}", "mask.png")]
+    maps = plain_maps(map_view, 0)
+    write_depth_map(paths[0], maps.depth)
+    write_normal_map(paths[1], np.moveaxis(maps.normals, 0, 2))
+    cv2.imwrite(str(paths[2]), np.full((file_view.height, file_view.width, 3), 100, np.uint8))
+    cv2.imwrite(str(paths[3]), np.full((file_view.height, file_view.width), 255, np.uint8))
+    del maps
+    larger = map_view if of_maps > 1 else None
+    turned = replace(view, name="b.png", R=cv2.Rodrigues(np.array([0, 1.5, 0]))[0])
+    beside = (turned,) if taken_by == "view beside" else ()
+    mask = paths[3] if taken_by == "mask" else None
+    sources = MapSources(view, 0, *paths[:3], mask, map_view=larger, beside=beside)
+    tracemalloc.start()
+    read = read_view_maps(sources)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert np.abs(read.depth[:, 300:500] - 10).max() < 1e-5
+    reserved = fusion_parts._bytes_to_read(sources)
+    assert 0.4 * reserved < peak < reserved + 0.5 * view.num_pixels

@@ -215,8 +215,10 @@ def arguments(function):
             "min_normal_cosine": 0.9,
             "partner_wins": True,
             "bit": 0,
+            "first_row": 1,
+            "end_row": H,
             "out covered": np.zeros((H, W), u8),
-            "out agreeing": np.zeros((H, W), np.uint64),
+            "out agreeing": np.zeros((8, H, W), u8),
             "out colour": np.zeros((H, W, 3), np.uint16),
         },
         "find_gates": {
@@ -499,7 +501,7 @@ def every_station():
 def verdicts():
     return {
         "covered": np.zeros((H, W), np.uint8),
-        "agreeing": np.zeros((H, W), np.uint64),
+        "agreeing": np.zeros((8, H, W), np.uint8),
         "colour": np.zeros((H, W, 3), np.uint16),
     }
 
@@ -588,6 +590,9 @@ FREE = {
     ("depth_candidates", "disparity"): {0, 1},
     ("add_patch_equations", "image"): {0},
     ("draw_heights", "out raster"): {0, 1},
+    ("fuse_partner", "out agreeing"): {0},
+    ("count_points", "agreeing"): {0},
+    ("write_points", "agreeing"): {0},
     ("planes_of_maps", "out planes"): {1},
     ("maps_of_planes", "planes"): {1},
 }
@@ -1026,11 +1031,17 @@ def test_negative_slant_is_refused():
 
 @pytest.mark.parametrize("bit", [-1, 64, 2**31 - 1, -(2**31)])
 def test_more_partners_than_bits_are_refused(bit):
-    with pytest.raises(ValueError, match=r"bit must lie in 0\.\.63"):
+    with pytest.raises(ValueError, match="bit must be one of a pixel's"):
         call("fuse_partner", {**arguments("fuse_partner"), "bit": bit})
 
 
 @pytest.mark.parametrize("function", ["count_points", "write_points"])
+def test_more_than_64_bits_are_refused(function):
+    with pytest.raises(ValueError, match="no more than 64 bits"):
+        call(function, {**arguments(function), "agreeing": np.zeros((9, H, W), np.uint8)})
+
+
+@pytest.mark.parametrize("function", ["fuse_partner", "count_points", "write_points"])
 @pytest.mark.parametrize("rows", [(-1, 2), (0, H + 1), (3, 2), (H + 1, H + 1), (-(2**62), 2**62)])
 def test_rows_outside_the_map_are_refused(function, rows):
     with pytest.raises(ValueError, match="rows must lie in the map"):
@@ -1040,7 +1051,7 @@ def test_rows_outside_the_map_are_refused(function, rows):
 @pytest.mark.parametrize("least", [-(2**31), 0, 1, 2, 65, 2**31 - 1])
 def test_points_are_counted_for_any_number_of_views(least):
     values = {**arguments("count_points"), "min_stations": least}
-    values["agreeing"][0, 0] = 2**64 - 1
+    values["agreeing"][:, 0, 0] = 255
     values["covered"][1] = 1
     expected = {1: ((H - 1) * W, 2 * (H - 1) * W + 64), 2: (1, 66), 66: (0, 0)}
     assert call("count_points", values) == expected[min(max(least, 1), 2) if least <= 65 else 66]
@@ -1053,7 +1064,7 @@ def test_agreeing_partners_of_one_station_count_as_one():
     agreeing = [0b000000, 0b000011, 0b000100, 0b011000, 0b011111, 0b100000, 0b111100, 2**63 | 0b100001]
     stations = [1, 1, 2, 2, 2, 2, 3, 3]
     for bits, expected in zip(agreeing, stations, strict=True):
-        values["agreeing"][:] = bits
+        values["agreeing"][:] = np.frombuffer(bits.to_bytes(8, "little"), np.uint8)[:, None, None]
         for least in range(1, 5):
             words = H * W * (2 + bits.bit_count())
             seen = call("count_points", {**values, "min_stations": least})
@@ -1263,9 +1274,11 @@ def fuse_empty(reference, other, matrix):
     """Fuse a map with another, one of which has no pixels, and write its points."""
     maps = [(depth, np.ones((3, *depth.shape), np.float32), np.eye(3)) for depth in (reference, other)]
     shape = reference.shape
-    verdict = (np.zeros(shape, np.uint8), np.zeros(shape, np.uint64), np.zeros((*shape, 3), np.uint16))
+    verdict = (np.zeros(shape, np.uint8), np.zeros((8, *shape), np.uint8), np.zeros((*shape, 3), np.uint16))
     image = np.ones((*other.shape, 3), np.uint8)
-    _native.fuse_partner(*maps[0], *maps[1], image, matrix, np.eye(3), 0.5, 0.01, 0.9, True, 63, *verdict)
+    _native.fuse_partner(
+        *maps[0], *maps[1], image, matrix, np.eye(3), 0.5, 0.01, 0.9, True, 63, 0, shape[0], *verdict
+    )
     assert not any(array.any() for array in verdict)
     rows = (*maps[0][:2], *verdict, 2, every_station(), 0, shape[0])
     assert _native.count_points(*rows) == (0, 0)

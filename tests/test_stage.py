@@ -2,9 +2,11 @@
 
 import pickle
 import threading
-from collections.abc import Hashable
+import tracemalloc
+from collections.abc import Callable, Hashable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,13 +29,16 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
 from colmap_sph.pipeline.stages.fusion_parts import PartsStage
 from colmap_sph.pipeline.stages.match import MatchStage
-from colmap_sph.pipeline.stages.stage import Job, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
+from colmap_sph.stereo import vote
 from colmap_sph.stereo.anchor import anchored
 from colmap_sph.stereo.fusion import FusionOptions
+from colmap_sph.stereo.partners.pairing import Pair
 from colmap_sph.stereo.partners.pairs import select_pairs
+from colmap_sph.stereo.partners.stations import OWN_STATION, Stations
 
 NAMES = FOUR_NAMES
 OPTIONS = RunOptions(threads=2)
@@ -174,3 +179,42 @@ def test_what_is_made_follows_from_the_task_alone(project: Path, tmp_path: Path)
     for _ in range(2):
         assert type(stage).make(task).points > 1000
         assert type(stage).make(masked).points == 0
+
+
+def peak_of(make: Callable[[], object]) -> int:
+    """Most bytes of arrays at a time."""
+    tracemalloc.start()
+    try:
+        make()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_vote_takes_what_is_reserved(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without maps that nobody asked for: measured."""
+    monkeypatch.setattr(vote, "_BAND_BYTES", 1 << 14)  # the image is smaller than a band otherwise
+    stage = finished_stages(project)[1]
+    for item in stage.items:
+        job = asked(stage, item)
+        task = replace(job.task, estimate=tmp_path / item)
+        peak = peak_of(partial(stage.make, task))
+        assert 0.5 * job.cost.memory < peak < job.cost.memory
+
+
+def test_partners_that_stand_beside_a_view_cost_it_nothing(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They tell nothing of its depth, and are not read: the others cost what they cost alone."""
+    context = context_of(project, project / "dense")
+    facts = Facts(coverage=1.0, row_residual=0.0)
+
+    def cost(pairs: list[Pair]) -> Cost:
+        matched = {pair: Result("", made=True, facts=facts) for pair in pairs}
+        votes = {name: Result("", made=True, facts=facts) for name in NAMES}
+        return asked(ConfirmStage(context, matched, votes), NAMES[0]).cost
+
+    pairs = [(NAMES[0], name) for name in NAMES[1:]]
+    alone, all_count = cost(pairs[1:]), cost(pairs)
+    numbers = {name: number for number, name in enumerate(NAMES[1:])}
+    monkeypatch.setattr(Stations, "numbers", lambda _self, _name, others: [numbers[name] for name in others])
+    assert numbers[NAMES[1]] == OWN_STATION
+    assert cost(pairs) == alone != all_count

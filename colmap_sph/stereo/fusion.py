@@ -6,8 +6,9 @@ its finest image everywhere, and an image is fused from the maps alone: images m
 number of threads, with the maps of few images in memory, and the cloud is the same to the byte.
 """
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, Literal
@@ -19,9 +20,13 @@ from colmap_sph import _native
 from colmap_sph.errors import OptionError
 from colmap_sph.scene import POINT, View, pixel_transfer
 from colmap_sph.stereo.partners.stations import OWN_STATION
+from colmap_sph.stereo.search.idle import at_once
 
-# A bit for each of them.
+# A bit for each of them, of which a byte has eight.
 MAX_PARTNERS = 64
+_BITS = 8
+# Rows in which partners are looked at by one thread.
+_BAND_ROWS = 256
 # Points are made from so many pixels at a time: one that 50 images see takes 231 bytes.
 _BAND_PIXELS = 1 << 16
 # Code of a normal that is no unit vector.
@@ -210,37 +215,20 @@ def fuse_view(
         For each point the number of these views and their indices: ``fused.ply.vis``.
     """
     shape = reference.depth.shape
+    most = MAX_PARTNERS if stations is None else min(len(stations), MAX_PARTNERS)
     covered = np.zeros(shape, np.uint8)
-    agreeing = np.zeros(shape, np.uint64)
+    agreeing = np.zeros((-(-most // _BITS), *shape), np.uint8)
     colour = reference.image.astype(np.uint16)
     reference = replace(reference, image=reference.image[:0].copy())  # may go: `colour` has it
     indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
     indices[0] = reference.index
     bit = -1
-    for partner in islice(partners, MAX_PARTNERS):  # `enumerate` would keep one while the next is read
+    for partner in islice(partners, most):  # `enumerate` would keep one while the next is read
         bit += 1
         if partner is None:
             continue
         indices[1 + bit] = partner.index
-        _native.fuse_partner(
-            reference.depth,
-            reference.normals,
-            reference.view.inverse_K,
-            partner.depth,
-            partner.normals,
-            partner.view.inverse_K,
-            partner.image,
-            pixel_transfer(reference.view, partner.view),
-            reference.view.R @ partner.view.R.T,
-            options.reprojection_error,
-            options.max_depth_error,
-            np.cos(np.radians(options.max_normal_error)),
-            partner.index < reference.index,
-            bit,
-            covered,
-            agreeing,
-            colour,
-        )
+        at_once(*_in_bands(reference, partner, options, bit, covered, agreeing, colour))
         del partner
     view = reference.view
     step = max(_BAND_PIXELS // shape[1], 1)
@@ -256,6 +244,37 @@ def fuse_view(
         visibility = np.empty(num_words, np.uint32)
         _native.write_points(*pixels, *rows, *frame, indices, points, visibility)
         yield points.view(POINT)[:, 0], visibility
+
+
+def _in_bands(
+    reference: ViewMaps,
+    partner: ViewMaps,
+    options: FusionOptions,
+    bit: int,
+    *verdict: NDArray[np.unsignedinteger],
+) -> Iterator[Callable[[], None]]:
+    """Add what a partner says of every pixel: in bands of rows, which may be done in any order."""
+    for first in range(0, len(reference.depth), _BAND_ROWS):
+        yield partial(
+            _native.fuse_partner,
+            reference.depth,
+            reference.normals,
+            reference.view.inverse_K,
+            partner.depth,
+            partner.normals,
+            partner.view.inverse_K,
+            partner.image,
+            pixel_transfer(reference.view, partner.view),
+            reference.view.R @ partner.view.R.T,
+            options.reprojection_error,
+            options.max_depth_error,
+            np.cos(np.radians(options.max_normal_error)),
+            partner.index < reference.index,
+            bit,
+            first,
+            min(first + _BAND_ROWS, len(reference.depth)),
+            *verdict,
+        )
 
 
 def _station_bits(stations: Sequence[int] | None) -> NDArray[np.uint64]:

@@ -73,7 +73,7 @@ static void run_fusion(const kernel_table *k, image_size size) {
     FILL(int32_t, columns, PIXELS, x)
     FILL(uint8_t, image, 3 * PIXELS, random_word())
     FILL(uint8_t, covered, PIXELS, 0)
-    FILL(uint64_t, agreeing, PIXELS, 0)
+    FILL(uint8_t, agreeing, PIXELS, 0)
     FILL(uint16_t, colour, 3 * PIXELS, 0)
     MAKE(uint8_t, gate, PIXELS);
     MAKE(float, distance, PIXELS);
@@ -82,9 +82,9 @@ static void run_fusion(const kernel_table *k, image_size size) {
     const view_maps maps = {depth, normals, size.height, size.width, {.01, 0, 0, 0, .01, 0, 0, 0, 1}};
     const fusion_transfer transfer = {
         {1, .001, .3, -.001, 1, .2, 0, 0, 1}, {2, 1, .01}, {1, .01, 0, -.01, 1, 0, 0, 0, 1}, 1};
-    const fusion_verdict verdict = {covered, agreeing, colour};
+    const fusion_verdict verdict = {covered, agreeing, colour, 1};
     find_gates(&maps, &maps, &transfer, (fusion_gates){2, .01f, .95f}, rows, columns, PIXELS, gate, distance);
-    fuse_partner(&maps, &maps, image, &transfer, (fusion_gates){2, .01f, .95f}, 5, &verdict);
+    fuse_partner(&maps, &maps, image, &transfer, (fusion_gates){2, .01f, .95f}, 5, 0, size.height, &verdict);
     pack_normals(normals, PIXELS, pair, codes);
     HASH(gate, PIXELS);
     add_floats_to_hash(distance, PIXELS);

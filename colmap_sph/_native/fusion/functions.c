@@ -23,14 +23,21 @@ _Static_assert(POINT_BYTES == 27 && 1 + MAX_FUSION_PARTNERS == 65, "tables below
     X(VALUE, float, min_normal_cosine) \
     X(VALUE, flag, partner_wins) \
     X(VALUE, int, bit) \
+    X(VALUE, ptrdiff, first_row) \
+    X(VALUE, ptrdiff, end_row) \
     X(OUT, uint8, covered, H, W) \
-    X(OUT, uint64, agreeing, H, W) \
+    X(OUT, uint8, agreeing, BYTES, H, W) \
     X(OUT, uint16, colour, H, W, 3)
 ARGUMENTS(fuse_partner, FUSE_PARTNER);
 
+static int check_rows(ptrdiff_t first_row, ptrdiff_t end_row, ptrdiff_t height) {
+    return check(0 <= first_row && first_row <= end_row && end_row <= height, "the rows must lie in the map");
+}
+
 static int check_fuse_partner(const void *arguments) {
     const fuse_partner_arguments *a = arguments;
-    return check(a->bit >= 0 && a->bit < MAX_FUSION_PARTNERS, "the partner's bit must lie in 0..63");
+    return check(a->bit >= 0 && a->bit / 8 < a->size.BYTES, "the partner's bit must be one of a pixel's") &&
+           check_rows(a->first_row, a->end_row, a->size.H);
 }
 
 static view_maps maps_with_rays(const float *depth, const float *normals, ptrdiff_t height, ptrdiff_t width,
@@ -46,16 +53,17 @@ static int run_fuse_partner(void *arguments) {
     const view_maps partner = maps_with_rays(a->partner_depth, a->partner_normals, a->size.PARTNER_H,
                                              a->size.PARTNER_W, a->partner_ray_from_pixel);
     const fusion_gates gates = {a->max_reprojection_error, a->max_depth_error, a->min_normal_cosine};
-    const fusion_verdict verdict = {a->covered, a->agreeing, a->colour};
+    const fusion_verdict verdict = {a->covered, a->agreeing, a->colour, a->size.BYTES};
     fusion_transfer transfer = {.partner_wins = a->partner_wins};
     split_transfer(a->partner_from_reference, transfer.pixel_from_reference, transfer.translation);
     memcpy(transfer.reference_from_partner, a->normal_from_partner, sizeof transfer.reference_from_partner);
-    fuse_partner(&reference, &partner, a->partner_image, &transfer, gates, a->bit, &verdict);
+    fuse_partner(&reference, &partner, a->partner_image, &transfer, gates, a->bit, a->first_row, a->end_row,
+                 &verdict);
     return 0;
 }
 
 FUNCTION(fuse_partner, FUSE_PARTNER, check_fuse_partner,
-         "Add a partner's verdict on a view's pixels: covered by a finer pixel, or seen by it, too.");
+         "Add a partner's verdict on the pixels of a view's rows: covered by a finer pixel, or seen by it, too.");
 
 #define FIND_GATES(X) \
     X(IN, float32, depth, H, W) \
@@ -135,7 +143,7 @@ FUNCTION(unpack_normals, UNPACK_NORMALS, any, "What was packed.");
     X(IN, float32, depth, H, W) \
     X(IN, float32, normals, 3, H, W) \
     X(IN, uint8, covered, H, W) \
-    X(IN, uint64, agreeing, H, W) \
+    X(IN, uint8, agreeing, BYTES, H, W) \
     X(IN, uint16, colour, H, W, 3) \
     X(VALUE, int, min_stations) \
     X(IN, uint64, stations, 2) \
@@ -158,19 +166,21 @@ FUNCTION(unpack_normals, UNPACK_NORMALS, any, "What was packed.");
 ARGUMENTS(count_points, COUNT_POINTS);
 ARGUMENTS(write_points, WRITE_POINTS);
 
-static int check_rows(ptrdiff_t first_row, ptrdiff_t end_row, ptrdiff_t height) {
-    return check(0 <= first_row && first_row <= end_row && end_row <= height, "the rows must lie in the map");
+static int check_fused_rows(ptrdiff_t first_row, ptrdiff_t end_row, const sizes *size) {
+    return check(size->BYTES <= MAX_FUSION_PARTNERS / 8, "a pixel must have no more than 64 bits") &&
+           check_rows(first_row, end_row, size->H);
 }
 
 /* Both have these arguments. */
 #define FUSED_ROWS_OF(a) \
     {&(view_maps){(a)->depth, (a)->normals, (a)->size.H, (a)->size.W, {0}}, \
-     &(fusion_verdict){(uint8_t *)(a)->covered, (uint64_t *)(a)->agreeing, (uint16_t *)(a)->colour}, \
+     &(fusion_verdict){(uint8_t *)(a)->covered, (uint8_t *)(a)->agreeing, (uint16_t *)(a)->colour, \
+                       (a)->size.BYTES}, \
      (a)->first_row, (a)->end_row, (a)->min_stations, (a)->stations[0], (a)->stations[1]}
 
 static int check_count_points(const void *arguments) {
     const count_points_arguments *a = arguments;
-    return check_rows(a->first_row, a->end_row, a->size.H);
+    return check_fused_rows(a->first_row, a->end_row, &a->size);
 }
 
 static int run_count_points(void *arguments) {
@@ -185,7 +195,7 @@ FUNCTION(count_points, COUNT_POINTS, check_count_points,
 
 static int check_write_points(const void *arguments) {
     const write_points_arguments *a = arguments;
-    if (!check_rows(a->first_row, a->end_row, a->size.H)) {
+    if (!check_fused_rows(a->first_row, a->end_row, &a->size)) {
         return 0;
     }
     /* The arrays must hold what will be written, and nothing may change it meanwhile: counted here again. */

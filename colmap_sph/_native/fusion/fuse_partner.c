@@ -108,10 +108,12 @@ ALWAYS_INLINE void fetch(const view_maps *partner, const uint8_t *image, const b
 }
 
 void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
-                  const fusion_transfer *transfer, fusion_gates gates, int bit, const fusion_verdict *verdict) {
+                  const fusion_transfer *transfer, fusion_gates gates, int bit, ptrdiff_t first_row,
+                  ptrdiff_t end_row, const fusion_verdict *verdict) {
     const double max_error_squared = (double)gates.max_reprojection_error * gates.max_reprojection_error;
     const ptrdiff_t blocks = (reference->width + BLOCK - 1) / BLOCK;
-    for (ptrdiff_t n = 0; n < reference->height * blocks; n++) {
+    uint8_t *agreeing = verdict->agreeing + bit / 8 * reference->height * reference->width;
+    for (ptrdiff_t n = first_row * blocks; n < end_row * blocks; n++) {
         const ptrdiff_t row = n / blocks, first = n % blocks * BLOCK, left = reference->width - first;
         const ptrdiff_t start = row * reference->width, end = first + (left < BLOCK ? left : BLOCK);
         if (is_aside(reference->depth + start, transfer, partner, (double)row, first, end)) {
@@ -136,7 +138,7 @@ void fuse_partner(const view_maps *reference, const view_maps *partner, const ui
                     continue;
                 }
             }
-            verdict->agreeing[p] |= UINT64_C(1) << bit;
+            agreeing[p] = (uint8_t)(agreeing[p] | 1 << bit % 8);
             const uint8_t *colour = image + 3 * (met.y * partner->width + met.x);
             for (int c = 0; c < 3; c++) {
                 verdict->colour[3 * p + c] = (uint16_t)(verdict->colour[3 * p + c] + colour[c]);

@@ -28,9 +28,10 @@ typedef struct {
 
 /* What the partners say of each pixel of the reference. */
 typedef struct {
-    uint8_t *covered;   /* 1: a partner sees the same piece of surface with a finer pixel */
-    uint64_t *agreeing; /* a bit for each partner that sees the same surface */
-    uint16_t *colour;   /* (..., 3) sums over these */
+    uint8_t *covered;  /* 1: a partner sees the same piece of surface with a finer pixel */
+    uint8_t *agreeing; /* a bit for each partner that sees the same surface: eight of them a plane */
+    uint16_t *colour;  /* (..., 3) sums over these */
+    ptrdiff_t planes;
 } fusion_verdict;
 
 /* What keeps a partner from agreeing with a pixel: it has the point not in view or no depth there, its depth or
@@ -44,10 +45,11 @@ void find_gates(const view_maps *reference, const view_maps *partner, const fusi
                 fusion_gates gates, const int32_t *rows, const int32_t *columns, ptrdiff_t count, uint8_t *gate,
                 float *distance);
 
-/* Adds the verdict of the partner with this bit, whose `image` has three channels. Pixels that are covered already
- * are passed over. */
+/* Adds the verdict of the partner with this bit, whose `image` has three channels, on some rows of the reference.
+ * Pixels that are covered already are passed over. */
 void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
-                  const fusion_transfer *transfer, fusion_gates gates, int bit, const fusion_verdict *verdict);
+                  const fusion_transfer *transfer, fusion_gates gates, int bit, ptrdiff_t first_row,
+                  ptrdiff_t end_row, const fusion_verdict *verdict);
 
 /* Unit vectors (three planes) as two of their components (two planes) and a code, and back to the same bits. Of
  * each pixel the largest component is left out; (0, 0, 0) is none. Code 3: it cannot be packed. */

@@ -32,7 +32,7 @@ void write_points(const fused_rows *rows, const point_frame *frame, uint8_t *poi
             points += POINT_BYTES;
             *visibility++ = (uint32_t)views;
             *visibility++ = frame->indices[0];
-            for (uint64_t bits = rows->verdict->agreeing[p]; bits; bits &= bits - 1) {
+            for (uint64_t bits = agreeing_at(rows, p); bits; bits &= bits - 1) {
                 *visibility++ = frame->indices[1 + __builtin_ctzll(bits)];
             }
         }

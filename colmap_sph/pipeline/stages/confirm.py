@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,6 +57,9 @@ _ESTIMATE_BYTES = 9
 _PAIRED_BYTES = 2
 # Caches take what the costliest image leaves, with some room to spare.
 _ROOM = 1.2
+
+# Names, stations and row residuals, radians, of a view's partners; and whether it is refined at half its size.
+_Partners = tuple[list[str], list[int], list[float], bool]
 
 # Images of views, and estimates of their depth.
 _loaded: LoadCache[NDArray[np.uint8] | DepthEstimate] = LoadCache(
@@ -213,7 +217,7 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         self._all_partners = partners_of(matched)
         # Each is asked for by all partners of a view.
         self._files: dict[str, EstimateFile] = {}
-        self._chosen: dict[str, list[str]] = {}
+        self._known_partners: dict[str, _Partners] = {}
 
     def input_key(self) -> str:
         """See `RememberingStage`."""
@@ -234,12 +238,10 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
     def ask(self, item: str) -> Job[ConfirmTask]:
         """See `RememberingStage`."""
         options = self.context.options
-        partners, stations = self.context.stations.elsewhere(item, self._partners(item))
+        partners, stations, residuals, half_size = self._partners(item)
         votes = [self._vote_keys[name] for name in partners]
         sights = self.context.sparse_tracks.sights(item).between(options.rectification.depths)
-        residuals = self._residuals_with(item, partners)
         cut = self.context.cut(item)
-        half_size = self._half_size(item, residuals)
         key = self.context.keys.geometric(
             self._vote_keys[item], votes, stations, residuals, sights, half_size, cut
         )
@@ -264,16 +266,19 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         )
         return Job(key, self.found(task), self._cost(item), task)
 
-    def _partners(self, name: str) -> list[str]:
-        if name not in self._chosen:
-            facing = self.context.facing.views(name, self._matched(name))
-            self._chosen[name] = [other for views in facing for other in views if other in self._vote_keys]
-        return self._chosen[name]
-
-    def _residuals_with(self, name: str, partners: Sequence[str]) -> list[float]:
-        """Row residuals of a view's pairs, radians."""
-        lead_of = self.context.lead
-        return [self._residuals[as_pair(lead_of(name), lead_of(partner))] for partner in partners]
+    def _partners(self, name: str) -> _Partners:
+        """Partners of a view that stand elsewhere; and whether it is refined at half its size."""
+        if name not in self._known_partners:
+            context = self.context
+            facing = chain(*context.facing.views(name, self._matched(name)))
+            names, stations = context.stations.elsewhere(name, [o for o in facing if o in self._vote_keys])
+            lead_of = context.lead
+            residuals = [self._residuals[as_pair(lead_of(name), lead_of(other))] for other in names]
+            # One whose image is not there yet is taken for sharp.
+            pixels = _usual(residuals) * float(context.scene.view(name).K[0, 0])
+            half_size = suits_half_size(context.details.get(name, 1.0), pixels)
+            self._known_partners[name] = names, stations, residuals, half_size
+        return self._known_partners[name]
 
     def _matched(self, name: str) -> list[str]:
         return self._all_partners.get(self.context.lead(name), [])
@@ -293,13 +298,10 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
 
     def _cost(self, name: str) -> Cost:
         pixels = self._pixels(name)
-        partners = self._partners(name)
-        residuals = self._residuals_with(name, partners)
+        partners, stations, residuals, half_size = self._partners(name)
         refinement = _refinement(self.context.options.refinement, self.context.scene.view(name), residuals)
-        half_size = self._half_size(name, residuals)
         normals = self.context.options.normals
         seconds = confirm_seconds(len(partners), normals, refinement, half_size=half_size)
-        _, stations = self.context.stations.elsewhere(name, partners)
         memory = (_CONFIRM_BYTES + _STATION_BYTES * (len({*stations}) < len(stations))) * pixels
         if refinement.rounds:
             of_partners = (_IMAGE_BYTES + _PAIRED_BYTES) * sum(map(self._pixels, partners))
@@ -308,11 +310,6 @@ class ConfirmStage(RememberingStage[str, ConfirmTask]):
         memory += bytes_to_reduce(*map(self.context.scene.view, [name, *partners]))
         maps = MAP_BYTES * self.context.scene.view(name).num_pixels
         return Cost(seconds * pixels / 1e6, memory + maps - MAP_BYTES * pixels, maps)
-
-    def _half_size(self, name: str, residuals: Sequence[float]) -> bool:
-        """Whether a view is refined at half its size; one whose image is not there yet is taken for sharp."""
-        pixels = _usual(residuals) * float(self.context.scene.view(name).K[0, 0])
-        return suits_half_size(self.context.details.get(name, 1.0), pixels)
 
     def _pixels(self, name: str) -> int:
         return self.context.window(name).num_pixels

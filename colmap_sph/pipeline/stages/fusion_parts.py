@@ -21,7 +21,7 @@ from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.images.reading import bytes_to_reduce
 from colmap_sph.project.masks import warn_of_unused_masks
 from colmap_sph.scene import Region
-from colmap_sph.stereo.fusion import FusionOptions, PackedMaps, ViewMaps, fuse_view
+from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, PackedMaps, ViewMaps, fuse_view
 from colmap_sph.stereo.partners.reads import best_order
 from colmap_sph.stereo.region.inside import pixels_inside
 
@@ -38,12 +38,19 @@ CLOUD_BYTES = 22.0
 # Processor seconds per megapixel of the image, and per image that overlaps it.
 _SECONDS = 0.05
 _PARTNER_SECONDS = 0.009
-# Bytes per pixel: of the maps of a view with its image; largest in use while a view is fused.
+# Bytes per pixel: of the maps of a view with its image; of the view that is fused beside one of its partners, that
+# is its maps, whether a finer pixel covers each of its own, the sums of colours, and a bit for each partner.
 _MAPS_BYTES = 19.0
-_FUSE_BYTES = 60.0
-# Of maps that are packed; and what unpacking those of a view and of a partner takes.
+_FUSE_BYTES = 23.0
+_PARTNER_BYTES = 1 / 8
+# Of a mask, or of which pixels are a view's own, while depths are taken away; of larger maps that are reduced, and
+# of what is reduced to meanwhile.
+_MASK_BYTES = 2.0
+_LARGER_BYTES = 16.0
+_REDUCED_BYTES = 48.0
+# Of maps that are packed; and what unpacking those of a view, or of a partner, takes.
 _PACKED_BYTES = 16.0
-_UNPACKING_BYTES = 24.0
+_UNPACKING_BYTES = 12.0
 
 _maps: LoadCache[ViewMaps | PackedMaps] = LoadCache(lambda view_maps: view_maps.nbytes)
 
@@ -158,7 +165,8 @@ class PartsStage(Stage[str, FuseTask]):
         pixels = scene.view(item).num_pixels
         partners, stations = self.partners[item]
         seconds = seconds_per_megapixel(len(partners))
-        memory = self._item_bytes * pixels + bytes_to_reduce(*map(scene.view, [item, *partners]))
+        memory = _bytes_to_fuse(len(partners), is_packed=self._is_packed) * pixels
+        memory += max(_bytes_to_read(self.sources[name], is_packed=self._is_packed) for name in [item, *partners])
         cost = Cost(seconds * pixels / 1e6, memory, CLOUD_BYTES * pixels)
         task = FuseTask(
             self.sources[item],
@@ -196,9 +204,8 @@ class PartsStage(Stage[str, FuseTask]):
         pixels = {name: self.context.scene.view(name).num_pixels for name in self.items}
         filled = _MAPS_BYTES * sum(pixels.values())
         largest = max(pixels.values(), default=0)
-        whole, packed = (
-            gate.spare(2 * each * largest) / 2 for each in (_FUSE_BYTES, _FUSE_BYTES + _UNPACKING_BYTES)
-        )
+        each = _bytes_to_fuse(MAX_PARTNERS) + _MAPS_BYTES
+        whole, packed = (gate.spare(2 * most * largest) / 2 for most in (each, each + 2 * _UNPACKING_BYTES))
         self._is_packed = whole < filled and packed / _PACKED_BYTES > whole / _MAPS_BYTES
         cache = int(min(filled, packed if self._is_packed else whole))
         if self._is_open:  # once, and not by every worker at a time
@@ -211,11 +218,6 @@ class PartsStage(Stage[str, FuseTask]):
             self._needed = _next_uses(self.items, partners)
         return Kept(cache=cache, caches=1, filled=filled)
 
-    @property
-    def _item_bytes(self) -> float:
-        """Largest in use while a view is fused, per pixel."""
-        return _FUSE_BYTES + (_UNPACKING_BYTES if self._is_packed else 0.0)
-
     def _report_unread(self, results: Mapping[str, Result]) -> bool:
         """Report images whose maps could not be read while others were fused; whether there are any."""
         unread = {name: reason for result in results.values() for name, reason in result.facts.unread.items()}
@@ -224,6 +226,23 @@ class PartsStage(Stage[str, FuseTask]):
                 continue
             self.context.leave_incomplete(name, f"the cloud lacks its agreement with other images: {reason}")
         return bool(unread)
+
+
+def _bytes_to_fuse(partners: int, *, is_packed: bool = False) -> float:
+    """Largest bytes in use while a view is fused, per pixel, beside the maps of one of so many partners."""
+    bits = math.ceil(_PARTNER_BYTES * min(partners, MAX_PARTNERS))
+    return _FUSE_BYTES + bits + _UNPACKING_BYTES * is_packed
+
+
+def _bytes_to_read(sources: MapSources, *, is_packed: bool = False) -> float:
+    """Largest bytes in use while the maps of a view are read, and from then on."""
+    view, larger = sources.view, sources.map_view
+    is_masked = sources.mask is not None or bool(sources.beside)
+    each = _MAPS_BYTES + _UNPACKING_BYTES * is_packed + _MASK_BYTES * is_masked
+    maps = each * view.num_pixels
+    if larger is not None:
+        maps = max(maps, _LARGER_BYTES * larger.num_pixels + _REDUCED_BYTES * view.num_pixels)
+    return max(maps, bytes_to_reduce(view))
 
 
 def _next_uses(items: Sequence[str], partners: Mapping[str, Sequence[str]]) -> dict[str, tuple[float, ...]]:

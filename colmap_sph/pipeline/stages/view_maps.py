@@ -67,19 +67,21 @@ def read_view_maps(sources: MapSources) -> ViewMaps:
         A map, the image or the mask is missing, damaged or not of the camera's size.
     """
     view = sources.view
-    depth, normals = read_sound_maps(sources)
-    if sources.map_view is not None:
-        depth, normals = reduced_maps(depth, normals, sources.map_view, view)
+    # Before the maps, beside which there would be no room to decode it.
     image = read_colours(sources.image)
     width, height = view.file_size
     if image.shape[:2] != (height, width):
         raise InputError(f"The image {sources.image} is not of its camera's {width} x {height} pixels.")
+    image = fitted(image, (view.width, view.height))
     mask = None if sources.mask is None else read_view_mask(sources.mask, view)
+    depth, normals = read_sound_maps(sources)
+    if sources.map_view is not None:
+        depth, normals = reduced_maps(depth, normals, sources.map_view, view)
     if mask is not None:
         depth[mask == 0] = 0
     if sources.beside:
         depth[~owned_pixels(view, sources.beside)] = 0
-    return ViewMaps(view, sources.index, depth, normals, fitted(image, (view.width, view.height)))
+    return ViewMaps(view, sources.index, depth, normals, image)
 
 
 def read_sound_maps(sources: MapSources) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

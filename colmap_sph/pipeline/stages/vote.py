@@ -47,8 +47,11 @@ _NORMALS_SECONDS = 0.027
 REGION_MARGIN = 24
 # Bytes on disk per pixel: of the estimate.
 _ESTIMATE_BYTES = 9.0
-# Largest bytes in use at a time, per pixel: beside the pairs' disparity maps, and of one that is not made yet.
-_VOTE_BYTES = 45.0
+# Largest bytes in use at a time, per pixel, beside the pairs' disparity maps: of the estimate (9), one more map as
+# floats and in the codes of its file (6, where it is no larger than the image), and a mask (7); more while maps
+# are made of the estimate, or pixels counted that show a region. And of a disparity map that is not made yet.
+_VOTE_BYTES = 24.0
+_MAPS_BYTES = 45.0
 _DISPARITY_BYTES = 4.0
 
 
@@ -245,12 +248,12 @@ class VoteStage(RememberingStage[str, VoteTask]):
         disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
         seconds = 0.0 if only_maps else vote_seconds(len(files))
         disk = 0.0 if only_maps else _ESTIMATE_BYTES * pixels
-        maps = 0.0
+        at_once, maps = _VOTE_BYTES if self.context.focus is None else _MAPS_BYTES, 0.0
         if self.context.wants_photometric:
             seconds += normals_seconds(self.context.options.normals)
             disk += MAP_BYTES * view.num_pixels
-            maps = MAP_BYTES * (view.num_pixels - pixels)
-        return Cost(seconds * pixels / 1e6, _VOTE_BYTES * pixels + disparities + maps, disk)
+            at_once, maps = _MAPS_BYTES, MAP_BYTES * (view.num_pixels - pixels)
+        return Cost(seconds * pixels / 1e6, at_once * pixels + disparities + maps, disk)
 
     @contextmanager
     def opened(self) -> Iterator[None]:

@@ -181,9 +181,8 @@ def read_colours(path: Path, size: Size | None = None) -> NDArray[np.uint8]:
         pixels = read_pixels(path, deep=False)
     except (OSError, DamagedError) as error:
         raise _unreadable(path, error) from error
-    colours = np.empty((*pixels.shape[:2], 3), dtype=np.uint8)
-    colours[:] = pixels[..., ::-1]
-    return fitted(colours, size)
+    colours = np.ascontiguousarray(pixels[..., ::-1])  # of JPEG as it was decoded
+    return fitted(colours if colours.shape[2] == 3 else colours.repeat(3, axis=2), size)
 
 
 def read_small_colours(path: Path, longest: int) -> NDArray[np.uint8]:

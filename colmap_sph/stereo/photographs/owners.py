@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from colmap_sph.scene import View
 
+# Pixels that are looked at together, at some hundred bytes each.
+_BAND_PIXELS = 1 << 16
+
 
 def owned_pixels(view: View, others: Sequence[View]) -> NDArray[np.bool_]:
     """Find the pixels of a view whose rays belong to it.
@@ -40,7 +43,17 @@ def owned_pixels(view: View, others: Sequence[View]) -> NDArray[np.bool_]:
     >>> int(owned_pixels(ahead, [right])[50].argmin())  # 50 + 50 tan 30° = 78.9
     79
     """
-    columns, rows = np.meshgrid(np.arange(view.width), np.arange(view.height))
+    owned = np.empty((view.height, view.width), bool)
+    step = max(_BAND_PIXELS // view.width, 1)
+    for first in range(0, view.height, step):
+        band = owned[first : first + step]
+        band[:] = _owned_in_rows(view, others, first, first + len(band))
+    return owned
+
+
+def _owned_in_rows(view: View, others: Sequence[View], first: int, end: int) -> NDArray[np.bool_]:
+    """`owned_pixels` of the rows from `first` to before `end`."""
+    columns, rows = np.meshgrid(np.arange(view.width), np.arange(first, end))
     pixels = np.stack([columns, rows, np.ones_like(columns)]).reshape(3, -1).astype(float)
     owned = np.ones(pixels.shape[1], bool)
     for other in others:
@@ -49,4 +62,4 @@ def owned_pixels(view: View, others: Sequence[View]) -> NDArray[np.bool_]:
         nearer = (depth > 1) | ((depth == 1) & (other.name < view.name))
         inside = (x >= 0) & (x <= other.width * depth) & (y >= 0) & (y <= other.height * depth)
         owned &= ~(nearer & inside)
-    return owned.reshape(view.height, view.width)
+    return owned.reshape(end - first, view.width)
