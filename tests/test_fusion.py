@@ -656,7 +656,7 @@ def test_reading_takes_what_is_reserved(ending, of_image, of_maps, taken_by, tmp
     turned = replace(view, name="b.png", R=cv2.Rodrigues(np.array([0, 1.5, 0]))[0])
     beside = (turned,) if taken_by == "view beside" else ()
     mask = paths[3] if taken_by == "mask" else None
-    sources = MapSources(view, 0, *paths[:3], mask, map_view=larger, beside=beside)
+    sources = MapSources(view, 0, paths[0], paths[1], paths[2], mask, map_view=larger, beside=beside)
     tracemalloc.start()
     read = read_view_maps(sources)
     peak = tracemalloc.get_traced_memory()[1]

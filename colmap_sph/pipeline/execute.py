@@ -12,6 +12,7 @@ from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.stage import Job, Result, Stage
 from colmap_sph.pipeline.workers import for_all
+from colmap_sph.platforms.memory import give_back_freed_memory
 from colmap_sph.project.state.background import vouching_in_background
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.search.idle import busy, lending
@@ -70,6 +71,7 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
 def made_by_threads(stage: Stage[Item, Task], items: Sequence[Item] | None = None) -> dict[Item, Result]:
     """Make the results of a stage that is open and announced, or of some of its items; see `execute`."""
     options = stage.context.options
+    give_back_freed_memory()  # what the stage before kept for its own sizes
     gate = MemoryGate(options.memory_budget, options.num_threads)
     kept = stage.kept_memory(gate)
 

@@ -68,6 +68,14 @@ def keep_freed_memory() -> None:
         mallopt(_MMAP_THRESHOLD, _MMAP_BYTES)
 
 
+def give_back_freed_memory() -> None:
+    """Give the system back what has been freed: of glibc, which keeps what lies between memory in use, gibibytes after
+    large images. Other C libraries do as they do.
+    """
+    with suppress(OSError, AttributeError, TypeError):
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def process_start_time() -> float | None:
     """When this process was started, in seconds since 1970; None where the system does not say."""
     with suppress(OSError, psutil.Error):

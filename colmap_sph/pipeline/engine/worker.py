@@ -23,7 +23,7 @@ from colmap_sph.pipeline.program import versions
 from colmap_sph.pipeline.stages.stage import holding_caches
 from colmap_sph.pipeline.workers import refusal_of
 from colmap_sph.platforms.files import look_again
-from colmap_sph.platforms.memory import keep_freed_memory, most_resident, resident
+from colmap_sph.platforms.memory import give_back_freed_memory, keep_freed_memory, most_resident, resident
 from colmap_sph.project.files import read_small, writing_only_if
 from colmap_sph.project.state.background import vouching_in_background
 
@@ -173,6 +173,7 @@ class Workplace:
 
     def _leave(self) -> None:
         self._held.close()
+        give_back_freed_memory()
         self._looked_at = set()
         self._stage = None
 
