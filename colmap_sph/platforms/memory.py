@@ -69,8 +69,8 @@ def keep_freed_memory() -> None:
 
 
 def give_back_freed_memory() -> None:
-    """Give the system back what has been freed: glibc keeps what lies between memory in use, a gibibyte after images of
-    80 megapixels. Other C libraries do as they do.
+    """Give the system back what has been freed: glibc keeps what lies between memory in use, much after large
+    images. Other C libraries do as they do.
     """
     with suppress(OSError, AttributeError, TypeError):
         ctypes.CDLL(None).malloc_trim(0)
