@@ -13,7 +13,12 @@ from projects import prepare
 
 from colmap_sph.app import cli
 from colmap_sph.errors import InputError
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.plan import make_plan
+from colmap_sph.pipeline.stages.wide import range_maps as range_maps_stage
+from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.project.files import remove_temporary_files
+from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.undistortion.process import ChildProcess
@@ -503,6 +508,19 @@ def test_a_kill_while_a_range_map_is_written(tmp_path: Path, monkeypatch: pytest
     assert [path.name for path in killed.rglob("*.exr")] == ["made.exr"]
     remove_temporary_files(killed)
     assert list(killed.iterdir()) == []
+
+
+@pytest.mark.parametrize("courtyard", ["fisheye", "panorama"], indirect=True)
+def test_range_maps_are_foreseen_before_there_are_views(courtyard: tuple[str, Path], tmp_path: Path) -> None:
+    """By the views' pixels, which tell about how many the originals have."""
+    kind, root = courtyard
+    plan = make_plan(Project(model_in(root), output=tmp_path / "dense"), RunOptions())
+    (stage,) = [stage for stage in plan.stages if stage.name == RangeStage.name]
+    pictures = [cv2.imread(str(path)) for path in (root / "images").iterdir()]
+    pixels = sum(picture.shape[0] * picture.shape[1] for picture in pictures if picture is not None)
+    assert (stage.total, len(pictures)) == (4, 4)
+    assert 0.7 < stage.disk / (range_maps_stage._FILE_BYTES * pixels) < 1.5
+    assert 0.7 < stage.seconds / (range_maps_stage._SECONDS * pixels * len(FACES[kind])) < 1.5
 
 
 @pytest.mark.parametrize("courtyard", ["fisheye", "panorama"], indirect=True)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
 # Of a pixel of the wide image, and of its views: processor seconds, bytes in use; bytes on disk.
-_SECONDS = 2e-7
+_SECONDS = 0.8e-7
 _BYTES = 60.0
 _VIEW_BYTES = 32.0
 _BAND_BYTES = 150e6
@@ -90,7 +90,8 @@ class RangeStage(Stage[str, RangeTask]):
         return None if known is None else Facts(coverage=known.coverage)
 
     def __init__(self, context: "Context", maps: Mapping[str, Result]) -> None:
-        # A workspace that is only foreseen has no table yet; nothing of it is there, either.
+        # A workspace that is only foreseen has no table yet; nothing of it is there, either. Its views have about
+        # as many pixels together as their image.
         self._cuts = read_cuts(context.workspace.sparse_dir)
         self._keys = keys_of(maps)
         self._views: dict[str, list[View]] = {}
@@ -113,9 +114,11 @@ class RangeStage(Stage[str, RangeTask]):
         key = context.keys.range_map([self._keys[view.name] for view in self._views[item]], cuts)
         task = RangeTask(tuple(views), place.files[0], place.record, key)
         done = self.found(task) if views else None
-        pixels = views[0][1].lens.width * views[0][1].lens.height if views else 0
-        memory = _BYTES * pixels + _VIEW_BYTES * sum(view.num_pixels for view in self._views[item]) + _BAND_BYTES
-        return Job(key, done, Cost(_SECONDS * pixels * len(views), memory, _FILE_BYTES * pixels), task)
+        of_views = sum(view.num_pixels for view in self._views[item])
+        pixels = views[0][1].lens.width * views[0][1].lens.height if views else of_views
+        memory = _BYTES * pixels + _VIEW_BYTES * of_views + _BAND_BYTES
+        seconds = _SECONDS * pixels * len(self._views[item])
+        return Job(key, done, Cost(seconds, memory, _FILE_BYTES * pixels), task)
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""
