@@ -1,10 +1,12 @@
 """The memory budget: amounts as people write them, and the gate that work waits at."""
 
+import platform
 import threading
 import time
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from projects import make_context, prepare
 from test_undistortion import NAMES, make_project
@@ -13,7 +15,10 @@ from colmap_sph.errors import OptionError
 from colmap_sph.pipeline import memory
 from colmap_sph.pipeline.forecast.survey import Survey
 from colmap_sph.pipeline.memory import MemoryGate, budget, format_memory, parse_memory, resident
-from colmap_sph.pipeline.stages.match import MatchStage
+from colmap_sph.pipeline.stages.match import MatchStage, _scratches
+from colmap_sph.pipeline.workers import room_for_workers
+from colmap_sph.stereo.census import RectifiedImage
+from colmap_sph.stereo.matching import MatchingOptions, match_pair
 
 GIB = 1 << 30
 
@@ -161,3 +166,17 @@ def test_a_dry_run_refuses_no_images_that_it_has_not_seen(
         survey(MatchStage(replace(small, details=dict.fromkeys(NAMES, 1.0)), [pair]))
     assert len(survey(MatchStage(small, [pair]))) == 1
     assert "is too little for the pair" in caplog.text and "This is for sharp images; soft ones" in caplog.text
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="keeps freed memory in another way")
+@pytest.mark.parametrize("in_bands", [False, True])
+def test_what_small_arrays_have_left_goes_back_before_a_large_level_begins(in_bands: bool) -> None:
+    """It lies between memory in use, and arrays of a large image find no room there; small ones take it again."""
+    image = RectifiedImage(np.zeros((160, 200), np.float32), np.full((160, 200), 255, np.uint8))
+    with room_for_workers():
+        small = [np.ones(1 << 20, np.uint8) for _ in range(128)]
+        del small[::2]
+        left = resident() - 64 * (1 << 20)  # once the rest is given back
+        match_pair(image, image, 0, 10, MatchingOptions(), _scratches(1 << 20 if in_bands else 1 << 28))
+        assert (resident() < left + (32 << 20)) == in_bands
+        del small

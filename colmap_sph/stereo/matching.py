@@ -9,6 +9,7 @@ This module and `prediction` are the only callers of the matching kernels. Their
 column minus reference column; with the left image as reference it is minus the disparity.
 """
 
+import math
 from dataclasses import dataclass, replace
 
 import cv2
@@ -206,6 +207,7 @@ def match_pair(
         if offset is None:
             prediction = from_seeds(seeds, shape, level, low, high)
         else:
+            scratches.prepare(math.prod(shape), depth)
             prediction = from_coarser(offset, prediction, shape, depth, options.range_radius, (low, high))
             lefts[-1] = near_matches(lefts[-1], offset)
         others: Prediction | None = None
@@ -263,6 +265,7 @@ def _match_level(
 
     Those of `others`, where another prediction is tried, too, and better.
     """
+    scratches.prepare(left.image.size, prediction.depth)
     grey = np.asarray(cv2.convertScaleAbs(left.image), dtype=np.uint8)
     compared = Compared(fine and finest)
     if coarser is not None:
@@ -286,7 +289,7 @@ def _match_level(
 
 
 def _is_large(level: Level, scratches: Scratches) -> bool:
-    return scratch_bytes(level.grey.size, level.prediction.depth) > scratches.max_bytes
+    return scratches.is_large(level.grey.size, level.prediction.depth)
 
 
 def _matches(level: Level, limits: Limits, scratches: Scratches, *, fit: bool = False) -> Matches:

@@ -20,6 +20,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, write_pair
 from colmap_sph.pipeline.stages.photo import Photo, PhotoFile, kept_masks, small_bytes, still_bytes
 from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result
+from colmap_sph.platforms.memory import give_back_freed_memory
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
@@ -151,7 +152,7 @@ def _scratches(max_bytes: int) -> Scratches:
     own = getattr(_thread, "scratches", None)
     if own is None or own.max_bytes != max_bytes:
         with _lock:
-            own = _all_scratches.get(max_bytes) or Scratches(max_bytes)
+            own = _all_scratches.get(max_bytes) or Scratches(max_bytes, give_back_freed_memory)
             _all_scratches[max_bytes] = own
         _thread.scratches = own
     return own

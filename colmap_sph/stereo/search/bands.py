@@ -62,11 +62,23 @@ class Scratches:
     ----------
     max_bytes : int
         Of each; levels that need more are worked in bands of rows, with the same result.
+    give_back : callable, optional
+        Called before a level in bands takes memory, to have the system get back what smaller levels have freed.
     """
 
-    def __init__(self, max_bytes: int = 1 << 30) -> None:
+    def __init__(self, max_bytes: int = 1 << 30, give_back: Callable[[], None] | None = None) -> None:
         self.max_bytes = max_bytes
+        self._give_back = give_back
         self._free: list[Scratch] = []
+
+    def is_large(self, pixels: int, depth: int) -> bool:
+        """Whether so many pixels are matched in bands."""
+        return scratch_bytes(pixels, depth) > self.max_bytes
+
+    def prepare(self, pixels: int, depth: int) -> None:
+        """Make room for what so many pixels take beside this, where they are matched in bands."""
+        if self._give_back is not None and self.is_large(pixels, depth):
+            self._give_back()
 
     @contextmanager
     def lent(self) -> Iterator[Scratch]:
