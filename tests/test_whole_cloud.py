@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tracemalloc
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
@@ -22,6 +23,7 @@ from colmap_sph.app import cli
 from colmap_sph.errors import InputError
 from colmap_sph.pages.whole_cloud import CloudServer, blocks
 from colmap_sph.pages.whole_cloud.blocks import FAN, LEAVES, CloudBlocks, CloudFrame
+from colmap_sph.project.cloud_reader import read_some_points
 from colmap_sph.project.workspace import Workspace
 
 NAMES = ["a.png", "b.png"]
@@ -137,6 +139,24 @@ def test_a_large_cloud_takes_little_memory(tmp_path: Path) -> None:
         root, _ = tree.node(tree.height, 0)
         assert 5000 < len(root) < 40_000
         assert psutil.Process().memory_info().rss - before < 60e6
+
+
+def test_some_points_of_a_large_cloud_take_the_memory_of_some(tmp_path: Path) -> None:
+    """Not that of all that is read: 160 MB here, and up to a GiB."""
+    path = tmp_path / "large.ply"
+    write_cloud(path, np.ones((1000, 3)))
+    header = path.read_bytes().partition(b"end_header\n")[0].replace(b"vertex 1000", b"vertex 6000000")
+    path.write_bytes(header + b"end_header\n")
+    os.truncate(path, len(header) + 11 + 6_000_000 * 27)
+    tracemalloc.start()
+    try:
+        xyz, _, count = read_some_points(path, 10_000)
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert count == 6_000_000
+    assert 9_000 < len(xyz) <= 10_000 + 618  # at most one more of each piece
+    assert peak < 5e6
 
 
 @pytest.mark.parametrize(

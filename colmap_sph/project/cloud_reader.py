@@ -148,6 +148,6 @@ def _read_pieces(file: BufferedReader, layout: PlyLayout, most: int) -> NDArray[
         file.seek(begin + int(first) * kind.itemsize)
         data = file.read(min(length, count - int(first)) * kind.itemsize)
         points = np.frombuffer(data[: len(data) // kind.itemsize * kind.itemsize], kind)
-        # Where to begin differs from piece to piece: images are written row by row.
-        parts.append(points[len(parts) % step :: step])
+        # Where to begin differs from piece to piece: images are written row by row. A view would keep all of it.
+        parts.append(points[len(parts) % step :: step].copy())
     return np.concatenate(parts) if parts else np.empty(0, kind)
