@@ -4,6 +4,7 @@ import json
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ from colmap_sph.app import cli
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
+from colmap_sph.pipeline.stages import undistort as undistort_stage
 from colmap_sph.pipeline.stages.wide import range_maps as range_maps_stage
 from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.project.files import remove_temporary_files
@@ -22,7 +24,7 @@ from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.undistortion.process import ChildProcess
-from colmap_sph.project.wide import layout, range_maps
+from colmap_sph.project.wide import cutting, layout, range_maps
 from colmap_sph.project.wide.cuts import cuts_of
 from colmap_sph.project.wide.layout import faces_of
 from colmap_sph.project.wide.projection import Lens, camera_rays
@@ -521,6 +523,26 @@ def test_range_maps_are_foreseen_before_there_are_views(courtyard: tuple[str, Pa
     assert (stage.total, len(pictures)) == (4, 4)
     assert 0.7 < stage.disk / (range_maps_stage._FILE_BYTES * pixels) < 1.5
     assert 0.7 < stage.seconds / (range_maps_stage._SECONDS * pixels * len(FACES[kind])) < 1.5
+
+
+def test_what_is_kept_of_wide_images_goes_with_their_stages(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The places of views' pixels and the rays of images', as large as several of them."""
+    kept = {cutting._places: [0], range_maps._rays: [0]}
+    for module, made in ((undistort_stage, cutting._places), (range_maps_stage, range_maps._rays)):
+        (name,) = [name for name in vars(module) if name.startswith("forget_")]
+        forget = getattr(module, name)
+
+        def noted(made: Any = made, forget: Any = forget) -> None:
+            kept[made].append(made.cache_info().currsize)
+            forget()
+            kept[made].append(made.cache_info().currsize)
+
+        monkeypatch.setattr(module, name, noted)
+    assert cli.main(["run", "--model", str(model_in(project)), "--threads", "1"]) in (0, 5)
+    (_, places, no_places), (_, rays, no_rays) = kept.values()
+    assert (places, no_places, rays, no_rays) == (len(FACES["fisheye"]), 0, 1, 0)
 
 
 @pytest.mark.parametrize("courtyard", ["fisheye", "panorama"], indirect=True)

@@ -39,6 +39,7 @@ from colmap_sph.project.undistortion.image import ImageToUndistort, undistort
 from colmap_sph.project.undistortion.originals import Originals
 from colmap_sph.project.undistortion.process import ChildProcess
 from colmap_sph.project.undistortion.rounding import rounding_of_original
+from colmap_sph.project.wide.cutting import forget_places
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -278,10 +279,11 @@ class UndistortStage(Stage[str, UndistortTask]):
 
     @contextmanager
     def holding(self, kept: Kept) -> Iterator[None]:
-        """Keep the processes of COLMAP until the end."""
+        """Keep the processes of COLMAP, and places in wide images, until the end."""
         try:
             yield
         finally:
+            forget_places()
             folder = self.context.workspace.undistortion_scratch_dir
             for child in [child for child in _children if child.folder == folder]:
                 _children.remove(child)

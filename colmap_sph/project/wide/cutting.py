@@ -92,6 +92,11 @@ def _places(lens: Lens, face: Face) -> Places:
     return x, y, is_shown
 
 
+def forget_places() -> None:
+    """Let go of the places that are kept: no more views are to be cut."""
+    _places.cache_clear()
+
+
 def _bands(face: Face) -> Iterator[slice]:
     step = max(_BAND_PIXELS // face.width, 1)
     for top in range(0, face.height, step):

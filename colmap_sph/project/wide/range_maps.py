@@ -167,6 +167,11 @@ def _rays(lens: Lens) -> Pixels:
     return rays
 
 
+def forget_rays() -> None:
+    """Let go of the rays that are kept: no more maps are to be made."""
+    _rays.cache_clear()
+
+
 def _bands(lens: Lens) -> Iterator[slice]:
     step = max(_BAND_PIXELS // lens.width, 1)
     for top in range(0, lens.height, step):

@@ -1,6 +1,7 @@
 """Geometric maps of the views cut from each wide image → a map of its range and normals."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,13 +11,14 @@ from msgspec import Meta
 
 from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
+from colmap_sph.pipeline.stages.stage import Cost, Job, Kept, Result, Stage, keys_of
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
 from colmap_sph.project.state.ownership import range_place
 from colmap_sph.project.state.records import begin, vouch_when_on_disk, vouched_facts
 from colmap_sph.project.wide.cuts import Cut
 from colmap_sph.project.wide.range_maps import (
     ViewMaps,
+    forget_rays,
     pixels_shown,
     range_and_normals,
     write_range_map,
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 _SECONDS = 0.8e-7
 _BYTES = 60.0
 _VIEW_BYTES = 32.0
-_BAND_BYTES = 150e6
+_BAND_BYTES = 40e6
 _FILE_BYTES = 8.0
 
 
@@ -119,6 +121,14 @@ class RangeStage(Stage[str, RangeTask]):
         memory = _BYTES * pixels + _VIEW_BYTES * of_views + _BAND_BYTES
         seconds = _SECONDS * pixels * len(self._views[item])
         return Job(key, done, Cost(seconds, memory, _FILE_BYTES * pixels), task)
+
+    @contextmanager
+    def holding(self, kept: Kept) -> Iterator[None]:
+        """Keep the rays of an image's pixels until the end."""
+        try:
+            yield
+        finally:
+            forget_rays()
 
     def close(self, results: Mapping[str, Result]) -> None:
         """See `Stage.close`."""
