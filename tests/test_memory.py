@@ -180,3 +180,16 @@ def test_what_small_arrays_have_left_goes_back_before_a_large_level_begins(in_ba
         match_pair(image, image, 0, 10, MatchingOptions(), _scratches(1 << 20 if in_bands else 1 << 28))
         assert (resident() < left + (32 << 20)) == in_bands
         del small
+
+
+@pytest.mark.parametrize(("left", "gives_back"), [(GIB, 0), (3 * GIB, 1)])
+def test_work_that_does_not_fit_beside_what_was_freed_has_it_given_back(
+    left: int, gives_back: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And only that: others are quicker with memory that the process has already."""
+    gate = MemoryGate(4 * GIB, in_use=GIB)
+    given: list[int] = []
+    monkeypatch.setattr(memory, "resident", lambda: left)
+    monkeypatch.setattr(memory, "give_back_freed_memory", lambda: given.append(1))
+    with gate.reserve(2 * GIB, "it"):
+        assert len(given) == gives_back

@@ -8,7 +8,7 @@ from functools import cache
 
 from colmap_sph.errors import OptionError
 from colmap_sph.platforms import control_groups
-from colmap_sph.platforms.memory import available, free_under_limits, resident
+from colmap_sph.platforms.memory import available, free_under_limits, give_back_freed_memory, resident
 
 _UNITS = {"": 0, "K": 1, "M": 2, "G": 3, "T": 4}
 # Of the memory that is free when a run starts, what it takes by itself.
@@ -144,6 +144,8 @@ class MemoryGate:
         with self._changed:
             self._changed.wait_for(lambda: not self._reserved or self._reserved + needed <= self.free)
             self._reserved += needed
+        if resident() + needed > self._total:
+            give_back_freed_memory()
         try:
             yield
         finally:
