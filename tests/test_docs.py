@@ -154,6 +154,21 @@ def test_commands_are_understood(page: str, line: str, monkeypatch: pytest.Monke
         assert cli.main([name, *options]) == 0
 
 
+def test_no_block_makes_a_product_twice_in_one_place() -> None:
+    """The second command is refused, unless it says what to do with what the first one made."""
+    found = 0
+    for document in _CURRENT:
+        for block in _FENCE.finditer(document.read_text(encoding="utf-8")):
+            made: set[tuple[str, ...]] = set()
+            for match in filter(None, map(_COMMAND.match, block[0].splitlines())):
+                words = shlex.split(match[1])
+                if words[0] in ("surface", "mesh") and not {"--output", "--overwrite"} & {*words}:
+                    assert tuple(words[:2]) not in made, (document.name, match[0])
+                    made.add(tuple(words[:2]))
+                    found += 1
+    assert found
+
+
 def test_options_in_backticks_are_there() -> None:
     known = {"--help", "--help-all", "--project_path", *_OF_OTHERS}
     for name in cli.commands():

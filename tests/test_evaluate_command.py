@@ -233,7 +233,9 @@ def test_refuses_clouds_that_cannot_be_measured(folder, capsys, role):
         assert bad.name in message
         return message
 
-    assert "does not exist" in refused(folder / "missing.ply")
+    message = refused(folder / "missing.ply")
+    assert "does not exist" in message
+    assert ("or as --reference a folder of exact depth maps" in message) == (role == "reference")
     (folder / "cloud.xyz").write_text("0 0 0\n")
     assert "unknown format" in refused(folder / "cloud.xyz")
     (folder / "text.laz").write_text("not a cloud")

@@ -5,6 +5,7 @@ import resource
 import shlex
 import struct
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
@@ -324,6 +325,16 @@ def test_depth_at_the_centres_of_pixels_is_exact_on_a_plane() -> None:
     np.testing.assert_array_equal(
         at_pixel_centres(given.astype(np.float32), 0 * normals, view), given.astype(np.float32)
     )
+
+
+def test_exr_maps_are_the_same_to_the_byte_at_any_time(workspace: Workspace, tmp_path: Path) -> None:
+    made = []
+    for name in ("first", "second"):
+        (folder,) = exported(workspace, tmp_path / name, "exr")
+        made.append({path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.exr")})
+        time.sleep(1.1)  # dates in OpenEXR have seconds
+    assert made[0].keys() >= {Path(f"{name}.exr") for name in NAMES}
+    assert made[0] == made[1]
 
 
 def test_depth_maps_are_read_back(workspace: Workspace, tmp_path: Path) -> None:

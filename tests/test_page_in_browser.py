@@ -1,6 +1,7 @@
 """The page in a browser: it draws, obeys keys and narrow windows, complains of nothing, and names do nothing."""
 
 import shutil
+import threading
 import time
 from collections.abc import Iterator
 from itertools import pairwise
@@ -247,7 +248,7 @@ def test_hostile_names_do_nothing(browser: "Browser", tmp_path: Path) -> None:
 def test_the_whole_cloud_comes_as_one_looks(browser: "Browser", tmp_path: Path) -> None:
     """From afar a part of it, near by all that is in view; the west is red, the east green."""
     server = CloudServer(coloured_ground(tmp_path / "dense"))
-    server.run_in_background()
+    threading.Thread(target=server.run, daemon=True).start()
     page = browser.new_page(viewport={"width": 500, "height": 400})
     said: list[str] = []
     asked: list[str] = []

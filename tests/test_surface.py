@@ -322,7 +322,7 @@ def test_a_model_on_the_map_has_its_coordinates(workspace, tmp_path):
     )
     arrays, transform, _ = made(workspace, tmp_path, place=place, cell=2 * GSD)
     x, y = places(arrays, transform)
-    model = place.to_model(np.stack([x, y, np.full_like(x, 300)], axis=-1))
+    model = (np.stack([x, y, np.full_like(x, 300)], axis=-1) - place.translation) @ turn / 2.0
     distance = signed_distance(model[..., 0], model[..., 1])
     assert np.abs(arrays["dsm"][0][distance < -GSD] - (300 + 2 * ROOF)).max() < 1e-3
     with rasterio.open(tmp_path / "dsm.tif") as file:

@@ -7,6 +7,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import tracemalloc
 import urllib.error
 import urllib.request
@@ -218,7 +219,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Workspace:
 @pytest.fixture(scope="module")
 def server(workspace: Workspace) -> Iterator[CloudServer]:
     started = CloudServer(workspace)
-    started.run_in_background()
+    threading.Thread(target=started.run, daemon=True).start()
     yield started
     started.stop()
     started.close()

@@ -111,8 +111,9 @@ def read_projects(path: Path) -> list[Project]:
 
 def default_output(model: Path) -> Path:
     """Where `colmap_sph run` puts the result of a model, of sparse/0, sparse/1 or sparse."""
-    there = Path(Path.cwd().anchor)
-    for part in (Path.cwd() / model).parts[1:]:  # the system goes back over a link from where that leads to
+    typed = Path.cwd() / model
+    there = Path(typed.anchor)
+    for part in typed.parts[1:]:  # the system goes back over a link from where that leads to
         there = there / part if part != ".." else (there.resolve() if there.is_symlink() else there).parent
     if "sparse" in (there.name, there.parent.name if there.name.isdigit() else ""):
         model = there

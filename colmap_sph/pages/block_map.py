@@ -227,7 +227,7 @@ def surface_points(view: View, samples: MapSamples, depth: NDArray[np.float32]) 
     """(h w, 3) world points of a view's samples."""
     columns, rows = np.meshgrid(samples.columns, samples.rows)
     pixels = np.stack([columns.ravel(), rows.ravel(), np.ones(columns.size)])
-    rays = np.linalg.inv(view.K) @ pixels * depth.reshape(1, -1)
+    rays = view.inverse_K @ pixels * depth.reshape(1, -1)
     return np.asarray((rays - view.t[:, None]).T @ view.R)
 
 

@@ -100,13 +100,6 @@ class Georeference:
             return far
         return np.asarray(self.scale * (far @ self.rotation.T) + self.translation)
 
-    def to_model(self, places: NDArray[np.floating]) -> NDArray[np.float64]:
-        """(…, 3) map coordinates in the model's frame."""
-        far = np.asarray(places, np.float64)
-        if self.is_identity:
-            return far
-        return np.asarray((far - self.translation) @ self.rotation / self.scale)
-
     def directions_to_map(self, directions: NDArray[np.floating]) -> NDArray[np.floating]:
         """(…, 3) directions of the model's frame, such as normals, along the axes of the map; same type."""
         if self.is_identity:

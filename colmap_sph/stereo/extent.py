@@ -195,7 +195,7 @@ def _box_of(outline: Float) -> tuple[Float, Float]:
 
 def _rays(view: View, pixels: Float) -> Float:
     """(n, 3) rays of pixels in the world frame."""
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(view.K).T
+    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ view.inverse_K.T
     return np.asarray(rays @ view.R)
 
 

@@ -70,7 +70,7 @@ def _carried(
     here: tuple[NDArray[Any], NDArray[Any]],
 ) -> NDArray[np.float64]:
     """By what depth changes along its plane from rows and columns there to those here; 1 where it cannot tell."""
-    inverse = np.linalg.inv(view.K)
+    inverse = view.inverse_K
     # On the plane n · z r = n · z' r', r and r' the rays of depth 1.
     with np.errstate(divide="ignore", invalid="ignore"):
         factor = _along(normals, inverse, *there) / _along(normals, inverse, *here)

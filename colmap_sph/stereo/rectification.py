@@ -298,7 +298,7 @@ def _range_of_depths(
     sights = [(view, other) for own, other in ((left, right), (right, left)) for view in own.views]
     for view, other in sights:
         pixels = np.stack([x.ravel() * view.width, y.ravel() * view.height, np.ones(x.size)], axis=1)
-        camera = depth.reshape(-1, 1) * (pixels @ np.linalg.inv(view.K).T)
+        camera = depth.reshape(-1, 1) * (pixels @ view.inverse_K.T)
         points = (camera - view.t) @ view.R
         seen.append(points[any_sees(other, points)])
     found = parallaxes(np.concatenate(seen))

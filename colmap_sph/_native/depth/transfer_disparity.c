@@ -84,7 +84,8 @@ static void put_block(const float *d, ptrdiff_t first, ptrdiff_t pixels, ptrdiff
             put_segment(row, width, first + i, d[i], d[i + 1]);
         }
         const float r = (float)(first + i) - d[i], nearest = rintf(r);
-        if (!(joined && nearest >= r) && !(joined_before && nearest <= r)) {
+        const int is_inside = nearest >= 0 && nearest < (float)width; /* else it may be no whole number */
+        if (is_inside && !(joined && nearest >= r) && !(joined_before && nearest <= r)) {
             put(row, width, (ptrdiff_t)nearest, d[i]);
         }
     }

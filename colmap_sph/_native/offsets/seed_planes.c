@@ -7,11 +7,23 @@
 /* Cells of a tile's side: what may be near one of them is found for all of a tile at once. */
 enum { TILE = 4 };
 
-/* Seeds around a place, nearest first; of those as near as each other, that with the lower number. */
 typedef struct {
     int count, seed[MAX_SEEDS];
-    double distance_squared[MAX_SEEDS];
+} seed_numbers;
+
+/* Seeds around a place, nearest first; of those as near as each other, that with the lower number. */
+typedef struct {
+    int count, seed[MAX_NEIGHBOURS];
+    double distance_squared[MAX_NEIGHBOURS];
 } nearest_seeds;
+
+static void find_distances(seed_list seeds, const seed_numbers *listed, double x, double y,
+                           double *distance_squared) {
+    for (int i = 0; i < listed->count; i++) {
+        const double dx = seeds.columns[listed->seed[i]] - x, dy = seeds.rows[listed->seed[i]] - y;
+        distance_squared[i] = dx * dx + dy * dy;
+    }
+}
 
 /* Adds a seed if it is among the nearest `most`. */
 ALWAYS_INLINE void add_seed(nearest_seeds *near, int most, int seed, double distance_squared) {
@@ -33,20 +45,29 @@ ALWAYS_INLINE void add_seed(nearest_seeds *near, int most, int seed, double dist
     near->distance_squared[place] = distance_squared;
 }
 
-/* Of the first `count` of those numbered, the nearest `most` within a distance of a place. */
-static void find_near(seed_list seeds, const int *numbers, ptrdiff_t count, double x, double y, int most,
-                      double max_squared, nearest_seeds *near) {
+/* Of those listed the nearest `most` to a place. */
+static void find_near(seed_list seeds, const seed_numbers *listed, double x, double y, int most,
+                      nearest_seeds *near) {
     double distance_squared[MAX_SEEDS];
-    for (ptrdiff_t i = 0; i < count; i++) {
-        const double dx = seeds.columns[numbers[i]] - x, dy = seeds.rows[numbers[i]] - y;
-        distance_squared[i] = dx * dx + dy * dy;
-    }
+    find_distances(seeds, listed, x, y, distance_squared);
     near->count = 0;
-    for (ptrdiff_t i = 0; i < count; i++) {
-        const double farthest = near->count < most ? max_squared : near->distance_squared[most - 1];
+    for (int i = 0; i < listed->count; i++) {
+        const double farthest = near->count < most ? DBL_MAX : near->distance_squared[most - 1];
         if (distance_squared[i] <= farthest) {
-            add_seed(near, most, numbers[i], distance_squared[i]);
+            add_seed(near, most, listed->seed[i], distance_squared[i]);
         }
+    }
+}
+
+/* Of all seeds those within a distance of a place. */
+static void list_near(seed_list seeds, const seed_numbers *all, double x, double y, double max_squared,
+                      seed_numbers *listed) {
+    double distance_squared[MAX_SEEDS];
+    find_distances(seeds, all, x, y, distance_squared);
+    listed->count = 0;
+    for (int i = 0; i < all->count; i++) {
+        listed->seed[listed->count] = all->seed[i];
+        listed->count += distance_squared[i] <= max_squared;
     }
 }
 
@@ -87,25 +108,25 @@ void seed_planes(seed_list seeds, seed_weights weights, ptrdiff_t cell, ptrdiff_
     const double ways = (double)cell * (TILE - 1) * sqrt(2), middle = 0.5 * (double)cell * (TILE - 1);
     const double enough = 1 + 1e-9;
     const int most = weights.neighbours;
-    int all[MAX_SEEDS];
-    for (int s = 0; s < (int)seeds.count; s++) {
-        all[s] = s;
+    seed_numbers all = {.count = (int)seeds.count}, listed;
+    for (int s = 0; s < all.count; s++) {
+        all.seed[s] = s;
     }
-    nearest_seeds listed, near;
+    nearest_seeds near;
     for (ptrdiff_t top = 0; top < height; top += TILE) {
         for (ptrdiff_t left = 0; left < width; left += TILE) {
             const double column = centre_of(left, cell) + middle, row = centre_of(top, cell) + middle;
-            find_near(seeds, all, seeds.count, column, row, most, DBL_MAX, &near);
+            find_near(seeds, &all, column, row, most, &near);
             double reach = DBL_MAX;
             if (near.count == most) {
                 reach = (sqrt(near.distance_squared[most - 1]) + ways) * enough;
                 reach *= reach;
             }
-            find_near(seeds, all, seeds.count, column, row, MAX_SEEDS, reach, &listed);
+            list_near(seeds, &all, column, row, reach, &listed);
             for (ptrdiff_t y = top; y < top + TILE && y < height; y++) {
                 for (ptrdiff_t x = left; x < left + TILE && x < width; x++) {
                     const double at_column = centre_of(x, cell), at_row = centre_of(y, cell);
-                    find_near(seeds, listed.seed, listed.count, at_column, at_row, most, DBL_MAX, &near);
+                    find_near(seeds, &listed, at_column, at_row, most, &near);
                     values[y * width + x] = (float)plane_at(seeds, weights, at_column, at_row, &near);
                 }
             }

@@ -3,7 +3,6 @@
 import json
 import re
 import secrets
-import threading
 from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -111,10 +110,6 @@ class CloudServer:
     def run(self) -> None:
         """Answer until `stop`, or until an exception such as an interruption comes."""
         self._server.serve_forever(poll_interval=0.2)
-
-    def run_in_background(self) -> None:
-        """Answer in a thread of its own."""
-        threading.Thread(target=self.run, daemon=True).start()
 
     def stop(self) -> None:
         """End `run` from another thread."""

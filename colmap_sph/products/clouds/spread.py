@@ -140,7 +140,7 @@ class DepthSpread:
         lines = np.where(inside, lines, 0)
         there = depth_map[lines.astype(np.int32), columns.astype(np.int32)].astype(np.float64)
         shown = inside & (np.abs(there - depth) <= _SAME_SURFACE * depth)
-        rays = np.stack([columns * there, lines * there, there], axis=1) @ (np.linalg.inv(view.K).T @ view.R)
+        rays = np.stack([columns * there, lines * there, there], axis=1) @ (view.inverse_K.T @ view.R)
         away = rays + view.center - places
         if piece.normals is None:
             normals = places - view.center

@@ -81,7 +81,7 @@ def _seen(index: int, view: View, path: Path) -> SeenView | None:
     row, column = np.nonzero(has_depth)
     z = depth[row, column].astype(np.float64)
     pixels = np.stack([columns[column], rows[row]], axis=1)
-    rays = np.column_stack([pixels, np.ones(len(z))]) @ np.linalg.inv(view.K).T
+    rays = np.column_stack([pixels, np.ones(len(z))]) @ view.inverse_K.T
     points = (rays * z[:, None]) @ view.R + view.center
     footprint = z / np.sqrt(view.K[0, 0] * view.K[1, 1])
     return SeenView(

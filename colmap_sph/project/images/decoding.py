@@ -158,6 +158,15 @@ def unreadable(path: Path, error: Exception, remedy: str = "mend or remove it") 
     return InputError(f"{path} cannot be read as an image ({reason_of(error)}); {remedy}.")
 
 
+def date_of(path: Path) -> str:
+    """The date that an image file holds, as 2001:02:03 04:05:06; empty where it holds none, or cannot be read."""
+    try:
+        with _opened(path) as image:
+            return str(image.spec().getattribute("DateTime") or "")
+    except (OSError, DamagedError):
+        return ""
+
+
 def _jpeg_size(path: Path) -> tuple[int, int, str] | None:
     """As `jpeg.jpeg_size`; of a file whose header ends soon the rest is not read."""
     with path.open("rb") as file:

@@ -5,7 +5,7 @@ image.
 """
 
 import os
-import struct
+import re
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,11 +19,10 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError
 from colmap_sph.project.files import atomic_file, make_dir
-from colmap_sph.project.images.decoding import is_jpeg, read_pixels, unreadable
+from colmap_sph.project.images.decoding import date_of, is_jpeg, read_pixels, unreadable
 from colmap_sph.project.images.depth import ValueRange, stretched
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.orientation import copy_without_orientation
-from colmap_sph.project.images.tiff import entries
 from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.straight import place_in_original, straight_camera
 
@@ -32,7 +31,8 @@ _BAND_PIXELS = 1 << 18
 # Endings of names for which COLMAP knows how to write the file; under others JPEG or PNG is written.
 _ENDINGS = {".bmp", ".exr", ".hdr", ".jpeg", ".jpg", ".pgm", ".png", ".ppm", ".tga", ".tif", ".tiff"}
 _WHITE = 65535
-_DATE_TIME = 306
+# Of files that hold the time of writing where no other is known.
+_DATED_ENDINGS = {".exr", ".tif", ".tiff"}
 _NO_DATE = b"    :  :     :  :  "  # as Exif writes one that is not known
 
 
@@ -136,7 +136,7 @@ def write_undistorted(bitmap: pycolmap.Bitmap, source: Path, target: Path) -> No
     try:
         if not bitmap.write(written):
             raise OutputError(f"{target} cannot be written; check space and permissions.")
-        if ending.lower() in (".tif", ".tiff"):
+        if ending.lower() in _DATED_ENDINGS:
             _forget_time_of_writing(written, source)
         copy_without_orientation(written, target)
     finally:
@@ -144,17 +144,16 @@ def write_undistorted(bitmap: pycolmap.Bitmap, source: Path, target: Path) -> No
 
 
 def _forget_time_of_writing(written: Path, source: Path) -> None:
-    """Blank the date of a TIFF file but where it is the original's: the same image makes the same bytes again."""
-    original = oiio.ImageInput.open(str(source))
-    date = b"" if original is None else str(original.spec().getattribute("DateTime")).encode(errors="replace")
-    data = written.read_bytes()
-    for entry in entries(data):
-        if entry.tag == _DATE_TIME:
-            (place,) = struct.unpack_from(entry.order + entry.offset, data, entry.place)
-            if data[place : place + len(_NO_DATE)] != date:
-                with written.open("r+b") as file:
-                    file.seek(place)
-                    file.write(_NO_DATE)
+    """Blank the date of a file but where it is the original's: the same image makes the same bytes again."""
+    date = date_of(written).encode()
+    if date in (b"", date_of(source).encode()):
+        return
+    # Wherever it is: of two directories that a TIFF file may have, the first is not read.
+    places = [match.start() for match in re.finditer(re.escape(date), written.read_bytes())]
+    with written.open("r+b") as file:
+        for place in places:
+            file.seek(place)
+            file.write(_NO_DATE)
 
 
 def _stretched(pixels: NDArray[Any], values: ValueRange) -> NDArray[np.uint16]:

@@ -86,5 +86,5 @@ def _rays_of(view: View) -> NDArray[np.float64]:
     """(n, 3) unit rays of an even grid over a view's image, world frame."""
     steps = (np.arange(_RAYS) + 0.5) / _RAYS
     x, y = np.meshgrid(steps * view.width, steps * view.height)
-    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1) @ np.linalg.inv(view.K).T @ view.R
+    rays = np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1) @ view.inverse_K.T @ view.R
     return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))

@@ -232,7 +232,7 @@ def _sample(view: View, depth: float) -> NDArray[np.float64]:
     steps = (np.arange(_SAMPLES_PER_SIDE) + 0.5) / _SAMPLES_PER_SIDE
     u, v = np.meshgrid(steps * view.width, steps * view.height)
     pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], axis=1)
-    rays = pixels @ np.linalg.inv(view.K).T
+    rays = pixels @ view.inverse_K.T
     return np.asarray((depth * rays - view.t) @ view.R)
 
 

@@ -58,7 +58,7 @@ def _owned_in_rows(view: View, others: Sequence[View], first: int, end: int) -> 
     owned = np.ones(pixels.shape[1], bool)
     for other in others:
         # Depth 1 here; the cosines of a ray with both axes are as its depths.
-        x, y, depth = (other.K @ other.R @ view.R.T @ np.linalg.inv(view.K)) @ pixels
+        x, y, depth = (other.K @ other.R @ view.R.T @ view.inverse_K) @ pixels
         nearer = (depth > 1) | ((depth == 1) & (other.name < view.name))
         inside = (x >= 0) & (x <= other.width * depth) & (y >= 0) & (y <= other.height * depth)
         owned &= ~(nearer & inside)

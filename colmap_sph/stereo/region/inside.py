@@ -73,7 +73,7 @@ def pixels_inside(view: View, depth: NDArray[np.float32], region: Region) -> NDA
         False where there is no depth.
     """
     inside = np.zeros(depth.shape, bool)
-    directions = view.R.T @ np.linalg.inv(view.K)
+    directions = view.R.T @ view.inverse_K
     step = max(_BAND_PIXELS // depth.shape[1], 1)
     for first in range(0, depth.shape[0], step):
         rows, columns = np.nonzero(depth[first : first + step] > 0)

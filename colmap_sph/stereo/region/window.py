@@ -91,7 +91,7 @@ def outline_on(view: View, box: NDArray[np.float64]) -> NDArray[np.float64] | No
     """
     steps = np.linspace(0, 1, _RAYS)
     x, y = (each.ravel() for each in np.meshgrid(steps * view.width, steps * view.height))
-    rays = np.stack([x, y, np.ones_like(x)], axis=1) @ np.linalg.inv(view.K).T @ view.R
+    rays = np.stack([x, y, np.ones_like(x)], axis=1) @ view.inverse_K.T @ view.R
     # The depths at which each ray enters and leaves the three slabs that make the box.
     with np.errstate(divide="ignore", invalid="ignore"):
         enters, leaves = np.sort((box[:, None] - view.center) / rays, axis=0)

@@ -43,7 +43,7 @@ def draw_heights(
     _native.draw_heights(
         np.ascontiguousarray(depth),
         np.ascontiguousarray(normals),
-        np.linalg.inv(view.K),
+        view.inverse_K,
         np.ascontiguousarray(matrix),
         shift,
         _HALF,

@@ -166,7 +166,7 @@ def _pixels_per_cell(
     # A cell is spanned by two vectors of the camera frame, whose cross product is its area N; the image of that is
     # N · ray / z² times the focal lengths.
     inverse = np.linalg.inv(raster.cells_from_camera(view)[0])
-    across = np.cross(inverse[:, 0], inverse[:, 1]) @ np.linalg.inv(view.K)
+    across = np.cross(inverse[:, 0], inverse[:, 1]) @ view.inverse_K
     facing = np.abs(across[0] * x + across[1] * y + across[2])
     return np.asarray(view.K[0, 0] * view.K[1, 1] * facing / z**2)
 
