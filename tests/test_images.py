@@ -163,9 +163,9 @@ def test_the_same_image_is_undistorted_to_the_same_bytes_at_any_time(
         time.sleep(1.1)  # dates have seconds
     assert made[0].read_bytes() == made[1].read_bytes()
     assert (date or "").encode() in made[0].read_bytes()
-    np.testing.assert_allclose(
-        pycolmap.Bitmap.read(made[0], True).to_array(), pixels, atol=1 if ending == "exr" else 0
-    )
+    again = pycolmap.Bitmap.read(made[0], True)
+    assert again is not None
+    np.testing.assert_allclose(again.to_array(), pixels, atol=1 if ending == "exr" else 0)
 
 
 def test_orientation_in_xmp_goes_too(tmp_path: Path) -> None:

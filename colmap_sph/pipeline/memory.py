@@ -144,7 +144,7 @@ class MemoryGate:
         with self._changed:
             self._changed.wait_for(lambda: not self._reserved or self._reserved + needed <= self.free)
             self._reserved += needed
-        if resident() + needed > self._total:
+        if resident() + amount > self._total:  # what fits is quicker with memory that the process has already
             give_back_freed_memory()
         try:
             yield
