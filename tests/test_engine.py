@@ -381,7 +381,7 @@ with room_for_workers():
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another C library")
 def test_no_stage_begins_with_what_another_has_freed() -> None:
     """What of 400 MiB is still held takes 3 MiB; what lies between would be missing from a budget."""
-    said = subprocess.run([sys.executable, "-c", _LEAVES], capture_output=True, check=True, text=True).stdout
+    said = subprocess.run([sys.executable, "-P", "-c", _LEAVES], capture_output=True, check=True, text=True).stdout
     assert int(said) < 40
 
 
