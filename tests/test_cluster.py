@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from conftest import copy_block, keep_images
-from distributed import LocalCluster
+from distributed import Client, LocalCluster
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -41,13 +41,21 @@ pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 
 
 @pytest.fixture(scope="module")
-def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
+def processes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalCluster]:
     """Two processes with one thread each, of a user."""
     folder = tmp_path_factory.mktemp("dask")
     with LocalCluster(
         n_workers=2, threads_per_worker=1, dashboard_address=":0", local_directory=str(folder), silence_logs=True
     ) as made:
         yield made
+
+
+@pytest.fixture
+def cluster(processes: LocalCluster) -> LocalCluster:
+    """Both of them, also where a test before has killed one: on a busy machine it is a while until it is back."""
+    with Client(processes) as client:
+        client.wait_for_workers(2, timeout=120)
+    return processes
 
 
 @dataclass(frozen=True)
