@@ -254,27 +254,25 @@ def _in_bands(
     *verdict: NDArray[np.unsignedinteger],
 ) -> Iterator[Callable[[], None]]:
     """Add what a partner says of every pixel: in bands of rows, which may be done in any order."""
+    add = partial(
+        _native.fuse_partner,
+        reference.depth,
+        reference.normals,
+        reference.view.inverse_K,
+        partner.depth,
+        partner.normals,
+        partner.view.inverse_K,
+        partner.image,
+        pixel_transfer(reference.view, partner.view),
+        reference.view.R @ partner.view.R.T,
+        options.reprojection_error,
+        options.max_depth_error,
+        np.cos(np.radians(options.max_normal_error)),
+        partner.index < reference.index,
+        bit,
+    )
     for first in range(0, len(reference.depth), _BAND_ROWS):
-        yield partial(
-            _native.fuse_partner,
-            reference.depth,
-            reference.normals,
-            reference.view.inverse_K,
-            partner.depth,
-            partner.normals,
-            partner.view.inverse_K,
-            partner.image,
-            pixel_transfer(reference.view, partner.view),
-            reference.view.R @ partner.view.R.T,
-            options.reprojection_error,
-            options.max_depth_error,
-            np.cos(np.radians(options.max_normal_error)),
-            partner.index < reference.index,
-            bit,
-            first,
-            min(first + _BAND_ROWS, len(reference.depth)),
-            *verdict,
-        )
+        yield partial(add, first, min(first + _BAND_ROWS, len(reference.depth)), *verdict)
 
 
 def _station_bits(stations: Sequence[int] | None) -> NDArray[np.uint64]:
