@@ -8,15 +8,18 @@ import signal
 import subprocess
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import SCRIPTS, copy_block, keep_images
 from projects import render_four_images
 
 from colmap_sph.app import cli
+from colmap_sph.evaluation.neighbours import PointIndex
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 STOPS = [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
@@ -201,6 +204,33 @@ def test_signals_end_long_calls(thread: str, number: signal.Signals, code: int) 
         said, _ = process.communicate(timeout=30)
     assert process.returncode == code
     assert said == f"last words {code}\n"
+
+
+def test_an_interrupted_comparison_of_clouds_leaves_no_thread() -> None:
+    """One that went on in memory that is freed meanwhile would end the process with a crash."""
+    random = np.random.default_rng(5)
+    index, queries = PointIndex(random.random((100_000, 3))), random.random((1_000_000, 3))
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def send() -> None:
+        while threading.active_count() < threads + 3:  # with this one, two that search
+            time.sleep(0.001)
+        time.sleep(0.05)  # until both are known to whoever waits for them
+        os.kill(os.getpid(), signal.SIGUSR1)
+
+    before = signal.signal(signal.SIGUSR1, interrupt)
+    threads = threading.active_count()
+    sender = threading.Thread(target=send, daemon=True)
+    sender.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            index.distances(queries, threads=2)
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+    sender.join()
+    assert threading.active_count() == threads
 
 
 def test_signals_that_are_ignored_stay_ignored(project: Path) -> None:

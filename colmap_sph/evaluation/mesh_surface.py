@@ -44,7 +44,6 @@ class MeshSurface:
         ----------
         points : (n, 3) float64 ndarray
         threads : int
-            -1: one per core.
         bound : float
             Metres.
 

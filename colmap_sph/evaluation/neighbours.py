@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import numpy.typing as npt
 
 from colmap_sph.errors import OptionError
 
 Points = npt.NDArray[np.float64]
-_QUERY_CHUNK = 1 << 20
+# What a thread searches for at a time: some hundredths of a second, which whoever interrupts has to wait.
+_QUERY_CHUNK = 1 << 13
 _ORDERING_CELLS = 512
 
 
@@ -30,7 +34,6 @@ class PointIndex:
         ----------
         queries : (n, 3) float64 ndarray
         threads : int
-            -1: one per core.
         bound : float
             In the unit of the points.
 
@@ -41,9 +44,12 @@ class PointIndex:
         """
         result = np.empty(len(queries))
         order = spatial_order(queries)
-        for start in range(0, len(queries), _QUERY_CHUNK):
-            chunk = order[start : start + _QUERY_CHUNK]
-            result[chunk], _ = self._tree.query(queries[chunk], workers=threads, distance_upper_bound=bound)
+
+        def search(chunk: slice) -> None:
+            rows = order[chunk]
+            result[rows], _ = self._tree.query(queries[rows], distance_upper_bound=bound)
+
+        _in_chunks(search, len(queries), threads)
         return result
 
     def nearest(self, queries: Points, count: int, *, threads: int = 1) -> npt.NDArray[np.int64]:
@@ -55,15 +61,31 @@ class PointIndex:
         count : int
             How many; there must be as many points.
         threads : int
-            -1: one per core.
 
         Returns
         -------
         (n, count) int64 ndarray
             Indices of points, the nearest first.
         """
-        _, rows = self._tree.query(queries, k=np.arange(1, count + 1), workers=threads)
+        rows = np.empty((len(queries), count), np.int64)
+
+        def search(chunk: slice) -> None:
+            _, rows[chunk] = self._tree.query(queries[chunk], k=np.arange(1, count + 1))
+
+        _in_chunks(search, len(queries), threads)
         return np.asarray(self._order[rows])
+
+
+def _in_chunks(search: Callable[[slice], None], number: int, threads: int) -> None:
+    """Search for so many queries in threads of our own.
+
+    Whoever interrupts `cKDTree.query` does not wait for the threads that it has begun itself: these go on in
+    memory that is freed meanwhile, and the process dies of them.
+    """
+    chunks = [slice(start, start + _QUERY_CHUNK) for start in range(0, number, _QUERY_CHUNK)]
+    with ThreadPoolExecutor(threads) as pool:
+        for _ in pool.map(search, chunks):  # interrupted, it begins no more, and waits for those under way
+            pass
 
 
 def bounds(points: Points) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:

@@ -35,7 +35,6 @@ class Reference(Protocol):
         points : (n, 3) float64 ndarray
             In the reference's frame, metres.
         threads : int
-            -1: one per core.
         bound : float
             Metres.
 
