@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pytest
 from conftest import copy_block
+from numpy.typing import NDArray
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -23,11 +25,14 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.shards import run_part as shards
 from colmap_sph.pipeline.shards.part import Part, StageName
 from colmap_sph.pipeline.shards.run_part import PartReport, run_part
+from colmap_sph.pipeline.stages import maps as map_stage
 from colmap_sph.pipeline.stages.facts import Facts
+from colmap_sph.pipeline.stages.maps import MapFiles
 from colmap_sph.pipeline.stages.match import MatchStage, MatchTask
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.platforms.files import look_again
 from colmap_sph.project.claim import claimed, shared
+from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.polishing import PolishOptions
 from colmap_sph.project.project import Project
 from colmap_sph.project.workspace import Workspace
@@ -329,6 +334,40 @@ def test_results_of_other_options_are_never_taken_for_ours(prepared: Project) ->
             with pytest.raises(InputError, match="was made anew with other options meanwhile"):
                 stage.make(task)
             assert not context.estimate_path(name).exists()
+
+
+@pytest.mark.parametrize("when", ["between both maps", "before they are vouched for"])
+def test_maps_of_two_jobs_at_the_same_time_are_nobodys(
+    when: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A job with other options writes the same maps; whichever is last, no key vouches for the other's files."""
+    maps = MapFiles(tmp_path / "depth.bin", tmp_path / "normals.bin", tmp_path / "record.json")
+    normals = np.zeros((40, 50, 3), np.float32)
+    normals[..., 2] = -1
+    write_normals = map_stage.write_normal_map
+
+    def write_other() -> None:
+        monkeypatch.undo()
+        maps.write(normals, np.full((40, 50), 2, np.float32), "other")
+
+    def write_normals_later(path: Path, values: NDArray[np.float32]) -> str:
+        if when == "between both maps":
+            write_other()
+        digest = write_normals(path, values)
+        if when == "before they are vouched for":
+            write_other()
+        return digest
+
+    monkeypatch.setattr(map_stage, "write_normal_map", write_normals_later)
+    with pytest.raises(OutputError, match=r"depth\.bin was written by another job at the same time"):
+        maps.write(normals, np.full((40, 50), 1, np.float32), "ours")
+    assert maps.facts("ours") is None
+    assert maps.facts("other") is None
+    # They are made anew without setting anything aside.
+    maps.write(normals, np.full((40, 50), 1, np.float32), "ours")
+    assert maps.facts("ours") is not None
+    assert read_depth_map(maps.depth, (maps.digests() or ("",))[0]).max() == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["depth.bin", "normals.bin", "record.json"]
 
 
 @contextlib.contextmanager

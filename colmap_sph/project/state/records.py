@@ -170,6 +170,7 @@ def vouch(
     facts: "DataclassInstance | None" = None,
     *,
     state: Literal["done", "void"] = "done",
+    read_back: bool = False,
 ) -> None:
     """Write a record: `files` are complete, and were made under `key`.
 
@@ -184,6 +185,14 @@ def vouch(
         What a later run wants to know without reading the files.
     state : {"done", "void"}
         "void": they are not what they should be, and only ours.
+    read_back : bool
+        Whether to make sure that they are what was written: not where no other job can write them.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be read back, or is another job's by now, and nothing vouches for it; or the record cannot be
+        written.
     """
     stamps = []
     for path, digest in files.items():
@@ -191,6 +200,13 @@ def vouch(
             stamps.append(_stamp(path) if digest else "")
         except OSError as error:
             raise OutputError(f"{path} cannot be read back ({reason_of(error)}); run again.") from error
+        # After the stamp: so both are of one content, whatever others write meanwhile.
+        if read_back and digest and _digest(path) != digest:
+            _write(record, Record(state="making"))
+            raise OutputError(
+                f"{path} was written by another job at the same time, with other options; run again, and give all "
+                "jobs of a workspace the same options."
+            )
     plain = {} if facts is None else asdict(facts)
     _write(record, Record(key, tuple(stamps), tuple(files.values()), plain, state))
 
@@ -223,7 +239,7 @@ def _sync_and_vouch(
             sync_folder(folder)
     except OSError as error:
         raise unwritable(next(iter(files)), error) from error
-    vouch(record, key, files, facts, state=state)
+    vouch(record, key, files, facts, state=state, read_back=True)
 
 
 def vouched_facts(record: Path, key: str, files: Sequence[Path], kind: type[T]) -> T | None:
