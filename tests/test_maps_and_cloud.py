@@ -16,6 +16,7 @@ from test_pages import Page
 import colmap_sph
 from colmap_sph.app import cli
 from colmap_sph.pages import write_page
+from colmap_sph.products.surface.seen import seen_views
 from colmap_sph.project.state.cloud_marks import is_cloud_of
 from colmap_sph.project.workspace import Workspace
 
@@ -141,3 +142,37 @@ def test_a_run_with_other_options_ends_with_its_own_cloud(dense: Path) -> None:
     assert shows_cloud(page_of(dense))
     assert cli.main(["report", str(dense)]) == 0
     assert shows_cloud(page_of(dense))
+
+
+def exported_maps(dense: Path, folder: Path) -> set[str]:
+    """Names of the images whose depth maps are exported."""
+    arguments = ["export", str(dense), "--formats", "npz", "--output", str(folder)]
+    assert cli.main(arguments) == 0
+    return {path.name.removesuffix(".npz") for path in (folder / "depth_npz").iterdir() if path.suffix == ".npz"}
+
+
+def test_products_are_made_of_the_maps_of_the_last_run(
+    dense: Path, finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Maps of images that it left out lie there, of the run before."""
+    names = set(finished.report.coverage)
+    assert exported_maps(dense, tmp_path / "all") == names
+    assert "left out" not in capsys.readouterr().err
+    gone = min(names)
+    (dense / "images" / gone).unlink()
+    report = colmap_sph.run(workspace=dense)
+    assert set(report.coverage) == names - {gone}
+    assert Workspace(dense).depth_map_path(gone, "geometric").is_file()
+    assert exported_maps(dense, tmp_path / "fewer") == names - {gone}
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"1 of 10 depth maps in {dense}, such as that of {gone}, are of another run than the cloud" in said
+    assert {each.view.name for each in seen_views(Workspace(dense))[1]} == names - {gone}
+
+
+def test_products_of_maps_that_are_not_fused_say_so(
+    dense: Path, finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command("patch_match_stereo", "--workspace_path", dense, *SMALL) == 0
+    capsys.readouterr()
+    assert exported_maps(dense, tmp_path / "out") == set(finished.report.coverage)
+    assert "was made of other depth maps than are there" in " ".join(capsys.readouterr().err.split())

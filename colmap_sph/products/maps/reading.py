@@ -18,12 +18,15 @@ from colmap_sph.project.map_files import (
     read_normal_planes,
 )
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.cloud_marks import images_of_cloud
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.agreement import check_some_maps
 from colmap_sph.stereo.map_sizes import at_pixel_centres
 
 logger = logging.getLogger(__name__)
+
+_Mapped = tuple[int, View, Path]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,20 +87,64 @@ def mapped_scene(workspace: Workspace) -> MappedScene:
     views = [at_map_size(view, path) for _, view, path in mapped if has_depth(path, possible=True)]
     if not views:
         raise no_depth(workspace)
-    if len(views) < len(scene.views):
-        logger.warning("%d of %d images have no depth; left out", len(scene.views) - len(views), len(scene.views))
+    if empty := len(mapped) - len(views):
+        logger.warning("%d of %d depth maps have no depth; left out", empty, len(mapped))
     return MappedScene(workspace, replace(scene, views=tuple(views)))
 
 
-def views_with_maps(workspace: Workspace) -> tuple[Scene, list[tuple[int, View, Path]]]:
-    """A workspace's scene, and number, view and geometric depth map of those that have one; `InputError`: none."""
+def views_with_maps(workspace: Workspace) -> tuple[Scene, list[_Mapped]]:
+    """A workspace's scene, and number, view and depth map of those of whose geometric maps products are made.
+
+    These are the maps that the cloud was made of, where that is known: others may be of earlier runs, or of runs
+    that were ended. What is left out is told.
+
+    Raises
+    ------
+    InputError
+        There is none, or the model cannot be read.
+    """
     scene = read_scene(workspace.sparse_dir)
     paths = (workspace.depth_map_path(view.name, "geometric") for view in scene.views)
     numbered = zip(range(len(scene.views)), scene.views, paths, strict=True)
     mapped = [each for each in numbered if each[2].is_file()]
     if not mapped:
         raise InputError(f"{workspace.root} has no geometric depth map; run {_command(workspace)} first.")
-    return scene, mapped
+    if missing := len(scene.views) - len(mapped):
+        logger.warning("%d of %d images have no geometric depth map; left out", missing, len(scene.views))
+    return scene, _of_last_cloud(workspace, mapped)
+
+
+def _of_last_cloud(workspace: Workspace, mapped: list[_Mapped]) -> list[_Mapped]:
+    """Those of some maps that the cloud was made of; all where that is not known, or none is."""
+    fused = images_of_cloud(workspace, [view.name for _, view, _ in mapped])
+    if fused is None:
+        return mapped
+    others = [view.name for _, view, path in mapped if view.name not in fused and _may_show(path)]
+    if not others:
+        return mapped
+    if not fused:
+        logger.warning(
+            "The cloud in %s was made of other depth maps than are there, of which this is made; %s makes it anew",
+            workspace.root,
+            _command(workspace),
+        )
+        return mapped
+    logger.warning(
+        "%d of %d depth maps in %s, such as that of %s, are of another run than the cloud; left out",
+        len(others),
+        len(mapped),
+        workspace.root,
+        others[0],
+    )
+    return [each for each in mapped if each[1].name not in others]
+
+
+def _may_show(path: Path) -> bool:
+    """Whether a depth map is not known to be empty, as those are that no cloud is made of."""
+    try:
+        return has_depth(path, possible=True)
+    except InputError:
+        return True
 
 
 def no_depth(workspace: Workspace) -> NoResultError:

@@ -1,6 +1,5 @@
 """A workspace → its views with depth maps, and roughly where each of them sees something."""
 
-import logging
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,8 +12,6 @@ from colmap_sph.project.images.reading import read_colours
 from colmap_sph.project.map_files import is_depth, read_some_pixels
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
-
-logger = logging.getLogger(__name__)
 
 # Pixels along the longer side of a map that are looked at beforehand.
 _SAMPLES = 128
@@ -48,9 +45,7 @@ class SeenView:
 
 
 def seen_views(workspace: Workspace) -> tuple[Scene, list[SeenView]]:
-    """Look at all geometric depth maps of a workspace.
-
-    Images without maps are left out, with a warning where others have some.
+    """Look at the geometric depth maps of a workspace, see `views_with_maps`.
 
     Raises
     ------
@@ -63,8 +58,6 @@ def seen_views(workspace: Workspace) -> tuple[Scene, list[SeenView]]:
     found = [seen for each in mapped if (seen := _seen(*each)) is not None]
     if not found:
         raise no_depth(workspace)
-    if missing := len(scene.views) - len(mapped):
-        logger.warning("%d of %d images have no geometric depth map; left out", missing, len(scene.views))
     return scene, found
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import get_args
 
 import xxhash
 
@@ -37,10 +38,22 @@ def is_cloud_of(workspace: Workspace, maps: Iterable[tuple[str, MapKind]]) -> bo
     bool or None
         None where that is not known: another program made it, or an earlier version.
     """
+    marks = _marks(workspace)
+    return marks <= {map_mark(workspace, name, kind) for name, kind in maps} if marks else None
+
+
+def images_of_cloud(workspace: Workspace, names: Iterable[str]) -> set[str] | None:
+    """Those of the images `names` of whose depth maps, as they are now, the cloud was made; None: not known."""
+    marks = _marks(workspace)
+    if not marks:
+        return None
+    return {name for name in names if any(map_mark(workspace, name, kind) in marks for kind in get_args(MapKind))}
+
+
+def _marks(workspace: Workspace) -> frozenset[str]:
+    """Marks of the depth maps that the cloud was made of; none where these are not known."""
     if workspace.fused_path.exists():
         known = recorded_facts(workspace.cloud_record_path, _Marked, workspace.cloud_paths)
     else:
         known = recorded_facts(workspace.tiles_record_path, _Marked, [workspace.tiles_dir / INDEX])
-    if known is None or not known.of_maps:
-        return None
-    return set(known.of_maps) <= {map_mark(workspace, name, kind) for name, kind in maps}
+    return frozenset(known.of_maps if known else ())
