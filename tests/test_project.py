@@ -1,10 +1,14 @@
 """What a run is given to work on: defaults, and every mistake told in a sentence that names the right option."""
 
+import errno
+import os
 import runpy
 import shlex
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pycolmap
 import pytest
@@ -219,6 +223,31 @@ def test_the_output_would_be_a_file(
     assert cli.main(["run", "--model", "sparse/0", "--output", output, *more]) == 3
     assert capsys.readouterr().err == "error: file is no folder; choose another --output.\n"
     assert Path("file").read_text() == "mine"
+
+
+@pytest.mark.parametrize("option", ["--model", "--workspace"])
+@pytest.mark.parametrize("place", ["closed/project", "closed/folder/../project", "closed/../project"])
+def test_a_folder_that_may_not_be_entered(
+    option: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The system refuses whatever leads through it, also where it leads out again; root would be let in."""
+    closed = f"{tmp_path}/closed/"
+
+    def refusing(real: Callable[..., os.stat_result]) -> Callable[..., os.stat_result]:
+        def look(path: Any, *arguments: Any, **options: Any) -> os.stat_result:
+            if isinstance(path, str | os.PathLike) and os.fspath(path).startswith(closed):
+                raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), os.fspath(path))
+            return real(path, *arguments, **options)
+
+        return look
+
+    for name in ("stat", "lstat"):
+        monkeypatch.setattr(os, name, refusing(getattr(os, name)))
+    folder = tmp_path / place
+    assert cli.main(["run", option, str(folder)]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert said == f"error: {folder} cannot be read (Permission denied); check its permissions."
+    assert Project(model=folder / "sparse" / "0").root.name == "dense"
 
 
 def test_models_inside_a_folder(here: Path) -> None:

@@ -63,13 +63,20 @@ def is_link(path: Path) -> bool:
 def plain_path(path: Path) -> Path:
     """The same place as an absolute path without ``..``, through the links that are typed: only where ``..`` goes
     back over one, by where that leads to. Windows takes ``..`` out of the text before it looks at any link.
+
+    What may not be looked at counts as a folder: nothing leads through it either, as whoever opens the path tells.
     """
     typed = Path.cwd() / path
     if sys.platform == "win32":
         return Path(os.path.normpath(typed))
     plain = Path(typed.anchor)
     for part in typed.parts[1:]:
-        plain = plain / part if part != ".." else Path(os.path.realpath(plain) if is_link(plain) else plain).parent
+        if part != "..":
+            plain = plain / part
+            continue
+        with suppress(PermissionError):
+            plain = Path(os.path.realpath(plain)) if is_link(plain) else plain
+        plain = plain.parent
     return plain
 
 

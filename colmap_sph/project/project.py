@@ -3,7 +3,7 @@
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from colmap_sph.errors import InputError, OptionError, shell_word
+from colmap_sph.errors import InputError, OptionError, reason_of, shell_word
 from colmap_sph.platforms.files import plain_path
 from colmap_sph.project.database import find_database
 from colmap_sph.project.files import real_path
@@ -38,7 +38,7 @@ class Project:
             Nothing to work on, options that contradict each other, or a workspace where a model belongs and the
             other way round.
         InputError
-            The sparse model is not there, or not complete.
+            The sparse model is not there, or not complete; or the folder may not be looked into.
         """
         if self.model is not None and self.workspace is not None:
             raise OptionError(
@@ -53,6 +53,7 @@ class Project:
             raise OptionError(f"There is nothing to work on: {_what_to_give()}")
 
     def _check_workspace(self, workspace: Path) -> None:
+        _check_open(workspace)
         given = {"--images": self.images, "--output": self.output}
         surplus = [option for option, value in given.items() if value is not None]
         if surplus:
@@ -146,7 +147,18 @@ def _no_workspace(root: Path, lack: str) -> str:
     )
 
 
+def _check_open(folder: Path) -> None:
+    """Raise `InputError` where permissions keep us out of a folder; what else is wrong with it is told later."""
+    try:
+        (folder / "..").stat()  # who may not enter it is not told even that
+    except PermissionError as error:
+        raise InputError(f"{folder} cannot be read ({reason_of(error)}); check its permissions.") from error
+    except OSError:
+        return
+
+
 def _check_model(model: Path) -> None:
+    _check_open(model)
     if _is_dense_workspace(model) and not has_model(model):
         raise OptionError(
             f"{model} is a dense workspace, not a sparse model; give it as --workspace {shell_word(model)}."
