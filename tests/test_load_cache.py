@@ -73,13 +73,15 @@ def test_capacity_counts_what_is_kept_alone(cache_of: CacheOf) -> None:
     assert load.loaded == []
 
 
-def test_a_value_larger_than_the_capacity(cache_of: CacheOf) -> None:
-    load = Loader(1000)
-    cache = cache_of(load, 30)
-    assert cache("a") is cache("a")
-    cache("b")
-    cache("a")
-    assert load.loaded == ["a", "b", "a"]
+def test_a_value_larger_than_the_capacity_is_not_kept(cache_of: CacheOf) -> None:
+    """Nor does it push out what is: a stage has reserved no more than the capacity for all that it keeps."""
+    load = Loader(10)
+    large = Loader(31)
+    cache = cache_of(lambda key: (large if key.isupper() else load)(key), 30)
+    for key in "abcAAabcB":
+        assert cache(key) == key.encode() * (31 if key.isupper() else 10)
+    assert load.loaded == [*"abc"]
+    assert large.loaded == [*"AAB"]
 
 
 def test_a_failure_is_not_kept(cache_of: CacheOf) -> None:

@@ -33,7 +33,7 @@ class LoadCache(Generic[T]):
 
     @contextmanager
     def holding(self, capacity: int) -> Iterator[None]:
-        """Keep up to so many bytes more for a while; a single larger value is kept while nothing newer comes."""
+        """Keep up to so many bytes more for a while; a value larger than all that is not kept."""
         with self._lock:
             self._capacity += capacity
         try:
@@ -62,15 +62,17 @@ class LoadCache(Generic[T]):
                     self._needed[key] = needed
                     return self._values[key]
             value = load()
+            size = self._size(value)
             with self._lock:
-                self._values[key] = value
-                self._needed[key] = needed
-                self._bytes += self._size(value)
+                if size <= self._capacity:
+                    self._values[key] = value
+                    self._needed[key] = needed
+                    self._bytes += size
                 self._evict()
             return value
 
     def _evict(self) -> None:
-        while self._bytes > self._capacity and len(self._values) > (self._capacity > 0):
+        while self._bytes > self._capacity:
             last = max(islice(self._values, max(len(self._values) - 1, 1)), key=self._needed.__getitem__)
             self._bytes -= self._size(self._values.pop(last))
             del self._needed[last]
