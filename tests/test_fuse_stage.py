@@ -21,6 +21,7 @@ from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import parse_memory
 from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.stages import cloud as cloud_module
 from colmap_sph.pipeline.stages import fuse as fuse_module
 from colmap_sph.pipeline.stages import fusion_parts as parts_module
 from colmap_sph.pipeline.stages.facts import Facts
@@ -479,6 +480,26 @@ def test_thin_clouds_of_many_images_are_no_reason_for_advice(workspace, monkeypa
     report = fuse(workspace, fusion=FusionOptions(min_num_pixels=2, max_depth_error=0.011))
     assert report.points > 0
     assert "loosen --fusion.max-normal-error" in report.advice
+
+
+@pytest.mark.parametrize("is_masked", [False, True])
+def test_advice_takes_what_is_left_of_the_memory(workspace, tmp_path, is_masked):
+    """And is the same: where there is no room for maps, those of two images are there at a time."""
+    for name in NAMES if is_masked else ():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    options = FusionOptions(min_num_pixels=7, mask_path=tmp_path if is_masked else None)
+    found, peaks = [], []
+    for amount in ("1MiB", "64GiB"):
+        context = context_of(workspace, fusion=options, memory=amount)
+        cloud_module.facts_of_cloud(context, NAMES, 0)  # what is made once is made
+        tracemalloc.start()
+        found.append(cloud_module.facts_of_cloud(context, NAMES, 0))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert found[0] == found[1] and found[0].advice
+    of_samples = 2000 * 150  # whatever the size of the maps
+    assert peaks[0] < cloud_module._LOOKED_AT_BYTES * WIDTH * HEIGHT + of_samples
+    assert peaks[1] > 16 * len(NAMES) * WIDTH * HEIGHT
 
 
 @pytest.mark.parametrize("coverage", [0.0, 1.0], ids=["before", "in fusion"])

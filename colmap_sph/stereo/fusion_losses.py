@@ -98,7 +98,8 @@ def explain_losses(
     Parameters
     ----------
     maps_of : callable
-        Image name → its (H, W) depth and (3, H, W) normals. Asked for some images many times.
+        Image name → its (H, W) depth and (3, H, W) normals. Asked for some images many times; those of two are in
+        use at a time.
     scene : Scene
         Views with maps.
     options : FusionOptions
@@ -119,12 +120,13 @@ def explain_losses(
         partners = {name: (o, range(1, 1 + len(o))) for name, o in overlapping_views(scene, most).items()}
     counts = np.zeros(len(_Loss))
     for view in scene.views[:: -(-len(scene.views) // max_views)]:
-        pixels = _sample_pixels(maps_of(view.name)[0], samples)
+        maps = maps_of(view.name)
+        pixels = _sample_pixels(maps[0], samples)
         names, stations = partners[view.name]
         names = names[:most]
         found = np.full((len(names), len(pixels[0])), _Loss.UNSEEN)
         for k, name in enumerate(names):
-            found[k] = _losses_in(view, maps_of(view.name), scene.view(name), maps_of(name), pixels, options)
+            found[k] = _losses_in(view, maps, scene.view(name), maps_of(name), pixels, options)
         counts += np.bincount(_final_losses(found, stations[:most], options), minlength=len(_Loss))
     return GateLosses(*(counts / max(counts.sum(), 1)))
 

@@ -6,10 +6,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 from msgspec import Meta
 
 from colmap_sph.errors import counted
 from colmap_sph.pipeline.load_cache import LoadCache
+from colmap_sph.pipeline.memory import MemoryGate
+from colmap_sph.platforms.memory import give_back_freed_memory
 from colmap_sph.project.cloud_tiles import missing_tiles, read_index, retire_tiles
 from colmap_sph.project.files import read_small, whole_digest
 from colmap_sph.project.map_files import read_depth_map, read_normal_planes
@@ -35,8 +38,10 @@ _MOSTLY = 0.5
 # of the sparse points do not.
 _MOSTLY_MASKED = 0.9
 _FITTING = 0.5
-# Bytes of maps in memory meanwhile.
+# Bytes of maps that are kept meanwhile, at most; and per pixel of the largest image, of its maps and those of
+# another beside it.
 _CACHE_BYTES = 1 << 30
+_LOOKED_AT_BYTES = 36.0
 _MAX_LIST_BYTES = 1 << 26
 
 
@@ -187,26 +192,30 @@ def facts_of_cloud(
         return CloudFacts(points, "")
     maps: LoadCache[DepthAndNormals] = LoadCache(lambda pair: pair[0].nbytes + pair[1].nbytes)
 
-    with_depth, masked = 0, 0
+    with_depth: dict[str, int] = {}
+    left: dict[str, int] = {}
 
     def read(name: str) -> DepthAndNormals:
-        nonlocal with_depth, masked
         files = context.map_files(name, options.input)
         depth = read_depth_map(files.depth)
-        found = int((depth > 0).sum())
+        with_depth[name] = int(np.count_nonzero(depth > 0))
         if options.mask_path is not None:
             view = context.scene.view(name)
             mask = read_view_mask(mask_path(options.mask_path, name), view)
             if mask is not None:
                 depth[mask == 0] = 0
-        with_depth += found
-        masked += found - int((depth > 0).sum())
+        left[name] = int(np.count_nonzero(depth > 0))
         return depth, read_normal_planes(files.normals)
 
-    with maps.holding(_CACHE_BYTES):
+    give_back_freed_memory()  # what fusion kept for its own sizes
+    largest = max((view.num_pixels for view in scene.views), default=0)
+    room = MemoryGate(context.options.memory_budget).spare(_LOOKED_AT_BYTES * largest)
+    with maps.holding(int(min(_CACHE_BYTES, room))):
         losses = explain_losses(lambda name: maps.get(name, lambda: read(name)), scene, options, partners=partners)
-    if masked > _MOSTLY_MASKED * with_depth:
-        share = masked / with_depth
+    found = sum(with_depth.values())
+    masked = found - sum(left.values())
+    if masked > _MOSTLY_MASKED * found:
+        share = masked / found
         return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {share:.0%}.")
     many = points > 0 and losses.kept > _MOSTLY
     if many:
