@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from surveyed import BLUE, BOX, GREEN, GSD, RED, ROOF, surveyed_workspace
 
 from colmap_sph.app import cli
-from colmap_sph.errors import InputError, NoResultError, OptionError
+from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.evaluation import read_geometry
 from colmap_sph.evaluation.geometry_io import Mesh
 from colmap_sph.products.georeference import Georeference
@@ -133,6 +133,19 @@ def test_a_small_picture_shows_a_mesh_from_the_south_and_above(tmp_path):
     blue = np.flatnonzero((picture == (0, 0, 255)).all(axis=2).any(axis=1))
     assert blue.max() <= height // 2 + 1
     assert blue.min() < 0.3 * height
+
+
+def test_a_mesh_that_was_not_written_to_its_end_is_refused(tmp_path):
+    """COLMAP tells nobody that the disk is full, and leaves a part: of it no smaller mesh is made."""
+    path = tmp_path / "mesh.ply"
+    mesh = pyramid()
+    write_ply(path, mesh, mesh.points)
+    whole = path.read_bytes()
+    assert len(read_ply(path).faces) == len(mesh.faces)
+    for size in range(len(whole)):
+        path.write_bytes(whole[:size])
+        with pytest.raises(OutputError, match="cannot be written whole; free some space"):
+            read_ply(path)
 
 
 def test_a_ply_file_keeps_map_coordinates(tmp_path):

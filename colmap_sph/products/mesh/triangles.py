@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import NoResultError
+from colmap_sph.errors import NoResultError, OutputError
 from colmap_sph.project.files import atomic_file
 
 _FACE = np.dtype([("count", "u1"), ("corners", "<i4", 3)])
@@ -78,10 +78,24 @@ def write_ply(path: Path, mesh: Triangles, points: NDArray[np.floating]) -> None
 
 
 def read_ply(path: Path) -> Triangles:
-    """Read a mesh that COLMAP or `write_ply` wrote; `NoResultError` where it has no triangles."""
+    """Read a mesh that COLMAP or `write_ply` wrote.
+
+    Raises
+    ------
+    NoResultError
+        It has no triangles.
+    OutputError
+        It was not written to its end, of which COLMAP tells nobody.
+    """
+    cut_off = OutputError(
+        f"{path} cannot be written whole; free some space, raise the limit (a quota, or ulimit -f), or choose "
+        "another --output."
+    )
     with path.open("rb") as file:
         start = file.read(_MAX_HEADER)
-        end = start.index(b"end_header\n") + len(b"end_header\n")
+        end = start.find(b"end_header\n") + len(b"end_header\n")
+        if end < len(b"end_header\n"):
+            raise cut_off
         header = start[:end].decode("ascii", "replace")
         counts = {kind: int(number) for kind, number in re.findall(r"element (\w+) (\d+)", header)}
         of_vertex = header.split("element face")[0]
@@ -93,6 +107,8 @@ def read_ply(path: Path) -> Triangles:
         file.seek(end)
         vertices = np.fromfile(file, np.dtype(fields), counts["vertex"])
         faces = np.fromfile(file, face, counts["face"])
+    if (len(vertices), len(faces)) != (counts["vertex"], counts["face"]):
+        raise cut_off
     points = np.stack([vertices[name] for name in "xyz"], axis=1).astype(np.float32)
     colours = np.full((len(points), 3), 200, np.uint8)
     if vertices.dtype.names is not None and "red" in vertices.dtype.names:
