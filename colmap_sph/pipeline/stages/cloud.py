@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta
 
-from colmap_sph.errors import counted
+from colmap_sph.errors import counted, percent
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.project.cloud_tiles import missing_tiles, read_index, retire_tiles
 from colmap_sph.project.files import read_small, whole_digest
@@ -207,7 +207,7 @@ def facts_of_cloud(
         losses = explain_losses(lambda name: maps.get(name, lambda: read(name)), scene, options, partners=partners)
     if masked > _MOSTLY_MASKED * with_depth:
         share = masked / with_depth
-        return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {share:.0%}.")
+        return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {percent(share, 0)}.")
     many = points > 0 and losses.kept > _MOSTLY
     if many:
         return CloudFacts(points, "")
