@@ -106,6 +106,17 @@ def counted(count: int, what: str) -> str:
     return f"{count:,} {what}" if count == 1 else f"{count:,} {what}s"
 
 
+def percent(share: float, digits: int = 1) -> str:
+    """A share of the whole, as in a sentence or a table.
+
+    Examples
+    --------
+    >>> print(percent(0.9176), percent(0.5, 0), sep=", ")
+    91.8 %, 50 %
+    """
+    return f"{100 * share:.{digits}f} %"
+
+
 def reason_of(error: BaseException | None) -> str:
     """Say in one line why something failed, for the brackets of a message that names the file itself.
 

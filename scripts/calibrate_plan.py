@@ -56,13 +56,12 @@ def compare(scene: Scene, folder: Path, threads: int) -> Comparison:
     given = [str(scene.model), images, str(dense), scene.max_image_size or -1, threads]
     _run([sys.executable, "-P", "-c", _PLAN, json.dumps(given)], folder / "plan.txt")
     plan = json.loads((folder / "plan.txt").read_text().splitlines()[-1])
-    _, _, peak = _run([*command(), *scene.arguments(folder, threads)], folder / "run.txt")
+    wall, _, peak = _run([*command(), *scene.arguments(folder, threads)], folder / "run.txt")
     report = json.loads((dense / "colmap_sph" / "report.json").read_text())
     files = [path for path in dense.rglob("*") if path.is_file() and not path.is_symlink()]
-    seconds = report["seconds"]
     disk = sum(path.stat().st_size for path in files)
     shutil.rmtree(dense)
-    return Comparison(scene.name, threads, plan, seconds, sum(seconds.values()), peak, disk)
+    return Comparison(scene.name, threads, plan, report["seconds"], wall, peak, disk)
 
 
 def _run(arguments: Sequence[str], log: Path) -> tuple[float, float, int]:

@@ -2,9 +2,10 @@
 
     python scripts/measure_pairs.py --scene walk --output /tmp/pairs
     python scripts/measure_pairs.py --scene drive --width 960 --output /tmp/pairs --rectification.sampling 1.4
+    python scripts/measure_pairs.py --model sparse/0 --exact-depth depth --depth-scale 0.001 --output /tmp/pairs
 
-Renders the scene into OUTPUT unless it is there, runs the program beside it (what has not changed is not done
-again) and prints a table. `study_rectification.py` compares sphere and frame.
+Renders the scene into OUTPUT, unless it is there or a model is given, runs the program beside it (what has not
+changed is not done again) and prints a table. `study_rectification.py` compares sphere and frame.
 """
 
 import sys
@@ -20,7 +21,7 @@ from rectification_study import found, pairs, scenes
 
 import colmap_sph
 from colmap_sph.app.evaluate_command import exact_depth_views
-from colmap_sph.errors import ColmapSphError
+from colmap_sph.errors import ColmapSphError, OptionError
 from colmap_sph.evaluation import DepthView
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.pair_files import read_estimate, read_pair
@@ -37,9 +38,17 @@ class Measurement:
     output: Path
     """Folder for rendered scenes and workspaces."""
     scene: scenes.SceneName = "walk"
-    """Scene: `penta` is the shared block, the others are rendered."""
+    """Scene to render."""
     width: int = 480
     """Width of rendered pictures, pixels."""
+    model: Path | None = None
+    """Sparse model, such as that of an aerial block, instead of a scene."""
+    images: Path | None = None
+    """Original images. Default: the folder `images` beside or above the model."""
+    exact_depth: Path | None = None
+    """With a model: folder of exact depth maps at pixel centres, named as the images."""
+    depth_scale: float | None = None
+    """Metres of one unit of integer depth maps."""
     by: Literal["baseline", "angle"] = "baseline"
     """Whether pairs are summed by baseline or by angle between the viewing directions."""
     run: Annotated[RunOptions, tyro.conf.arg(name="")] = field(default_factory=RunOptions)
@@ -47,8 +56,8 @@ class Measurement:
 
 def main(asked: Measurement) -> None:
     """Render, run, measure, print."""
-    name = f"{asked.scene}-{asked.width}"
-    files = scenes.find_scene(asked.scene, asked.output / name, asked.width, asked.run.num_threads)
+    name = "given" if asked.model is not None else f"{asked.scene}-{asked.width}"
+    files = files_of(asked, asked.output / name)
     workspace = Workspace(asked.output / f"{name}-{asked.run.rectification.surface}")
     report = colmap_sph.run(files.model, images=files.images, output=workspace.root, options=asked.run)
     scene = read_scene(workspace.sparse_dir)
@@ -57,6 +66,15 @@ def main(asked: Measurement) -> None:
     print(pair_table(scored, asked.by))
     print()
     print(map_table(workspace, exact, scene, float(np.mean(list(report.coverage.values())))))
+
+
+def files_of(asked: Measurement, folder: Path) -> scenes.StudyScene:
+    """Those that are given, or of the scene that is rendered into a folder."""
+    if asked.model is None:
+        return scenes.find_scene(asked.scene, folder, asked.width, asked.run.num_threads)
+    if asked.exact_depth is None:
+        raise OptionError("--model needs --exact-depth, what is found is compared with it.")
+    return scenes.StudyScene(asked.model, asked.images, asked.exact_depth, asked.depth_scale)
 
 
 def score(

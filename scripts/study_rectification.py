@@ -4,8 +4,7 @@
     python scripts/study_rectification.py --scene drive --same-pixels spherical --output /tmp/study
     python scripts/study_rectification.py --model sparse/0 --lidar lidar.laz --output /tmp/study
 
-Without --model it takes a scene: the shared test block `penta` (COLMAP_SPH_DATA, or ../shared/data beside the
-repository), or one that it renders.
+Without --model it takes a scene that it renders.
 Both surfaces get the same pairs, matcher and options; each is computed in a process of its own, so that the peak
 memory is its own. OUTPUT gets study.md, study.json and the plots. What is already computed in OUTPUT with the same
 options is measured again, not computed again. Needs matplotlib: pip install 'colmap_sph[study]'.
@@ -36,8 +35,8 @@ class Study:
 
     output: Path
     """Folder for the workspaces, the results, and what is rendered."""
-    scene: scenes.SceneName = "penta"
-    """Scene with exact depth: the shared block, a street walked or driven along, an oblique block of a town."""
+    scene: scenes.SceneName = "town"
+    """Scene to render: a street walked or driven along, an oblique block of a town."""
     width: int = 960
     """Width of rendered images, pixels."""
     model: Path | None = None
@@ -96,7 +95,7 @@ def main(study: Study) -> None:
 
 
 def with_scene(study: Study) -> Study:
-    """The study of a scene whose files are known, or made."""
+    """The study of a rendered scene."""
     folder = study.output / f"{study.scene}-{study.width}"
     files = scenes.find_scene(study.scene, folder, study.width, study.run.num_threads)
     given = {one.name: getattr(study, one.name) for one in fields(study)}

@@ -79,8 +79,8 @@ def test_maps_of_a_model_of_another_scale_are_refused(what, scale, aligned, caps
     paths = ["--workspace_path", str(workspace.root), "--output_path", str(workspace.root / "cloud.ply")]
     assert cli.main([what, *(paths if what == "stereo_fusion" else [str(workspace.root)])]) == 2
     assert re.fullmatch(
-        r"error: The depth maps in \S+stereo are not of the model in \S+sparse: only \d\.\d% of its sparse points "
-        r"that have a depth there agree with it\. Was the model scaled, .*\n",
+        r"error: The depth maps in \S+stereo are not of the model in \S+sparse: only \d\.\d % of its sparse "
+        r"points that have a depth there agree with it\. Was the model scaled, .*\n",
         capsys.readouterr().err,
     )
     made = {*workspace.root.iterdir()} - {*before}
@@ -110,7 +110,7 @@ def test_a_cloud_of_a_model_that_was_moved_since_is_refused(what, tmp_path, caps
     model.write(workspace.sparse_dir)
     capsys.readouterr()
     assert cli.main([*what, root]) == 2
-    refusal = r"error: The cloud in \S+ is not of the model in \S+sparse: only \d\.\d% of .* Fuse again\.\n$"
+    refusal = r"error: The cloud in \S+ is not of the model in \S+sparse: only \d\.\d % of .* Fuse again\.\n$"
     assert re.search(refusal, capsys.readouterr().err)
 
 
@@ -200,7 +200,7 @@ def reported(agreements, misplaced=0.0):
 def test_an_image_that_hardly_agrees_is_named():
     sound = {f"{k}.jpg": Agreement(100, 95, 90) for k in range(5)}
     report = reported({**sound, "odd.jpg": Agreement(100, 40, 3), "few.jpg": Agreement(5, 0, 0)})
-    assert "odd.jpg (3%)" in report.doubts and "few.jpg" not in report.doubts and "0.jpg" not in report.doubts
+    assert "odd.jpg (3 %)" in report.doubts and "few.jpg" not in report.doubts and "0.jpg" not in report.doubts
     assert report.agreement["0.jpg"] == 0.9
     assert report.overall_agreement == pytest.approx(453 / 605)
     refuse_disagreement(report)
@@ -211,19 +211,21 @@ def test_an_image_that_agrees_less_than_the_others_is_named():
     """Two neighbours in a strip that were exchanged fit some of their points; a scene may be hard for all."""
     others = {f"{k}.jpg": Agreement(440, 320, 310) for k in range(5)}
     report = reported({**others, "a.jpg": Agreement(438, 250, 136), "few.jpg": Agreement(60, 29, 14)})
-    assert "a.jpg (31%)" in report.doubts and "few.jpg" not in report.doubts and "0.jpg" not in report.doubts
+    assert "a.jpg (31 %)" in report.doubts and "few.jpg" not in report.doubts and "0.jpg" not in report.doubts
     hard = {f"{k}.jpg": Agreement(400, 300, 160) for k in range(5)}
     assert reported({**hard, "a.jpg": Agreement(438, 250, 136)}).doubts == ""
 
 
 def test_hardly_any_agreement_is_no_result():
     report = reported({"a.jpg": Agreement(100, 30, 4), "b.jpg": Agreement(100, 30, 5)})
-    with pytest.raises(NoResultError, match=r"Only 4\.5% of the sparse points agree"):
+    with pytest.raises(NoResultError, match=r"Only 4\.5 % of the sparse points agree"):
         refuse_disagreement(report)
     # Where little is matched few points have a depth, but these agree.
     few = reported({"a.jpg": Agreement(100, 6, 5)})
     assert few.refusal == ""
-    assert "only 6.0% of the sparse points that the images observe have a depth, of which 83% agree" in few.doubts
+    assert (
+        "only 6.0 % of the sparse points that the images observe have a depth, of which 83 % agree" in few.doubts
+    )
     # Too few to tell.
     refuse_disagreement(reported({"a.jpg": Agreement(10, 5, 0)}))
 
@@ -231,7 +233,7 @@ def test_hardly_any_agreement_is_no_result():
 def test_depth_that_disagrees_with_a_model_that_disagrees_with_itself_is_no_result():
     """Neither alone: a rig among people agrees with a third; observations of another size leave depth right."""
     third = {f"{k}.jpg": Agreement(100, 80, 42) for k in range(5)}
-    with pytest.raises(NoResultError, match=r"do not project .* only 42\.0% of them agree"):
+    with pytest.raises(NoResultError, match=r"do not project .* only 42\.0 % of them agree"):
         refuse_disagreement(reported(third, misplaced=0.9))
     refuse_disagreement(reported(third, misplaced=0.4))
     refuse_disagreement(reported({f"{k}.jpg": Agreement(100, 95, 90) for k in range(5)}, misplaced=1.0))
@@ -296,7 +298,7 @@ def test_small_garbage_is_refused(garbage, project):
     for name in FOUR_NAMES:
         picture = read_picture(project / "images" / name)
         cv2.imwrite(str(project / "images" / name), cv2.flip(picture, -1 if garbage == "turned" else 1))
-    why = "No depth was confirmed by a second image|Only 0.0% of the sparse points agree"
+    why = "No depth was confirmed by a second image|Only 0.0 % of the sparse points agree"
     with pytest.raises(NoResultError, match=why):
         colmap_sph.run(project / "sparse/0", options=OPTIONS)
 
@@ -571,5 +573,5 @@ def test_points_that_no_image_has_in_sight_are_told(project):
     wrong.mkdir()
     model.write_binary(wrong)
     assert share_in_sight(read_scene(wrong)) == 0
-    with pytest.raises(NoResultError, match="only 0% of them into these images at all"):
+    with pytest.raises(NoResultError, match="only 0 % of them into these images at all"):
         colmap_sph.run(wrong, images=project / "images", output=project / "dense", options=OPTIONS)

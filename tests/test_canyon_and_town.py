@@ -3,6 +3,7 @@
 import importlib
 from collections.abc import Sequence
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -212,6 +213,17 @@ def rows_of(text: str) -> dict[str, list[float]]:
     """Rows of printed tables by their first cell; cells that are no numbers are NaN."""
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in text.splitlines() if "|" in line]
     return {row[0]: [float(cell) if cell[:1].isdigit() else np.nan for cell in row[1:]] for row in rows}
+
+
+@pytest.mark.usefixtures("scripts_on_path")
+def test_pairs_of_a_given_model_are_measured_with_its_exact_depth(tmp_path: Path) -> None:
+    """In its unit; not without."""
+    measure = importlib.import_module("measure_pairs")
+    given = {"output": tmp_path, "model": tmp_path / "sparse", "depth_scale": 0.005}
+    files = measure.files_of(measure.Measurement(**given, exact_depth=tmp_path / "depth"), tmp_path)
+    assert (files.model, files.exact_depth, files.depth_scale) == (tmp_path / "sparse", tmp_path / "depth", 0.005)
+    with pytest.raises(OptionError, match="--model needs --exact-depth"):
+        measure.files_of(measure.Measurement(**given), tmp_path)
 
 
 @pytest.mark.usefixtures("scripts_on_path")

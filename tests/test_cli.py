@@ -290,7 +290,7 @@ def test_run(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     # The closing summary.
     words = " ".join(output.split())
     for name in IMAGES:
-        assert f"{name} {report['coverage'][name]:.1%}" in words
+        assert f"{name} {100 * report['coverage'][name]:.1f} %" in words
     assert "images 3 with depth maps, mean coverage" in words
     assert "pairs 3 matched (tracks)" in words
     assert f"{report['points']:,} points in" in words

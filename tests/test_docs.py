@@ -81,6 +81,19 @@ def test_the_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) <= 150
 
 
+def test_shares_are_written_in_one_way() -> None:
+    """As "12.3 %", in pages, in the terminal and in what examples print."""
+    written = re.compile(r"\d%(?![\w])|:\.\d%")
+    texts = [*DOCUMENTS, *PACKAGE.rglob("*.py"), *(ROOT / "workflows").rglob("*.py")]
+    found = [
+        f"{path.name}: {line}"
+        for path in texts
+        for line in path.read_text("utf-8").splitlines()
+        if written.search(line)
+    ]
+    assert not found
+
+
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_headings_are_nested(document: Path) -> None:
     levels = [len(marks) for marks in re.findall(r"^(#+) ", prose(document), re.MULTILINE)]

@@ -267,7 +267,7 @@ def test_map_coordinates_against_a_local_model_say_what_to_do():
         evaluate_cloud(cloud, make_reference(degrees, FIXED), FIXED)
 
 
-@pytest.mark.parametrize("width", [40, 60, 100, 146])
+@pytest.mark.parametrize("width", [40, 60, 80, 100, 146])
 def test_tables_fit_a_width(width: int) -> None:
     """Columns that find no room stand below; none is lost, and each has its row's name."""
     scores = [scores_of(plane(), plane()), scores_of(plane() + np.array([0, 0, 0.1]), plane())]
@@ -275,6 +275,9 @@ def test_tables_fit_a_width(width: int) -> None:
     wide = format_clouds(scores).split("\n\n")[1].splitlines()
     tables = text.split("\n\n")[1:-1]
     assert all(len(line) <= width for table in tables for line in table.splitlines())
+    if width > 40:  # what is told of a distance stands side by side
+        told = [sorted(re.findall(r"(acc|comp|F) ([\d.]+ m)", table)) for table in tables]
+        assert all(len(each) % 3 == 0 for each in told) and sum(map(len, told)) == 6
     columns = [re.split(r" {2,}", line) for line in wide]
     for row, cells in enumerate(columns):
         parts = [re.split(r" {2,}", table.splitlines()[row]) for table in tables]

@@ -442,7 +442,7 @@ def test_no_point(workspace):
         ("apart", {}, "check the poses, or try --fusion.input photometric"),
         ("apart, with poses that fit", {}, "; try --fusion.input photometric"),
         ("maps lost", {}, "; mend first what left 5 of 6 images without maps: b.png, as it is gone; run again."),
-        ("mask", {}, "--fusion.mask-path leaves out 100%"),
+        ("mask", {}, "--fusion.mask-path leaves out 100 %"),
     ],
 )
 def test_the_advice_names_the_cause(workspace, tmp_path, cause, options, advice):

@@ -390,6 +390,14 @@ def test_what_colmap_cannot_read_is_refused(tmp_path: Path, channels: int) -> No
         ("jpeg2000", cv2.imencode(".jp2", np.zeros((HEIGHT, WIDTH, 3), np.uint8))[1].tobytes()),
         ("HEIC", b"\0\0\0\x1cftypheic\0\0\0\0mif1heicmiaf" + bytes(100)),
         ("AVIF", b"\0\0\0\x1cftypavif\0\0\0\0avifmif1miaf" + bytes(100)),
+        # Sequences of images, and a general brand before the one that tells what they are coded in.
+        *(
+            ("HEIC", b"\0\0\0\x18ftyp" + brand + b"\0\0\0\0msf1" + brand + bytes(100))
+            for brand in (b"hevc", b"hevx", b"heim", b"heis", b"hevm", b"hevs")
+        ),
+        ("HEIC", b"\0\0\0\x18ftypmif1\0\0\0\0mif1heic" + bytes(100)),
+        ("AVIF", b"\0\0\0\x18ftypmif1\0\0\0\0mif1avif" + bytes(100)),
+        ("HEIF", b"\0\0\0\x14ftypmif1\0\0\0\0mif1avif" + bytes(100)),  # what is behind the box is no brand
     ],
 )
 def test_whole_images_of_other_kinds_are_not_called_damaged(tmp_path: Path, kind: str, data: bytes) -> None:

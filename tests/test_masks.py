@@ -21,7 +21,7 @@ from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.pair_files import read_estimate
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
-from colmap_sph.project.masks import read_mask, undistort_mask
+from colmap_sph.project.masks import check_names, read_mask, undistort_mask
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace, mask_path
@@ -190,6 +190,38 @@ def test_masks_that_are_not_used_are_named(tmp_path: Path, caplog: pytest.LogCap
     unused, bare = (record.getMessage() for record in caplog.records)
     assert unused.startswith(f"2 files in {tmp_path / 'masks'} (a_mask.png, c.png) belong to no image")
     assert bare == f"No mask in {tmp_path / 'masks'} for 2 images (a.png, cam/c.png): they are used whole"
+
+
+@pytest.mark.parametrize(
+    ("image", "there", "called"),
+    [
+        ("b\u00e9.png", "be\u0301.png.png", "b\u00e9.png.png"),
+        ("be\u0301.png", "b\u00e9.png", "be\u0301.png"),
+        ("b.png", "B.PNG.png", "b.png.png"),
+    ],
+)
+@pytest.mark.parametrize("others", [NAMES[2:], []])
+def test_masks_in_another_spelling(tmp_path: Path, image: str, there: str, called: str, others: list[str]) -> None:
+    """Accents in two ways look alike, and the image would be used whole; also where it is not the only mask."""
+    sparse = make_project(tmp_path)
+    model = pycolmap.Reconstruction(sparse)
+    next(each for each in model.images.values() if each.name == "b.png").name = image
+    model.write(sparse)
+    (tmp_path / "images/b.png").rename(tmp_path / "images" / image)
+    write_masks(tmp_path / "masks", others)
+    write_masks(tmp_path / "masks", [there.removesuffix(".png")])
+    with pytest.raises(InputError) as error:
+        prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
+    assert f"mask {there!a} in " in str(error.value) and f"called {called!a} " in str(error.value)
+    with pytest.raises(InputError):
+        check_names(tmp_path / "masks", [image, *NAMES[2:]], tmp_path / "images")
+    assert not (tmp_path / "dense").exists()
+
+
+def test_images_that_differ_in_case_alone(tmp_path: Path) -> None:
+    """Where files do: the mask of one is not that of the other."""
+    write_masks(tmp_path / "masks", ["a.jpg"])
+    check_names(tmp_path / "masks", ["a.jpg", "A.jpg"], tmp_path)
 
 
 def test_masks_beside_their_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -244,7 +244,7 @@ def all_around() -> Scene:
     [
         (in_one_place(), "cameras stand in one place"),
         (all_around(), "nothing that stands out"),
-        (block_with_details(140, np.random.default_rng(5))[0], "20% of the images look elsewhere"),
+        (block_with_details(140, np.random.default_rng(5))[0], "20 % of the images look elsewhere"),
         (at_one_point(), "all sparse points in one place"),
         (replace(in_one_place(), points=np.zeros((0, 3)), views=()), "the model has 0"),
     ],

@@ -5,6 +5,8 @@ import json
 import os
 import pkgutil
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +22,7 @@ from projects import FOUR_NAMES, FOUR_SIZE, read_picture, render_four_images
 import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
 from colmap_sph.pipeline import memory
+from colmap_sph.pipeline.forecast.within import START_SECONDS
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
@@ -744,6 +747,17 @@ def test_plan_of_a_new_workspace(project: Path) -> None:
     assert 0.05 < plan.seconds / sum(report.seconds.values()) < 10
 
 
+def test_plan_of_few_small_images(project: Path) -> None:
+    """Most of the time goes to the program's start, and to the page."""
+    plan = make_plan(Project(project / "sparse/0"), replace(OPTIONS, threads=1))
+    before = os.times()
+    command = [sys.executable, "-P", "-m", "colmap_sph", "run", "--model", "sparse/0", "--threads", "1"]
+    subprocess.run(command, cwd=project, check=True, capture_output=True)
+    after = os.times()
+    taken = after.children_user + after.children_system - before.children_user - before.children_system
+    assert 0.4 < plan.seconds / taken < 4
+
+
 def test_plan_of_reduced_images(project: Path) -> None:
     whole = make_plan(Project(project / "sparse/0"), OPTIONS)
     reduced = replace(OPTIONS, undistortion=UndistortionOptions(max_image_size=WIDTH // 2))
@@ -774,7 +788,7 @@ def test_plan_of_a_finished_workspace(finished: Finished) -> None:
         assert not plan.undistort and not plan.fuse
         assert plan.pairs == plan.pairs_done == 6
         assert plan.images == plan.images_done == 4
-        assert plan.seconds == plan.disk == 0
+        assert plan.disk == 0 and plan.seconds == START_SECONDS
         fresh = make_plan(project, OPTIONS, overwrite=True)
         assert fresh.undistort == (project.model is not None)
         assert fresh.fuse and fresh.pairs_done == fresh.images_done == 0

@@ -29,6 +29,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.fuse import ColmapFuseStage, fuse_stage
 from colmap_sph.pipeline.stages.fusion_parts import PartsStage
 from colmap_sph.pipeline.stages.match import MatchStage
+from colmap_sph.pipeline.stages.pair_files import read_pair, write_pair
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage, keys_of
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.scene_reader import read_scene
@@ -42,6 +43,8 @@ from colmap_sph.stereo.partners.stations import OWN_STATION, Stations
 
 NAMES = FOUR_NAMES
 OPTIONS = RunOptions(threads=2)
+# Of what is no array, in a stage's work.
+SMALL_BYTES = 20_000
 Item = TypeVar("Item", bound=Hashable)
 Task = TypeVar("Task")
 
@@ -191,15 +194,35 @@ def peak_of(make: Callable[[], object]) -> int:
         tracemalloc.stop()
 
 
-def test_a_vote_takes_what_is_reserved(project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without maps that nobody asked for: measured."""
+def stretch_pair(path: Path, key: str, rows: float, right: float) -> None:
+    """Give a pair many more rows and columns, and its right image again more columns; it matches nowhere."""
+    pair = read_pair(path, key)
+    geometry = pair.geometry.resampled(rows)
+    geometry = replace(geometry, right_width=int(geometry.right_width * right))
+    disparity = np.full((geometry.height, geometry.left_width), np.nan, np.float32)
+    write_pair(path, replace(pair, geometry=geometry, disparity=disparity), key)
+
+
+@pytest.mark.parametrize(("rows", "right"), [(1.0, 1.0), (4.0, 1.0), (3.0, 0.3), (2.0, 3.0)])
+def test_a_vote_takes_what_is_reserved(
+    project: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rows: float, right: float
+) -> None:
+    """Without maps that nobody asked for: measured; also where those of pairs are larger than the image."""
     monkeypatch.setattr(vote, "_BAND_BYTES", 1 << 14)  # the image is smaller than a band otherwise
     stage = finished_stages(project)[1]
-    for item in stage.items:
-        job = asked(stage, item)
-        task = replace(job.task, estimate=tmp_path / item)
-        peak = peak_of(partial(stage.make, task))
-        assert 0.5 * job.cost.memory < peak < job.cost.memory
+    tasks = {item: asked(stage, item).task for item in stage.items}
+    keys = {path: key for task in tasks.values() for path, key in zip(task.pairs, task.pair_keys, strict=True)}
+    as_matched = {path: path.read_bytes() for path in keys}
+    try:
+        for path, key in keys.items():
+            stretch_pair(path, key, rows, right)
+        for item in stage.items:
+            job = asked(stage, item)
+            peak = peak_of(partial(stage.make, replace(job.task, estimate=tmp_path / item)))
+            assert 0.5 * job.cost.memory < peak < job.cost.memory + SMALL_BYTES
+    finally:
+        for path, content in as_matched.items():
+            path.write_bytes(content)
 
 
 def test_partners_that_stand_beside_a_view_cost_it_nothing(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -208,14 +208,16 @@ def test_files_get_no_bars_boxes_or_colours(
     with Display(terminal) as shown:
         shown.start("fuse", 1)
         shown.advance()
-    terminal.table("Depth maps", ["image", "coverage"], [("a.jpg", "90.0%"), ("long name.jpg", "5.0%")], "caption")
+    terminal.table(
+        "Depth maps", ["image", "coverage"], [("a.jpg", "90.0 %"), ("long name.jpg", "5.0 %")], "caption"
+    )
     terminal.say("words", label="error:", style="bold red")
     said = capsys.readouterr().err.splitlines()
     assert said[1:] == [
         "Depth maps",
         "image          coverage",
-        "a.jpg          90.0%",
-        "long name.jpg  5.0%",
+        "a.jpg          90.0 %",
+        "long name.jpg  5.0 %",
         "caption",
         "error: words",
     ]
@@ -252,7 +254,7 @@ SUMMARY = """
     terminal = Terminal()
     names = [f"survey of the village/2024-05-01/camera {side}/IMG_{number:05d}.jpg"
              for side in ("left", "right") for number in range(3)]
-    terminal.table("Depth maps", ["image", "coverage", "agreement"], [(name, "90.1%", "99.5%") for name in names])
+    terminal.table("Depth maps", ["image", "coverage", "agreement"], [(n, "90.1 %", "99.5 %") for n in names])
     terminal.facts([("seconds", "48.5 (check originals 0.1, match pairs 34.8, vote on depth 4.6, fuse 2.4)"),
                     ("cloud", "939,782 points in " + "/data/some/where" * 10 + "/fused.ply")])
 """

@@ -110,7 +110,7 @@ def test_a_batch_of_all_kinds(tmp_path: Path, stub: Path) -> None:
     assert "==== 4 projects, 2 failed" in done.stdout
     rows = [line.split("\t") for line in (root / "colmap_sph_batch.tsv").read_text().splitlines()]
     found = {row[0].removeprefix(f"{root}/"): row[1:] for row in rows[1:]}
-    numbers = ["2", "1234", "75.0%", "12", ""]
+    numbers = ["2", "1234", "75.0 %", "12", ""]
     assert found == {
         "one/sparse/0": ["done", *numbers, ""],
         "one/sparse/1": ["incomplete", *numbers, "c.jpg: it is missing"],
@@ -270,7 +270,7 @@ def test_snakemake_with_models_of_all_kinds(tmp_path: Path, stub: Path) -> None:
         )
     }
     assert sorted(stub.read_text().splitlines()) == sorted(calls)
-    numbers = ["2", "1234", "75.0%", "12", ""]
+    numbers = ["2", "1234", "75.0 %", "12", ""]
     expected = {
         "one/sparse/0": ["done", *numbers, ""],
         "one/sparse/1": ["incomplete", *numbers, "c.jpg: it is missing"],
@@ -350,4 +350,4 @@ def test_one_damaged_report_does_not_cost_the_summary(tmp_path: Path, damaged: s
     assert done.returncode == 1 and "Traceback" not in done.stderr
     rows = [line.split("\t") for line in (tmp_path / "list.tsv").read_text().splitlines()]
     assert rows[1][:2] == ["a/sparse/0", "FAILED (?)"]
-    assert rows[2][:6] == ["b/sparse/0", "done", "7", "70", "0.0%", "42"]
+    assert rows[2][:6] == ["b/sparse/0", "done", "7", "70", "0.0 %", "42"]

@@ -46,7 +46,7 @@ class Project:
             result,
             str(report.get("images", "")),
             str(report.get("points", "")),
-            f"{sum(coverage.values()) / max(len(coverage), 1):.1%}",
+            f"{100 * sum(coverage.values()) / max(len(coverage), 1):.1f} %",
             f"{_seconds(report):.0f}",
             " ".join(folder.name for folder in self.products()),
             "; ".join(f"{name}: {reason}" for name, reason in missing.items()),

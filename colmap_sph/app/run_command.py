@@ -23,7 +23,7 @@ from colmap_sph.app.option_list import option_groups, print_options
 from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.spelling import EVERYDAY
 from colmap_sph.app.terminal import Terminal
-from colmap_sph.errors import counted, shell_word
+from colmap_sph.errors import counted, percent, shell_word
 from colmap_sph.pipeline.forecast.time_limit import DIALS, TimeLimit, changed_dials, format_time, parse_time
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import Plan, make_plan
@@ -223,14 +223,14 @@ def print_plan(plan: Plan, workspace: Workspace, terminal: Terminal) -> None:
 
 
 def _share(value: float | None) -> str:
-    return "" if value is None else f"{value:.1%}"
+    return "" if value is None else percent(value)
 
 
 def _agreement(report: RunReport) -> str:
     """How far the depth maps agree with the sparse points."""
     if report.overall_agreement is None:
         return "no sparse points to check against"
-    return f"{report.overall_agreement:.1%} of the sparse points agree with the depth maps"
+    return f"{percent(report.overall_agreement)} of the sparse points agree with the depth maps"
 
 
 def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -> None:
@@ -245,7 +245,7 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
     """
     listed = sorted(report.coverage.items(), key=lambda item: item[1])
     rows = [
-        (name, f"{share:.1%}", _share(report.agreement.get(name)))
+        (name, percent(share), _share(report.agreement.get(name)))
         for name, share in sorted(listed[:_MAX_LISTED_IMAGES])
     ]
     caption = f"the {_MAX_LISTED_IMAGES} least covered of {len(listed)} images" if len(listed) > len(rows) else ""
@@ -268,10 +268,10 @@ def print_summary(report: RunReport, workspace: Workspace, terminal: Terminal) -
 def _facts(report: RunReport, workspace: Workspace) -> Iterator[tuple[str, str]]:
     """What a run did, with the names by which the summary calls it."""
     mean = sum(report.coverage.values()) / max(len(report.coverage), 1)
-    yield "images", f"{report.images} with depth maps, mean coverage {mean:.1%}"
+    yield "images", f"{report.images} with depth maps, mean coverage {percent(mean)}"
     if report.originals:
         mean = sum(report.originals.values()) / len(report.originals)
-        yield "originals", f"{len(report.originals)} of which these are views, mean coverage {mean:.1%}"
+        yield "originals", f"{len(report.originals)} of which these are views, mean coverage {percent(mean)}"
     if report.region is not None:
         left = f"; {len(report.out_of_region)} left out that see too little of it" if report.out_of_region else ""
         yield "region", f"in {counted(len(report.coverage), 'image')}, of whose pixels in it coverage is{left}"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Mapping, Sequence
-from math import nan
+from math import inf, nan
 from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.errors import NoResultError, printable, unwritable
+from colmap_sph.errors import NoResultError, percent, printable, unwritable
 from colmap_sph.evaluation.cloud_scores import CloudScores
 from colmap_sph.evaluation.depth_maps import DepthMapScores
 from colmap_sph.platforms.files import move_into_place, write_text
@@ -22,7 +23,7 @@ def format_clouds(scores: Sequence[CloudScores], width: int | None = None) -> st
     ----------
     scores : sequence of CloudScores
     width : int, optional
-        Most columns of text; the columns of a table that has more are put below each other.
+        Most columns of text; where a table has more, what is told of each distance goes below the rest.
 
     Returns
     -------
@@ -31,6 +32,7 @@ def format_clouds(scores: Sequence[CloudScores], width: int | None = None) -> st
     if not scores:
         return ""
     header = ["cloud", "points", "judged", "mean [m]", "std [m]"]
+    groups = [len(header) - 1, *(3 for _ in scores[0].thresholds)]
     for threshold in scores[0].thresholds:
         label = _tau_label(threshold.tau, scores[0].gsd)
         header += [f"acc {label}", f"comp {label}", f"F {label}"]
@@ -40,7 +42,9 @@ def format_clouds(scores: Sequence[CloudScores], width: int | None = None) -> st
     lines = [f"reference: {printable(first.reference)}, {samples}"]
     if first.cloud_to_reference.cap is not None:
         lines.append(f"distances above {first.cloud_to_reference.cap:g} m count as that")
-    return "\n".join([*lines, "", _aligned(rows, width), "", *(_registration_line(cloud) for cloud in scores)])
+    return "\n".join(
+        [*lines, "", _aligned(rows, width, groups), "", *(_registration_line(cloud) for cloud in scores)]
+    )
 
 
 def format_depth_maps(scores: Mapping[str, DepthMapScores], width: int | None = None) -> str:
@@ -50,13 +54,13 @@ def format_depth_maps(scores: Mapping[str, DepthMapScores], width: int | None = 
     first = next(iter(scores.values()))
     header = ["image", "coverage", *(f"<= {bound:g} GSD" for bound in first.thresholds), "median [GSD]"]
     with_normals = first.median_normal_angle is not None
-    rows = [header + (["normals (deg)"] if with_normals else [])]
+    rows = [header + (["normals [deg]"] if with_normals else [])]
     means = mean_of_depth_maps(scores)
     for name, one in [*scores.items(), ("mean", means)]:
         row = [
             name,
-            _percent(one.coverage),
-            *(_percent(share) for share in one.within),
+            percent(one.coverage, 2),
+            *(percent(share, 2) for share in one.within),
             f"{one.median_error:.3f}",
         ]
         if with_normals:
@@ -120,7 +124,7 @@ def _cloud_row(scores: CloudScores) -> list[str]:
         f"{distance.standard_deviation:.4f}",
     ]
     for threshold in scores.thresholds:
-        row += [_percent(threshold.accuracy), _percent(threshold.completeness), _percent(threshold.f_score)]
+        row += [percent(threshold.accuracy, 2), percent(threshold.completeness, 2), percent(threshold.f_score, 2)]
     return row
 
 
@@ -134,7 +138,7 @@ def _registration_line(scores: CloudScores) -> str:
         f"{name}: {'registered' if registration.applied else 'registration NOT applied'}, "
         f"rotation {registration.rotation_degrees:.4f} deg, shift ({shift}) m, "
         f"rms {registration.rms_before:.4f} -> {registration.rms_after:.4f} m, "
-        f"{_percent(registration.inlier_share)} of the points paired"
+        f"{percent(registration.inlier_share, 2)} of the points paired"
     )
 
 
@@ -142,12 +146,11 @@ def _tau_label(tau: float, gsd: float | None) -> str:
     return f"{tau:g} m" if gsd is None else f"{tau / gsd:g} GSD"
 
 
-def _percent(share: float) -> str:
-    return f"{100 * share:.2f} %"
+def _aligned(rows: Sequence[Sequence[str]], width: int | None = None, groups: Sequence[int] | None = None) -> str:
+    """Columns to the right, the first to the left; where they need more than `width`, groups below each other.
 
-
-def _aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> str:
-    """Columns to the right, the first to the left; where they need more than `width`, below each other."""
+    Groups are of so many columns, all but the first; without them each column is one.
+    """
     texts = list(zip(*([printable(cell) for cell in row] for row in rows), strict=True))
     widths = [max(map(len, column)) for column in texts]
     columns = [
@@ -155,20 +158,28 @@ def _aligned(rows: Sequence[Sequence[str]], width: int | None = None) -> str:
         for number, (column, each) in enumerate(zip(texts, widths, strict=True))
     ]
     parts = []
-    for numbers in _parts(widths, width):
+    for numbers in _parts(widths, inf if width is None else width, groups or [1] * (len(widths) - 1)):
         chosen = [columns[0], *(columns[number] for number in numbers)]
         parts.append("\n".join("  ".join(cells).rstrip() for cells in zip(*chosen, strict=True)))
     return "\n\n".join(parts)
 
 
-def _parts(widths: Sequence[int], width: int | None) -> list[list[int]]:
+def _parts(widths: Sequence[int], width: float, groups: Sequence[int]) -> list[list[int]]:
     """Which columns stand side by side, behind the first one."""
     parts: list[list[int]] = [[]]
     taken = widths[0]
-    for number, each in enumerate(widths[1:], start=1):
-        if width is not None and parts[-1] and taken + 2 + each > width:
-            parts.append([])
-            taken = widths[0]
-        parts[-1].append(number)
-        taken += 2 + each
+    for first, size in zip(itertools.accumulate(groups, initial=1), groups, strict=False):
+        group = [*range(first, first + size)]
+        is_too_wide = widths[0] + _needed(widths, group) > width
+        for numbers in [[number] for number in group] if is_too_wide else [group]:
+            needed = _needed(widths, numbers)
+            if parts[-1] and taken + needed > width:
+                parts.append([])
+                taken = widths[0]
+            parts[-1] += numbers
+            taken += needed
     return parts
+
+
+def _needed(widths: Sequence[int], numbers: Sequence[int]) -> int:
+    return sum(2 + widths[number] for number in numbers)

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from colmap_sph import errors
+
 
 def cell(value: float | None, text: str) -> dict[str, Any]:
     """Text of a cell, and what its column is sorted by."""
@@ -10,7 +12,7 @@ def cell(value: float | None, text: str) -> dict[str, Any]:
 
 def percent(share: float | None, nothing: str = "–") -> str:
     """Such as 12.3 %."""
-    return nothing if share is None else f"{100 * share:.1f} %"
+    return nothing if share is None else errors.percent(share)
 
 
 def plain(value: float | None, form: str) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from colmap_sph.pipeline.forecast.sizes import affordable_size
 from colmap_sph.pipeline.forecast.survey import StagePlan, Survey, foresee
 from colmap_sph.pipeline.forecast.time_limit import TimeLimit
-from colmap_sph.pipeline.forecast.within import Within, widest
+from colmap_sph.pipeline.forecast.within import START_SECONDS, Within, page_seconds, widest
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import with_polished_poses
 from colmap_sph.pipeline.reconstruct import check_input, go_through_stages
@@ -42,7 +42,7 @@ class Plan:
     fuse : bool
         Whether the cloud is to be made.
     seconds : float
-        Estimated wall time.
+        Estimated wall time, with that of the program's start and, where anything is to do, of its page.
     memory, disk : float
         Estimated largest memory in use, and space for files to be made, in bytes.
     free_disk : int
@@ -105,7 +105,7 @@ def make_plan(
         context = with_polished_poses(context, selection.unique_pairs(), survey, foreseen.given)
     pairs_to_match = selection.unique_pairs()
     if limit is not None:
-        within = Within(limit.begun(survey.seconds), context, selection, goes_on=not overwrite)
+        within = Within(limit.begun(START_SECONDS + survey.seconds), context, selection, goes_on=not overwrite)
         context, pairs_to_match, chosen = within.planned()
         choice = f"{choice} {chosen.words}".lstrip()
     go_through_stages(context, pairs_to_match, survey, is_plan=True)
@@ -119,7 +119,7 @@ def make_plan(
         images=maps.total,
         images_done=maps.done,
         fuse=cloud.done < cloud.total,
-        seconds=survey.seconds,
+        seconds=START_SECONDS + survey.seconds + (page_seconds(maps.total) if survey.seconds else 0.0),
         memory=max(stage.memory for stage in stages),
         disk=sum(stage.disk for stage in stages),
         free_disk=free_space(project.root),

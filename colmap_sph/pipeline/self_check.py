@@ -6,7 +6,7 @@ from statistics import median
 
 import numpy as np
 
-from colmap_sph.errors import NoResultError
+from colmap_sph.errors import NoResultError, percent
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.scene import Scene, View
@@ -73,12 +73,12 @@ def judge_agreement(report: RunReport, *, misplaced: float, in_sight: float = 1.
         if share < _DOUBTED_SHARE or of_found.get(name, usual) < _DOUBTED_OF_USUAL * usual
     }
     if misplaced > 0.5 and in_sight < 0.5:
-        report.refusal = _refusal_of_misplaced(f"only {in_sight:.0%} of them into these images at all")
+        report.refusal = _refusal_of_misplaced(f"only {percent(in_sight, 0)} of them into these images at all")
     elif not total.tested:
         logger.info("There are no sparse points to check the depth maps against")
     elif is_enough and misplaced > 0.5 and total.agreeing < _REFUSED_SHARE_OF_MISPLACED * total.tested:
         share = total.agreeing / total.tested
-        report.refusal = _refusal_of_misplaced(f"only {share:.1%} of them agree with the depth maps")
+        report.refusal = _refusal_of_misplaced(f"only {percent(share)} of them agree with the depth maps")
     elif is_enough and total.agreeing < _REFUSED_SHARE * total.tested:
         is_right = total.agreeing >= _RIGHT_SHARE_OF_FOUND * total.found
         if is_right and total.agreeing >= _LEAST_SHARE * total.tested:
@@ -192,8 +192,9 @@ def refuse_cameras(scene: Scene) -> None:
     if 2 * sum(share > _IMPOSSIBLE_SHARE for share in shares) > len(shares):
         raise NoResultError(
             "Sparse points do not project to where most images observe them, and no other size or crop of the "
-            f"images explains it: {median(shares):.0%} of their longer side is left. Cameras, poses or points of "
-            "the model were changed apart from each other; give the model as it was adjusted, with its cameras."
+            f"images explains it: {percent(median(shares), 0)} of their longer side is left. Cameras, poses or "
+            "points of the model were changed apart from each other; give the model as it was adjusted, with its "
+            "cameras."
         )
 
 
@@ -256,10 +257,10 @@ def add_doubt(report: RunReport, words: str) -> None:
 
 def _refusal(total: Agreement) -> str:
     return (
-        f"Only {total.agreeing / total.tested:.1%} of the sparse points agree with the depth maps of the images "
-        "that observe them: these images do not belong to the poses and cameras of the model (exchanged, turned, "
-        "mirrored, cropped, or of another model), or hardly anything could be matched; check --images. What was "
-        "made is left on disk."
+        f"Only {percent(total.agreeing / total.tested)} of the sparse points agree with the depth maps of the "
+        "images that observe them: these images do not belong to the poses and cameras of the model (exchanged, "
+        "turned, mirrored, cropped, or of another model), or hardly anything could be matched; check --images. "
+        "What was made is left on disk."
     )
 
 
@@ -273,14 +274,14 @@ def _refusal_of_misplaced(fact: str) -> str:
 
 def _hardly_matched(total: Agreement) -> str:
     return (
-        f"Hardly anything could be matched: only {total.found / total.tested:.1%} of the sparse points that the "
-        f"images observe have a depth, of which {total.agreeing / total.found:.0%} agree."
+        f"Hardly anything could be matched: only {percent(total.found / total.tested)} of the sparse points that "
+        f"the images observe have a depth, of which {percent(total.agreeing / total.found, 0)} agree."
     )
 
 
 def _doubts(doubted: Mapping[str, float]) -> str:
     shares = sorted((share, name) for name, share in doubted.items())
-    named = _named([f"{name} ({share:.0%})" for share, name in shares])
+    named = _named([f"{name} ({percent(share, 0)})" for share, name in shares])
     return (
         "Few of the sparse points that these images observe agree with their depth maps, or far fewer than in the "
         f"other images: {named}. Their poses, cameras or pixels may not be those of the model, or they could "

@@ -6,16 +6,17 @@ used whole.
 """
 
 import logging
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path, PurePosixPath
 
 import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError, reason_of
+from colmap_sph.errors import InputError, counted, reason_of
 from colmap_sph.project.files import atomic_file, make_dir, real_path
+from colmap_sph.project.given.image_places import files_below, other_spellings, told_from
 from colmap_sph.project.images.decoding import read_pixels
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.reading import fitted, image_problem
@@ -97,7 +98,7 @@ def check_masks(
     ------
     InputError
         The folder does not exist or holds no mask for any of the images, or a mask cannot be read, is not of its
-        image's size, or is the image itself.
+        image's size, is the image itself, or is called as its image's in another spelling.
     """
     if not folder.is_dir():
         raise InputError(f"The mask folder {folder} does not exist; check --masks.")
@@ -108,10 +109,13 @@ def check_masks(
         for name, camera in cameras.items()
         if read_mask(mask_path(folder, name), camera.width, camera.height) is not None
     ]
+    names = [*cameras, *others]
+    unused = _unused_masks(folder, names, image_dir)
+    _refuse_misspelled(folder, names, unused)
     if not masked:
         name = min(cameras)
         raise InputError(f"{folder} holds no mask for any image; that of {name} must be {folder / name}.png.")
-    warn_of_unused_masks(folder, [*cameras, *others], image_dir)
+    _warn_of_unused(folder, unused)
     bare = sorted(set(cameras) - set(masked))
     if bare:
         they_are = "it is" if len(bare) == 1 else "they are"
@@ -129,18 +133,50 @@ def _refuse_images(folder: Path, names: Iterable[str]) -> None:
             )
 
 
-def warn_of_unused_masks(folder: Path, names: Iterable[str], image_dir: Path) -> None:
-    """Report files in a folder of masks that belong to none of the images `names`."""
+def check_names(folder: Path, names: Iterable[str], image_dir: Path) -> None:
+    """Do what `check_masks` does of the names of masks alone: warn of files that belong to no image.
+
+    Raises
+    ------
+    InputError
+        One is called as its image's mask is, but in another spelling.
+    """
     names = list(names)
+    unused = _unused_masks(folder, names, image_dir)
+    _refuse_misspelled(folder, names, unused)
+    _warn_of_unused(folder, unused)
+
+
+def _unused_masks(folder: Path, names: Sequence[str], image_dir: Path) -> list[str]:
+    """Files in a folder of masks that belong to none of the images; none where there is much that is no mask."""
     known = {mask_path(folder, name) for name in names}
     if real_path(folder) == real_path(image_dir):
         known |= {folder / name for name in names}
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file() and path not in known)
-    unused = [
-        path.relative_to(folder).as_posix()
-        for path in files
-        if not path.name.startswith(".") and path.name not in _NO_MASKS
+    files = (PurePosixPath(file) for file in sorted(files_below(folder, len(names)) or []))
+    return [
+        str(file)
+        for file in files
+        if folder / file not in known and not file.name.startswith(".") and file.name not in _NO_MASKS
     ]
+
+
+def _refuse_misspelled(folder: Path, names: Iterable[str], unused: Iterable[str]) -> None:
+    """Raise `InputError` for a mask that would not be used, as its image is spelled in another way."""
+    bare = [name for name in names if not mask_path(folder, name).exists()]
+    usual = {f"{name}.png": name for name in bare}
+    others = {str(PurePosixPath(name).with_suffix(".png")): name for name in bare if PurePosixPath(name).suffix}
+    wanted = others | usual
+    spelled = other_spellings(unused, wanted)
+    if spelled:
+        right, there = min(spelled.items())
+        raise InputError(
+            f"The mask {told_from(right, there)} in {folder} would not be used, as its image's is called "
+            f"{told_from(there, right)} (so for {counted(len(spelled), 'mask')}); rename the masks as "
+            "their images."
+        )
+
+
+def _warn_of_unused(folder: Path, unused: list[str]) -> None:
     if unused:
         belong = "belongs" if len(unused) == 1 else "belong"
         logger.warning(

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, percent
 from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.depth import Depths
 from colmap_sph.stereo.partners.observers import observers_of_points
@@ -173,9 +173,9 @@ def check_some_maps(
             agreeing += right
     if found >= _FEWEST_FOUND and agreeing < _LEAST_OF_FOUND * found:
         raise InputError(
-            f"The depth maps in {maps} are not of the model in {model}: only {agreeing / found:.1%} of its sparse "
-            "points that have a depth there agree with it. Was the model scaled, aligned or replaced after they "
-            "were made? Put back the one they were made with, or make them again."
+            f"The depth maps in {maps} are not of the model in {model}: only {percent(agreeing / found)} of its "
+            "sparse points that have a depth there agree with it. Was the model scaled, aligned or replaced after "
+            "they were made? Put back the one they were made with, or make them again."
         )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph import _native
+from colmap_sph.errors import percent
 from colmap_sph.scene import Scene, View, pixel_transfer
 from colmap_sph.stereo.fusion import FusionOptions
 from colmap_sph.stereo.partners.pairs import overlapping_views
@@ -54,10 +55,12 @@ class GateLosses:
         lacking : str
             How many images are without maps, where most are, and why; else empty.
         """
+        shares = (self.kept, self.unseen, self.few, self.depth, self.reprojection, self.normal)
+        kept, unseen, few, depth, reprojection, normal = (percent(share, 0) for share in shares)
         return (
-            f"Of the pixels with a depth {self.kept:.0%} find enough agreeing pixels, {self.unseen:.0%} are seen "
-            f"by no other depth map, {self.few:.0%} by too few that agree, and the rest fail the gates of "
-            f"depth ({self.depth:.0%}), reprojection ({self.reprojection:.0%}) and normal ({self.normal:.0%}); "
+            f"Of the pixels with a depth {kept} find enough agreeing pixels, {unseen} are seen by no other depth "
+            f"map, {few} by too few that agree, and the rest fail the gates of depth ({depth}), reprojection "
+            f"({reprojection}) and normal ({normal}); "
             f"{self._remedy(options, poses_fit, lacking)}."
         )
 

@@ -194,6 +194,7 @@ def vote_depth(
             sources.append((pair.disparity, pair.geometry, "left"))
         else:
             sources.append((right_disparity(pair, options.max_disparity_step), pair.geometry, "right"))
+        del pair  # before the next one is read
     shape = (view.height, view.width)
     voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
     numbers = np.arange(len(sources)) if stations is None else np.asarray(stations)

@@ -1,6 +1,5 @@
-"""Scenes with exact depth for the study: the shared block, and rendered ones."""
+"""Rendered scenes with exact depth for the study."""
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,10 +8,9 @@ from typing import Literal
 import numpy as np
 
 from colmap_sph import synthetic as syn
-from colmap_sph.errors import OptionError
 
-SceneName = Literal["penta", "walk", "drive", "town"]
-"""The shared block; a street passed with a picture every metre, and every 2.8; a convergent oblique block."""
+SceneName = Literal["walk", "drive", "town"]
+"""A street passed with a picture every metre, and every 2.8; a convergent oblique block."""
 
 
 @dataclass(frozen=True)
@@ -21,24 +19,23 @@ class StudyScene:
 
     Attributes
     ----------
-    model, images, exact_depth : Path
+    model : Path
+    images : Path, optional
+        Default: the folder `images` beside or above the model.
+    exact_depth : Path
         Exact depth at pixel centres.
     depth_scale : float, optional
         Of integer depth maps.
-    lidar : Path, optional
     """
 
     model: Path
-    images: Path
+    images: Path | None
     exact_depth: Path
     depth_scale: float | None = None
-    lidar: Path | None = None
 
 
 def find_scene(name: SceneName, folder: Path, width: int, threads: int = 1) -> StudyScene:
-    """Render a scene into a folder unless it is there; the shared block is where it is."""
-    if name == "penta":
-        return shared_block()
+    """Render a scene into a folder unless it is there."""
     scene = StudyScene(folder / "sparse" / "0", folder / "images", folder / "depth")
     if not (folder / "done").is_file():
         print(f"rendering {name}, {width} pixels wide, into {folder}", flush=True)
@@ -46,21 +43,6 @@ def find_scene(name: SceneName, folder: Path, width: int, threads: int = 1) -> S
         write_exact_depth(capture.names, capture.cameras, capture.surfaces, scene.exact_depth)
         (folder / "done").touch()
     return scene
-
-
-def shared_block() -> StudyScene:
-    """The shared block `penta`.
-
-    Raises
-    ------
-    OptionError
-        It is not there.
-    """
-    default = Path(__file__).resolve().parents[2].parent / "shared" / "data"
-    penta = Path(os.environ.get("COLMAP_SPH_DATA", default)) / "penta"
-    if not penta.is_dir():
-        raise OptionError(f"the shared block is not at {penta}: set COLMAP_SPH_DATA, or give --model.")
-    return StudyScene(penta / "sparse" / "0", penta / "images", penta / "depth", 0.005, penta / "lidar.laz")
 
 
 def write_exact_depth(

@@ -9,6 +9,7 @@ import tyro
 from colmap_sph.app.display import Display
 from colmap_sph.app.products.opening import opened_on_map
 from colmap_sph.app.terminal import Terminal, print_result
+from colmap_sph.errors import percent
 from colmap_sph.pipeline.memory import budget, parse_memory
 from colmap_sph.products.georeferencing import GeoreferenceOptions
 from colmap_sph.products.surface.options import SurfaceOptions
@@ -49,8 +50,9 @@ def surface_command(command: SurfaceCommand, terminal: Terminal) -> int:
             request = SurfaceRequest(workspace, georeference, command.options, folder, memory, command.overwrite)
             paths, summary = make_surface(request, display.start, display.advance)
     size = f"{summary.width} x {summary.height} cells of {summary.cell:g}"
-    filled = f", {summary.filled:.1%} filled" if summary.filled else ""
-    terminal.say(f"{size}, {summary.covered:.1%} with a measured height{filled}", label="Surface:", style="bold")
+    filled = f", {percent(summary.filled)} filled" if summary.filled else ""
+    covered = f"{percent(summary.covered)} with a measured height"
+    terminal.say(f"{size}, {covered}{filled}", label="Surface:", style="bold")
     for path in paths:
         print_result(str(path))
     return 0

@@ -50,6 +50,8 @@ _ASKED = 8
 # Processor seconds of what follows the last stage, the page: of any run, and of each image.
 _PAGE_SECONDS = 1.8
 _PAGE_SECONDS_EACH = 0.03
+START_SECONDS = 2.0
+"""Of what comes before the first stage, of any run: the program and its libraries are loaded."""
 
 
 def page_seconds(images: int) -> float:

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, percent
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.stages.photo import read_small
@@ -119,6 +119,7 @@ def _words(images: int, share: float, *, keep: bool) -> str:
         "(--masks) would leave them out."
     )
     return (
-        f"{share:.0%} of the pixels of {images} images stand still while the camera turns, as a backdrop, a time "
-        f"stamp or a part of the vehicle would: they are not of the scene, and are {kept if keep else ignored}"
+        f"{percent(share, 0)} of the pixels of {images} images stand still while the camera turns, as a backdrop, "
+        f"a time stamp or a part of the vehicle would: they are not of the scene, and are "
+        f"{kept if keep else ignored}"
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import numpy as np
 from msgspec import Meta
 
-from colmap_sph.errors import counted
+from colmap_sph.errors import counted, percent
 from colmap_sph.pipeline.load_cache import LoadCache
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.platforms.memory import give_back_freed_memory
@@ -216,7 +216,7 @@ def facts_of_cloud(
     masked = found - sum(left.values())
     if masked > _MOSTLY_MASKED * found:
         share = masked / found
-        return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {share:.0%}.")
+        return CloudFacts(points, f"Of the pixels with a depth --fusion.mask-path leaves out {percent(share, 0)}.")
     many = points > 0 and losses.kept > _MOSTLY
     if many:
         return CloudFacts(points, "")

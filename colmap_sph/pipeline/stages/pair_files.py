@@ -126,15 +126,34 @@ def residuals_of(matched: Mapping[Pair, Result]) -> dict[Pair, float]:
     return dict(zip(matched, measured, strict=True))
 
 
-def disparity_bytes(path: Path) -> int:
-    """About the memory that the disparity map of a pair's file takes; 0 where the file is missing.
+def bytes_to_read(path: Path, lead: str) -> tuple[int, int] | None:
+    """Memory for the disparity map that a pair's file holds for one of its images.
 
-    A missing file is for `read_pair` to report: another worker may have found it damaged and removed it.
+    Only the head of the file is read.
+
+    Parameters
+    ----------
+    path : Path
+    lead : str
+        Name of the image, as the pair calls it.
+
+    Returns
+    -------
+    (int, int) or None
+        Bytes of the map, and how many more there are for a moment until it is there: its codes, or the left
+        image's map for the right image. None where the file is missing or damaged, which is for `read_pair` to
+        report: another worker may have found it so and removed it.
     """
+    head = read_head(path)
     try:
-        return 2 * path.stat().st_size  # two bytes per pixel in the file, four in memory
-    except OSError:
-        return 0
+        geometry = None if head is None else _geometry_of(head)
+    except ValueError:
+        geometry = None
+    if head is None or geometry is None:
+        return None
+    left, right = (4 * geometry.height * width for width in (geometry.left_width, geometry.right_width))
+    codes = left // 2
+    return (left, codes) if head.texts[0] == lead else (right, max(left, left + codes - right))
 
 
 def write_estimate(

@@ -14,7 +14,7 @@ from colmap_sph.pipeline.known.remembering import RememberingStage
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import (
-    disparity_bytes,
+    bytes_to_read,
     facts_of_estimate,
     read_estimate,
     read_pair,
@@ -47,9 +47,9 @@ _NORMALS_SECONDS = 0.027
 REGION_MARGIN = 24
 # Bytes on disk per pixel: of the estimate.
 _ESTIMATE_BYTES = 9.0
-# Largest bytes in use at a time, per pixel, beside the pairs' disparity maps: of the estimate (9), one more map as
-# floats and in the codes of its file (6, where it is no larger than the image), and a mask (7); more while maps
-# are made of the estimate, or pixels counted that show a region. And of a disparity map that is not made yet.
+# Largest bytes in use at a time, per pixel, beside the pairs' disparity maps once these are read: of the estimate
+# (9), a band of candidates, and a mask (7); more while maps are made of the estimate, or pixels counted that show
+# a region. And of a disparity map that is not made yet.
 _VOTE_BYTES = 24.0
 _MAPS_BYTES = 45.0
 _DISPARITY_BYTES = 4.0
@@ -242,10 +242,11 @@ class VoteStage(RememberingStage[str, VoteTask]):
         )
         done = self.found(task)
         only_maps = is_voted and done is None  # to make, or to remove
-        return Job(key, done, self._cost(view, window.num_pixels, files, only_maps), task)
+        return Job(key, done, self._cost(view, lead, window.num_pixels, files, only_maps), task)
 
-    def _cost(self, view: View, pixels: int, files: tuple[Path, ...], only_maps: bool) -> Cost:
-        disparities = sum(disparity_bytes(file) or _DISPARITY_BYTES * pixels for file in files)
+    def _cost(self, view: View, lead: str, pixels: int, files: tuple[Path, ...], only_maps: bool) -> Cost:
+        unknown = (_DISPARITY_BYTES * pixels, 0.0)
+        disparities = [bytes_to_read(file, lead) or unknown for file in files]
         seconds = 0.0 if only_maps else vote_seconds(len(files))
         disk = 0.0 if only_maps else _ESTIMATE_BYTES * pixels
         at_once, maps = _VOTE_BYTES if self.context.focus is None else _MAPS_BYTES, 0.0
@@ -253,7 +254,9 @@ class VoteStage(RememberingStage[str, VoteTask]):
             seconds += normals_seconds(self.context.options.normals)
             disk += MAP_BYTES * view.num_pixels
             at_once, maps = _MAPS_BYTES, MAP_BYTES * (view.num_pixels - pixels)
-        return Cost(seconds * pixels / 1e6, at_once * pixels + disparities + maps, disk)
+        memory = max([at_once * pixels + maps, *(reading for _, reading in disparities)])
+        memory += sum(kept for kept, _ in disparities)
+        return Cost(seconds * pixels / 1e6, memory, disk)
 
     @contextmanager
     def opened(self) -> Iterator[None]:

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, percent
 from colmap_sph.products.clouds.source import UNKNOWN, Cloud, CloudPiece, open_cloud
 from colmap_sph.products.maps.reading import at_map_size
 from colmap_sph.project.map_files import depth_on_disk
@@ -42,8 +42,8 @@ def measured_cloud(workspace: Workspace) -> Cloud:
     if sightings >= _FEWEST_SIGHTINGS and shown < _LEAST_SHOWN * sightings:
         raise InputError(
             f"The cloud in {workspace.root} is not of the model in {workspace.sparse_dir}: only "
-            f"{shown / sightings:.1%} of the images that see a point have its surface there. Was the model moved, "
-            "aligned or replaced after the fusion? Fuse again."
+            f"{percent(shown / sightings)} of the images that see a point have its surface there. Was the model "
+            "moved, aligned or replaced after the fusion? Fuse again."
         )
     return replace(cloud, measure=spread.of)
 

@@ -57,7 +57,7 @@ def find_images(model_dir: Path, names: Sequence[str]) -> Path:
     if max(found) > 0:
         return folders[found.index(max(found))]
     for folder in folders:
-        files = _files_below(folder, len(names))
+        files = files_below(folder, len(names))
         misspelled = None if files is None else _common_misspelling(model_dir, folder, files, names)
         if misspelled:
             raise InputError(misspelled)
@@ -97,7 +97,7 @@ def tell_problems(
         No image is left; the message says what is wrong with all of them, where that is one thing.
     """
     missing = [name for name in problems if not os.path.lexists(folder / name)]
-    files = _files_below(folder, num_images) if missing else []
+    files = files_below(folder, num_images) if missing else []
     if files is None and len(missing) == num_images:
         raise InputError(
             f"None of the {num_images} images of {model_dir} is in {folder}, which has many thousands of other "
@@ -113,7 +113,7 @@ def tell_problems(
     spelled = other_spellings(files, missing)
     alike: dict[str, list[str]] = {}
     for name, problem in problems.items():
-        instead = f", but there is {_told_from(name, spelled[name])}" if name in spelled else ""
+        instead = f", but there is {told_from(name, spelled[name])}" if name in spelled else ""
         alike.setdefault(f"{problem}{instead}", []).append(name)
     for words, names in alike.items():
         for name in names if len(names) <= _MOST_TOLD else ():
@@ -157,7 +157,7 @@ def other_spellings(files: Iterable[str], names: Iterable[str]) -> dict[str, str
     return {name: those[0] for name, those in found.items() if len(those) == 1}
 
 
-def _files_below(folder: Path, num_images: int) -> list[str] | None:
+def files_below(folder: Path, num_images: int) -> list[str] | None:
     """The files of a folder and those below it, relative to it; None where there is much that is no image.
 
     Parameters
@@ -181,7 +181,7 @@ def _folded(name: str) -> str:
     return unicodedata.normalize("NFC", name.replace("\\", "/")).casefold()
 
 
-def _told_from(other: str, name: str) -> str:
+def told_from(other: str, name: str) -> str:
     """A name in quotes; with code points where it looks like the other one, as accents written in two ways do."""
     same = unicodedata.normalize("NFC", name) == unicodedata.normalize("NFC", other)
     return ascii(name) if same else repr(name)
@@ -204,9 +204,9 @@ def _common_misspelling(model_dir: Path, folder: Path, files: Sequence[str], nam
         remedy = "rename the files as the model has them"
     name = min(spelled)
     # As it is typed: `repr` doubles each \.
-    called = _told_from(spelled[name], name).replace(r"\\", "\\")
+    called = told_from(spelled[name], name).replace(r"\\", "\\")
     return (
-        f"The model {model_dir} calls an image {called}, and {folder} has {_told_from(name, spelled[name])} "
+        f"The model {model_dir} calls an image {called}, and {folder} has {told_from(name, spelled[name])} "
         f"(so for {len(spelled)} of {len(names)} images); {remedy}."
     )
 

@@ -26,9 +26,16 @@ _PNG_START = b"\x89PNG\r\n\x1a\n"
 # Its first chunk: length, kind, width, height, bits, kind of colours, compression, filter, interlacing, checksum.
 _PNG_HEADER = struct.Struct(">I4sIIBB3xI")
 _PNG_GREY = (0, 4)
-# Of what phones write: a box of this kind behind its length, then the kind of the file.
+# Of what phones write: a box of this kind behind its length, then the file's brands, the second of them a number.
+# They tell what an image or a sequence of them is coded in (ISO/IEC 23008-12, AV1 Image File Format), or not even
+# that.
 _HEIF_BOX = b"ftyp"
-_HEIF_KINDS = dict.fromkeys((b"heic", b"heix", b"mif1", b"msf1"), "HEIC") | {b"avif": "AVIF", b"avis": "AVIF"}
+_HEIF_BYTES = 256
+_HEIF_KINDS = {
+    "AVIF": {b"avif", b"avis"},
+    "HEIC": {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"hevm", b"hevs"},
+    "HEIF": {b"mif1", b"msf1", b"mif2"},
+}
 # Headers with a preview and profiles of colour are mostly shorter.
 _JPEG_HEADER_BYTES = 1 << 17
 # COLMAP leaves out the last channel of two or four: transparency.
@@ -182,8 +189,12 @@ def _starts_with(path: Path, start: bytes) -> bool:
 def _heif_kind(path: Path) -> str | None:
     """What a file of phones is called that OpenImageIO does not know; None: it is none."""
     with path.open("rb") as file:
-        start = file.read(12)
-    return _HEIF_KINDS.get(start[8:]) if start[4:8] == _HEIF_BOX else None
+        start = file.read(_HEIF_BYTES)
+    if start[4:8] != _HEIF_BOX:
+        return None
+    end = int.from_bytes(start[:4], "big")
+    brands = {start[place : place + 4] for place in (8, *range(16, min(end, len(start)), 4))}
+    return next((kind for kind, known in _HEIF_KINDS.items() if brands & known), None)
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, percent
 from colmap_sph.project.wide.layout import WIDEST_PINHOLE, angles_shown
 from colmap_sph.project.wide.projection import MODELS, PANORAMA, Lens, camera_rays, principal_point, turning_angle
 
@@ -85,7 +85,7 @@ def _panorama(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str
     beyond = ((places < 0) | (places > (camera.width, camera.height))).any(axis=1).mean()
     if beyond > _MOST_BEYOND:
         raise InputError(
-            f"Camera {camera.camera_id} ({PANORAMA}) in {name} has {100 * beyond:.0f} % of its observations "
+            f"Camera {camera.camera_id} ({PANORAMA}) in {name} has {percent(beyond, 0)} of its observations "
             f"outside of its images of {camera.width} x {camera.height} pixels; {_WHOLE}"
         )
     cosines = (camera_rays(lens, places) * towards).sum(axis=1)
@@ -121,7 +121,7 @@ def _fisheye(model: pycolmap.Reconstruction, camera: pycolmap.Camera, name: str)
     if beyond.mean() > _MOST_BEYOND:
         raise InputError(
             f"Camera {camera.camera_id} ({camera.model_name}) in {name} cannot have seen "
-            f"{100 * beyond.mean():.0f} % of what it observes: by its parameters it shows nothing beyond "
+            f"{percent(beyond.mean(), 0)} of what it observes: by its parameters it shows nothing beyond "
             f"{np.degrees(turn):.0f} degrees off its axis; calibrate it again, or choose another camera model."
         )
     reach = float(np.arccos(np.clip(rays[~beyond, 2].min(), -1, 1)))

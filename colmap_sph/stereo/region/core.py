@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, percent
 from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.region.inside import is_inside
@@ -95,14 +95,14 @@ def _check_that_it_stands_out(
     around = np.mean([look.share(is_around) for look in looks])
     if shares.mean() < _LEAST_SHARE and around > _MOST_AROUND:
         raise InputError(
-            f"--region auto finds nothing that stands out: what images place best is {shares.mean():.0%} of what "
-            "they look at, and goes over into the rest; give a box as --region, or none."
+            f"--region auto finds nothing that stands out: what images place best is {percent(shares.mean(), 0)} "
+            "of what they look at, and goes over into the rest; give a box as --region, or none."
         )
-    elsewhere = np.mean(shares < _ELSEWHERE)
+    elsewhere = float(np.mean(shares < _ELSEWHERE))
     if elsewhere > _MOST_ELSEWHERE:
         raise InputError(
-            f"--region auto finds no common core: {elsewhere:.0%} of the images look elsewhere than the others; "
-            "give a box as --region, or none."
+            f"--region auto finds no common core: {percent(elsewhere, 0)} of the images look elsewhere than the "
+            "others; give a box as --region, or none."
         )
 
 
