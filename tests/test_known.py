@@ -69,7 +69,7 @@ def test_a_touched_file_is_unknown(tmp_path: Path, file: Path, change: str) -> N
     assert table(tmp_path).find("a", [str(file)]) is None
 
 
-@pytest.mark.parametrize("damage", [b"", b"{}", b'{"key": "input", "check": "", "results": {}}', b"\xff\xfe"])
+@pytest.mark.parametrize("damage", [b"", b"{}", b'{"key": "input", "check": "", "content": {}}', b"\xff\xfe"])
 def test_a_damaged_table_knows_nothing(tmp_path: Path, file: Path, damage: bytes) -> None:
     table(tmp_path).add({"a": Known("key", stamp_of_files([str(file)]), Facts())})
     (tmp_path / "known/table.json").write_bytes(damage)

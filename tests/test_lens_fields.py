@@ -375,6 +375,6 @@ def test_cameras_with_fields_are_kept(tmp_path: Path) -> None:
     nothing = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
     used = Observations([], nothing.track, nothing.view, nothing.pixels, np.empty((0, 3)), 0.1)
     task = CamerasToRefine(model, UndistortionOptions(), NO_SCENE, used, nothing)
-    said, is_refined = refine_cameras(task, 0.5, 0.05, tmp_path / "refined")
-    assert (said, is_refined) == ("The cameras are kept as given: they have lens fields already.", False)
+    said = refine_cameras(task, 0.5, 0.05, tmp_path / "refined")
+    assert said == "The cameras are kept as given: they have lens fields already."
     assert not (tmp_path / "refined").exists()

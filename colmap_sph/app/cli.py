@@ -14,7 +14,6 @@ import tyro
 import colmap_sph
 from colmap_sph.app.colmap.names import is_colmap_command
 from colmap_sph.app.colmap.spelling import spelling_of
-from colmap_sph.app.completion import short_completion
 from colmap_sph.app.display import Display
 from colmap_sph.app.events import Events
 from colmap_sph.app.given_options import all_arguments
@@ -25,7 +24,7 @@ from colmap_sph.app.part_command import part_command
 from colmap_sph.app.refusals import refusals_in_words, refuse_empty_paths
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
-from colmap_sph.app.spelling import flag_of, with_dashed_values
+from colmap_sph.app.spelling import flag_of, short_completion, with_dashed_values
 from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutputError, reason_of
 from colmap_sph.pipeline.forecast.time_limit import process_start

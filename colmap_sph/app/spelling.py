@@ -1,7 +1,9 @@
 """How options are spelled on the command line: everyday ones short, all others behind the name of their stage."""
 
+import io
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
 
 SHORT = {
     "undistortion.max_image_size": "--max-image-size",
@@ -59,6 +61,8 @@ _DASHED = re.compile(r"-(?!h$)[^-\d.]")
 # A box whose first number is negative.
 _NEGATIVE = re.compile(r"-(inf|[\d.])")
 
+_ASKING_FOR_COMPLETION = "--tyro-print-completion"
+
 _FULL = {flag: f"--{place.replace('_', '-')}" for place, flag in SHORT.items()} | _RENAMED
 
 
@@ -106,3 +110,20 @@ def in_full(arguments: Sequence[str]) -> list[str]:
     spelled.pop()
     is_named = any(argument.partition("=")[0] == "--model" for argument in spelled)
     return ["--model", *spelled] if spelled and not spelled[0].startswith("-") and not is_named else spelled
+
+
+@contextmanager
+def short_completion(arguments: Sequence[str]) -> Iterator[None]:
+    """Where a script for completion in shells is asked for, print it with the short spellings."""
+    if not any(argument.startswith(_ASKING_FOR_COMPLETION) for argument in arguments):
+        yield
+        return
+    script = io.StringIO()
+    try:
+        with redirect_stdout(script):
+            yield
+    finally:
+        text = script.getvalue()
+        for place, flag in SHORT.items():
+            text = text.replace(f"--{place.replace('_', '-')}", flag)
+        print(text, end="", flush=True)

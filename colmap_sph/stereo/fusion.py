@@ -9,7 +9,7 @@ number of threads, with the maps of few images in memory, and the cloud is the s
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -222,14 +222,13 @@ def fuse_view(
     reference = replace(reference, image=reference.image[:0].copy())  # may go: `colour` has it
     indices = np.zeros(1 + MAX_PARTNERS, np.uint32)
     indices[0] = reference.index
-    bit = -1
-    for partner in islice(partners, most):  # `enumerate` would keep one while the next is read
-        bit += 1
-        if partner is None:
-            continue
-        indices[1 + bit] = partner.index
-        at_once(*_in_bands(reference, partner, options, bit, covered, agreeing, colour))
-        del partner
+    others = iter(partners)
+    for bit in range(most):
+        partner = next(others, None)
+        if partner is not None:
+            indices[1 + bit] = partner.index
+            at_once(*_in_bands(reference, partner, options, bit, covered, agreeing, colour))
+        del partner  # or it is there while the next is read
     view = reference.view
     step = max(_BAND_PIXELS // shape[1], 1)
     gates = (options.min_num_pixels, _station_bits(stations))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.synthetic.capture import Capture, CaptureOptions, Progress, write_capture
+from colmap_sph.synthetic.capture import Capture, CaptureOptions, write_capture
 from colmap_sph.synthetic.ground import Road, paint_ground
 from colmap_sph.synthetic.light import Light, ShadowMap
 from colmap_sph.synthetic.pairs import look_at, pinhole
@@ -109,13 +109,7 @@ def build_canyon(gsd: float, way: float, seed: int) -> tuple[Surface, ...]:
     return tuple(surfaces)
 
 
-def make_canyon_block(
-    output: Path,
-    options: CanyonOptions | None = None,
-    *,
-    threads: int = 1,
-    progress: Progress | None = None,
-) -> Capture:
+def make_canyon_block(output: Path, options: CanyonOptions | None = None, *, threads: int = 1) -> Capture:
     """Render the street and write it to disk; see `make_demo_block`."""
     options = options or CanyonOptions()
     options.check()
@@ -126,9 +120,7 @@ def make_canyon_block(
     extent = np.array([[x, y, z] for x in (-11.0, 11.0) for y in ends for z in (0.0, 20.0)])
     sun = (-0.55, -0.50, 1.0)
     light = Light(sun, shadows=ShadowMap.cast(surfaces[1:], sun, extent, max(2 * gsd, 0.04)))
-    return write_capture(
-        output, canyon_cameras(options), surfaces, light, options, gsd=gsd, threads=threads, progress=progress
-    )
+    return write_capture(output, canyon_cameras(options), surfaces, light, options, gsd=gsd, threads=threads)
 
 
 def _carriageway(noise: Noise, start: float, end: float, rng: np.random.Generator) -> Plane:

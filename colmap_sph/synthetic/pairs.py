@@ -141,12 +141,11 @@ def slanted_plane_pair(
     tilt: float = 0.0,
     *,
     depth: float = 10.0,
-    baseline: float = 1.0,
     focal_length: float = 400.0,
     size: tuple[int, int] = (320, 240),
     seed: int = 0,
 ) -> SyntheticPair:
-    """Parallel cameras before one textured plane.
+    """Parallel cameras, a metre apart, before one textured plane.
 
     Parameters
     ----------
@@ -157,8 +156,8 @@ def slanted_plane_pair(
         changes along the rows), 90 about the horizontal.
     depth : float
         Depth in metres where the left camera's axis meets the plane.
-    baseline, focal_length : float
-        Metres, pixels.
+    focal_length : float
+        Pixels.
     size : (int, int)
         Width and height in pixels.
     seed : int
@@ -169,7 +168,7 @@ def slanted_plane_pair(
     SyntheticPair
     """
     left = Camera(pinhole(focal_length, *size), np.eye(3), np.zeros(3), *size)
-    right = replace(left, t=np.array([-baseline, 0.0, 0.0]))
+    right = replace(left, t=np.array([-1.0, 0.0, 0.0]))
     angle = np.radians(slant)
     direction = np.radians(tilt)
     normal = (np.sin(angle) * np.cos(direction), np.sin(angle) * np.sin(direction), -np.cos(angle))
@@ -180,9 +179,9 @@ def slanted_plane_pair(
     return SyntheticPair((Plane((0.0, 0.0, depth), normal, material),), left, right, behind_the_camera)
 
 
-def _yard(gsd: float, seed: int) -> tuple[Surface, ...]:
+def _yard(gsd: float) -> tuple[Surface, ...]:
     """A yard with a house, boxes and balls on a floor, closed by a wall: occlusions from every side."""
-    noise = Noise(gsd, seed)
+    noise = Noise(gsd)
     floor = Mottled(noise, (0.50, 0.52, 0.45), 0.22)
     plaster = Mottled(noise, (0.72, 0.66, 0.58), 0.18, offset=(3.1, 7.7))
     roof = Mottled(noise, (0.60, 0.36, 0.28), 0.20, offset=(11.3, 2.9))
@@ -203,7 +202,6 @@ def convergent_pair(
     *,
     focal_length: float = 400.0,
     size: tuple[int, int] = (320, 240),
-    seed: int = 0,
 ) -> SyntheticPair:
     """Two cameras on an arc that look at one place of a yard.
 
@@ -215,8 +213,6 @@ def convergent_pair(
         Pixels.
     size : (int, int)
         Width and height in pixels.
-    seed : int
-        Of the textures.
 
     Returns
     -------
@@ -226,7 +222,7 @@ def convergent_pair(
     half = np.radians(angle) / 2
     eyes = [target + np.array([9.0 * np.sin(turn), -9.0 * np.cos(turn), 2.5]) for turn in (-half, half)]
     left, right = (_camera(eye, target, focal_length, size) for eye in eyes)
-    return SyntheticPair(_yard(_YARD_DEPTH / focal_length, seed), left, right)
+    return SyntheticPair(_yard(_YARD_DEPTH / focal_length), left, right)
 
 
 def forward_motion_pair(
@@ -234,7 +230,6 @@ def forward_motion_pair(
     *,
     focal_length: float = 320.0,
     size: tuple[int, int] = (320, 240),
-    seed: int = 0,
 ) -> SyntheticPair:
     """Motion along the first camera's axis: the epipole is the principal point.
 
@@ -246,8 +241,6 @@ def forward_motion_pair(
         Pixels.
     size : (int, int)
         Width and height in pixels.
-    seed : int
-        Of the textures.
 
     Returns
     -------
@@ -258,7 +251,7 @@ def forward_motion_pair(
     axis = (target - eye) / np.linalg.norm(target - eye)
     left = _camera(eye, target, focal_length, size)
     right = _camera(eye + step * axis, target, focal_length, size)
-    return SyntheticPair(_yard(_YARD_DEPTH / focal_length, seed), left, right)
+    return SyntheticPair(_yard(_YARD_DEPTH / focal_length), left, right)
 
 
 def epipole_inside_pair(
@@ -266,7 +259,6 @@ def epipole_inside_pair(
     *,
     focal_length: float = 320.0,
     size: tuple[int, int] = (320, 240),
-    seed: int = 0,
 ) -> SyntheticPair:
     """Forward and sideways motion with a turn: the epipoles lie inside both pictures, off their middle.
 
@@ -278,8 +270,6 @@ def epipole_inside_pair(
         Pixels.
     size : (int, int)
         Width and height in pixels.
-    seed : int
-        Of the textures.
 
     Returns
     -------
@@ -289,4 +279,4 @@ def epipole_inside_pair(
     motion = np.array([0.2, 0.95, -0.1])
     left = _camera(eye, (0.0, 8.0, 1.2), focal_length, size)
     right = _camera(eye + step * motion, (-0.3, 8.0, 1.4), focal_length, size, up=(0.1, 0.0, 1.0))
-    return SyntheticPair(_yard(_YARD_DEPTH / focal_length, seed), left, right)
+    return SyntheticPair(_yard(_YARD_DEPTH / focal_length), left, right)

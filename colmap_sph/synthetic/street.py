@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from colmap_sph.synthetic.capture import Capture, CaptureOptions, Progress, write_capture
+from colmap_sph.synthetic.capture import Capture, CaptureOptions, write_capture
 from colmap_sph.synthetic.light import Light, ShadowMap
 from colmap_sph.synthetic.pairs import look_at, pinhole
 from colmap_sph.synthetic.primitives import ConvexPolyhedron, Ellipsoid, FloatArray, Plane, Surface
@@ -96,13 +96,7 @@ def build_street(gsd: float, seed: int, blank_contrast: float = 0.0) -> tuple[Su
     return tuple(surfaces)
 
 
-def make_street_block(
-    output: Path,
-    options: StreetOptions | None = None,
-    *,
-    threads: int = 1,
-    progress: Progress | None = None,
-) -> Capture:
+def make_street_block(output: Path, options: StreetOptions | None = None, *, threads: int = 1) -> Capture:
     """Render the street and write it to disk; see `make_demo_block`."""
     options = options or StreetOptions()
     options.check()
@@ -121,7 +115,6 @@ def make_street_block(
         gsd=gsd,
         blank=(BLANK_HOUSE,) if options.blank_contrast == 0 else (),
         threads=threads,
-        progress=progress,
     )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from colmap_sph.synthetic.block import ground_corners
-from colmap_sph.synthetic.capture import Capture, CaptureOptions, Progress, write_capture
+from colmap_sph.synthetic.capture import Capture, CaptureOptions, write_capture
 from colmap_sph.synthetic.light import Light, ShadowMap
 from colmap_sph.synthetic.pairs import look_at, pinhole
 from colmap_sph.synthetic.rays import Camera
@@ -99,13 +99,7 @@ def town_cameras(options: TownOptions) -> dict[str, Camera]:
     return dict(sorted(cameras.items()))
 
 
-def make_town_block(
-    output: Path,
-    options: TownOptions | None = None,
-    *,
-    threads: int = 1,
-    progress: Progress | None = None,
-) -> Capture:
+def make_town_block(output: Path, options: TownOptions | None = None, *, threads: int = 1) -> Capture:
     """Render the town and write it to disk; see `make_demo_block`."""
     options = options or TownOptions()
     options.check()
@@ -121,5 +115,4 @@ def make_town_block(
         options,
         gsd=options.nadir_gsd,
         threads=threads,
-        progress=progress,
     )

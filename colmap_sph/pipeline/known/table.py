@@ -16,12 +16,9 @@ import msgspec
 import xxhash
 
 from colmap_sph.pipeline.digests import stamp_of
+from colmap_sph.pipeline.known.kept import read_kept, write_kept
 from colmap_sph.pipeline.stages.facts import Facts
-from colmap_sph.project.files import atomic_file, folder_locked, make_dir
-from colmap_sph.project.state.records import read_json
-from colmap_sph.project.state.typed import from_json
-
-_MAX_BYTES = 1 << 31
+from colmap_sph.project.files import folder_locked, make_dir
 
 
 class Known(msgspec.Struct, frozen=True, array_like=True):
@@ -30,14 +27,6 @@ class Known(msgspec.Struct, frozen=True, array_like=True):
     key: str
     stamp: str
     facts: Facts
-
-
-class _TableFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A table on disk: the key of the stage's input, a digest of it and of the rest, and `Known` by item."""
-
-    key: str
-    check: str
-    results: msgspec.Raw
 
 
 class ResultTable:
@@ -57,13 +46,7 @@ class ResultTable:
 
     @cached_property
     def _known(self) -> dict[str, Known]:
-        file = read_json(self._path, _TableFile, max_bytes=_MAX_BYTES)
-        if file is None or file.key != self._key or file.check != _check(file.key, file.results):
-            return {}
-        try:
-            return from_json(file.results, dict[str, Known])
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-            return {}
+        return read_kept(self._path, self._key, dict[str, Known]) or {}
 
     def find(self, item: str, files: Iterable[str]) -> Known | None:
         """What is known of an item, whose files are as they were then; None where that is nothing."""
@@ -79,9 +62,7 @@ class ResultTable:
         with folder_locked(self._path.parent):
             # Jobs that share the workspace add theirs. What is lost where there are no locks is found out again.
             there = ResultTable(self._path, self._key)._known
-            content = msgspec.Raw(msgspec.json.encode(there | kept))
-            with atomic_file(self._path, sync=False) as file:  # it can be found out again
-                file.write(msgspec.json.encode(_TableFile(self._key, _check(self._key, content), content)))
+            write_kept(self._path, self._key, there | kept)
 
 
 def stamp_of_files(paths: Iterable[str]) -> str:
@@ -100,7 +81,3 @@ def stamp_of_files(paths: Iterable[str]) -> str:
             return ""
         words += stamp_of(status)
     return xxhash.xxh3_64_hexdigest(repr(words).encode())
-
-
-def _check(key: str, content: msgspec.Raw) -> str:
-    return xxhash.xxh3_128_hexdigest(key.encode() + bytes(content))

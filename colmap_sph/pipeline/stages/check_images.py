@@ -10,20 +10,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import msgspec
-import xxhash
-
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.digests import digest, file_digest, stamp_of
+from colmap_sph.pipeline.known.kept import read_kept, write_kept
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
-from colmap_sph.project.files import atomic_file, make_dir
 from colmap_sph.project.given.image_places import tell_problems
 from colmap_sph.project.images.decoding import is_jpeg
 from colmap_sph.project.images.depth import ValueSample, sample_values
 from colmap_sph.project.images.reading import Problem, image_problem, read_grey
-from colmap_sph.project.state.records import read_json
-from colmap_sph.project.state.typed import from_json
 from colmap_sph.project.workspace import checked_name
 from colmap_sph.stereo.detail import image_detail
 
@@ -31,8 +26,6 @@ if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
 Size = tuple[int, int]
-
-_MAX_BYTES = 1 << 30
 
 # Processor seconds per megapixel, and largest bytes in use per pixel, while an image is decoded: other files than
 # JPEG may hold colours as floating-point numbers.
@@ -91,42 +84,14 @@ class Known:
         return digest(self.digest, self.doubt) if self.doubt else self.digest
 
 
-class KnownFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What is kept of images from run to run.
-
-    Attributes
-    ----------
-    check : str
-        Digest of the code that looked at them, and of the rest.
-    images : dict of str to Known
-        In JSON, by name.
-    """
-
-    check: str
-    images: msgspec.Raw
-
-
 def read_known(path: Path, key: str) -> dict[str, Known]:
     """Read what `write_known` wrote under this key; nothing where the file holds anything else."""
-    file = read_json(path, KnownFile, max_bytes=_MAX_BYTES)
-    if file is None or file.check != _check(key, file.images):
-        return {}
-    try:
-        return from_json(file.images, dict[str, Known])
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
-        return {}
+    return read_kept(path, key, dict[str, Known]) or {}
 
 
 def write_known(path: Path, key: str, images: Mapping[str, Known]) -> None:
     """Keep what is known of images; `OutputError` where that fails."""
-    known = msgspec.Raw(msgspec.json.encode(images))
-    make_dir(path.parent)
-    with atomic_file(path) as file:
-        file.write(msgspec.json.encode(KnownFile(_check(key, known), known)))
-
-
-def _check(key: str, images: msgspec.Raw) -> str:
-    return xxhash.xxh3_128_hexdigest(key.encode() + bytes(images))
+    write_kept(path, key, images, sync=True)  # doubts are not found out again
 
 
 @dataclass(frozen=True)

@@ -104,13 +104,13 @@ def polish_poses(task: PolishTask) -> Facts:
         return _kept(task, "their adjustment does not converge")
     after = scene_of_model(adjusted, folder)
     judgement = judged(held_out, scene, after)
-    advice, is_refined = _advice(task, tracks, scene, judgement)
+    advice = _advice(task, tracks, scene, judgement)
     reason = judgement.refusal(task.options.least_gain)
     if reason:
-        return _kept(task, reason, advice, is_refined=is_refined)
+        return _kept(task, reason, advice)
     moved = movements(scene, after, tracks)
     success = _success(judgement, moved)
-    polish = Polish(success, is_polished=True, movement=moved, advice=advice, is_refined=is_refined)
+    polish = Polish(success, is_polished=True, movement=moved, advice=advice, is_refined=_is_refined(task))
     with scratch_folder(workspace.polishing_scratch_dir):
         made = workspace.polishing_scratch_dir / "polished"
         write_model(adjusted, made)
@@ -137,14 +137,19 @@ def kept_as_given(reason: str, options: PolishOptions, advice: str = "") -> Poli
     return Polish(f"The poses are kept as given: {reason}.", advice=advice)
 
 
-def _kept(task: PolishTask, reason: str, advice: str = "", *, is_refined: bool = False) -> Facts:
-    polish = replace(kept_as_given(reason, task.options, advice), is_refined=is_refined)
+def _kept(task: PolishTask, reason: str, advice: str = "") -> Facts:
+    polish = replace(kept_as_given(reason, task.options, advice), is_refined=_is_refined(task))
     keep_given(task.workspace, task.key, asdict(polish))
     return Facts(polish=polish)
 
 
-def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> tuple[str, bool]:
-    """What to do about images that are bent alike; where it was asked for, whether it was done."""
+def _is_refined(task: PolishTask) -> bool:
+    """Whether this polishing has left a model with refined cameras; one of an earlier run is gone by now."""
+    return task.options.cameras and has_model(task.workspace.refined_model_dir)
+
+
+def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
+    """What to do about images that are bent alike; where it was asked for, what came of it."""
     if task.options.cameras:
         return _with_refined_cameras(task, tracks, scene, judgement)
     bent = [bend for bend in common_bends(tracks, scene) if bend.share > _BENT_SHARE]
@@ -153,12 +158,10 @@ def _advice(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement
         f"{bend.pixels:.2f} px beyond what poses can take up: its lens model is imprecise; try --polish-cameras."
         for bend in bent
     )
-    return " ".join(words), False
+    return " ".join(words)
 
 
-def _with_refined_cameras(
-    task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement
-) -> tuple[str, bool]:
+def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgement: Judgement) -> str:
     """Refine the cameras of the original model, and leave it in the workspace where it is better."""
     # Not before: what it is solved with takes its time to load.
     from colmap_sph.pipeline.stages.refine_cameras import CamerasToRefine, refine_cameras

@@ -41,7 +41,7 @@ class CamerasToRefine:
     held_out: Tracks
 
 
-def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, target: Path) -> tuple[str, bool]:
+def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, target: Path) -> str:
     """Refine cameras; writes the model with those that fit clearly better.
 
     Parameters
@@ -56,13 +56,11 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
 
     Returns
     -------
-    words : str
+    str
         What came of it, in a sentence.
-    is_refined : bool
-        Whether there is such a model now.
     """
     if read_lens_fields(task.model_dir):
-        return "The cameras are kept as given: they have lens fields already.", False
+        return "The cameras are kept as given: they have lens fields already."
     given = Lenses(load_model(task.model_dir))
     best = given
     error = before
@@ -79,12 +77,12 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
             error = fits
     if best is given:
         found = f"({tried:.2f} px)" if np.isfinite(tried) else "(none could be found)"
-        return f"The cameras are kept as given: refined ones are not clearly better {found}.", False
+        return f"The cameras are kept as given: refined ones are not clearly better {found}."
     best.write(target)
     return (
         f"Cameras were refined ({best.words(given)}): ties that had no part in it fit to {error:.2f} px, before "
         f"{before:.2f} px."
-    ), True
+    )
 
 
 def _error(task: CamerasToRefine, given: Lenses, refined: Lenses) -> float:

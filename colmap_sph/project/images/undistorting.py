@@ -7,7 +7,6 @@ image.
 import os
 import re
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError
 from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.images.bands import in_bands
 from colmap_sph.project.images.decoding import date_of, is_jpeg, read_pixels, unreadable
 from colmap_sph.project.images.depth import ValueRange, stretched
 from colmap_sph.project.images.jpeg import DamagedError
@@ -158,14 +158,9 @@ def _forget_time_of_writing(written: Path, source: Path) -> None:
 
 def _stretched(pixels: NDArray[Any], values: ValueRange) -> NDArray[np.uint16]:
     image = pixels if pixels.dtype == np.uint16 else np.empty(pixels.shape, np.uint16)
-    for rows in _bands(*pixels.shape[:2]):
+    for rows in in_bands(len(pixels), pixels.shape[1], _BAND_PIXELS):
         image[rows] = np.rint(stretched(pixels[rows], values) * _WHITE)
     return image
-
-
-def _bands(height: int, width: int) -> Iterator[slice]:
-    step = max(1, _BAND_PIXELS // width)
-    return (slice(first, min(first + step, height)) for first in range(0, height, step))
 
 
 def undistorted_pixels(
@@ -198,7 +193,7 @@ def undistorted_pixels(
     if reduce:
         target.rescale(camera.width, camera.height)
     warped = np.empty((target.height, target.width, image.shape[2]), image.dtype)
-    for rows in _bands(target.height, target.width):
+    for rows in in_bands(target.height, target.width, _BAND_PIXELS):
         warped[rows] = _warped_rows(image, place_in_original(camera, target, field, rows), target.width)
     return _resized(warped, size) if reduce else warped
 

@@ -1,6 +1,5 @@
 """Wide image → the image and the mask of a view cut from it, sampled once."""
 
-from collections.abc import Iterator
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.files import atomic_file, make_dir
+from colmap_sph.project.images.bands import in_bands
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.undistorting import read_original
 from colmap_sph.project.masks import read_mask
@@ -83,7 +83,7 @@ def _places(lens: Lens, face: Face) -> Places:
     x = np.empty((face.height, face.width), np.float32)
     y = np.empty_like(x)
     is_shown = np.empty(x.shape, np.bool_)
-    for rows in _bands(face):
+    for rows in in_bands(face.height, face.width, _BAND_PIXELS):
         points = image_points(lens, face.rays(rows))
         is_shown[rows] = shown(lens, points).reshape(-1, face.width)
         column, row = (np.nan_to_num(part, nan=0.5).reshape(-1, face.width) - 0.5 for part in points.T)
@@ -95,9 +95,3 @@ def _places(lens: Lens, face: Face) -> Places:
 def forget_places() -> None:
     """Let go of the places that are kept: no more views are to be cut."""
     _places.cache_clear()
-
-
-def _bands(face: Face) -> Iterator[slice]:
-    step = max(_BAND_PIXELS // face.width, 1)
-    for top in range(0, face.height, step):
-        yield slice(top, min(top + step, face.height))
