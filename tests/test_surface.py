@@ -240,6 +240,22 @@ def test_each_cell_has_the_colour_of_its_own_surface(products):
     assert len(summary.images) == 13
 
 
+def test_gdal_takes_the_orthophotos_alpha_for_alpha(workspace, tmp_path):
+    """So QGIS shows no black where there is nothing, and overviews mix no black into the rims of holes."""
+    made(workspace, tmp_path, cell=GSD / 3)
+    path = tmp_path / "orthophoto.tif"
+    with rasterio.open(path) as file:
+        assert [each.name for each in file.colorinterp] == ["red", "green", "blue", "alpha"]
+        alpha = file.read(4)
+        np.testing.assert_array_equal(file.dataset_mask(), alpha)
+    with rasterio.open(path, overview_level=0) as file:
+        *colours, small = file.read()
+    assert alpha.min() == 0
+    assert np.count_nonzero(small) > 1000
+    # Of all three colours and their mixtures; with a quarter of black it would be 195.
+    assert np.sum(colours, axis=0, dtype=int)[small > 0].min() > sum(GREEN) - 5
+
+
 def test_the_index_names_an_image_that_sees_the_cell(workspace, products):
     arrays, transform, _ = products
     x, y = places(arrays, transform)

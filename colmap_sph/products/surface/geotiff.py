@@ -114,7 +114,7 @@ class LayerFiles:
             blockysize=_BLOCK,
             BIGTIFF="IF_SAFER",
             SPARSE_OK=True,
-            **({"photometric": "RGB", "alpha": "unspecified"} if len(layer.bands) == 4 else {}),
+            **({"photometric": "RGB", "alpha": "yes"} if len(layer.bands) == 4 else {}),
         )
         file.descriptions = layer.bands
         file.update_tags(AREA_OR_POINT="Area", **self._tags)
