@@ -211,6 +211,18 @@ def test_poissons_mesh_of_a_sphere_is_a_sphere(cloudy, tmp_path):
     assert (tmp_path / "mesh.glb").exists()
 
 
+def test_glb_keeps_the_axes_of_a_level_model(cloudy, tmp_path):
+    """Also where the scene's longer side lies askew to them, as those of the surface model and the orthophoto."""
+    yaw = np.radians(30)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    turned = surveyed_workspace(tmp_path / "dense", turn=turn)
+    turned.fused_path.write_bytes(cloudy.fused_path.read_bytes())
+    mesh = made(turned, tmp_path / "mesh", method="poisson", voxel=0.7, trim=0.0)
+    found: Any = trimesh.load(tmp_path / "mesh" / "mesh.glb", process=False, force="mesh")
+    x, y, z = (mesh.vertices - mesh.bounds.mean(axis=0)).T
+    np.testing.assert_allclose(found.vertices, np.stack([x, z, -y], axis=1), atol=1e-5)
+
+
 def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path, capfd):
     full = made(cloudy, tmp_path / "full", method="poisson", voxel=0.7, trim=0.0)
     few = made(cloudy, tmp_path / "few", method="poisson", voxel=0.7, trim=0.0, simplify=0.2, formats=("ply",))
