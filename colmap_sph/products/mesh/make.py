@@ -98,7 +98,9 @@ def make_mesh(
             mesh = _of_cloud(request, scene, seen, options.voxel or 2 * gsd, scratch)
             advance()
         if options.simplify < 1:
+            start("simplify", 1)
             mesh = _simplified(mesh, request, scratch)
+            advance()
         if not len(mesh.faces):
             raise NoResultError("There is no surface: give a larger --voxel or a smaller --min-images.")
         sheets = [plain(mesh)]
