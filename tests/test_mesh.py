@@ -3,6 +3,7 @@
 import json
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +47,16 @@ needs_open3d = pytest.mark.skipif(not is_open3d_here(), reason="Open3D, or what 
 
 
 def made(
-    workspace: Workspace, folder: Path, memory: int = PLENTY, place: Georeference | None = None, **options
+    workspace: Workspace,
+    folder: Path,
+    memory: int = PLENTY,
+    place: Georeference | None = None,
+    start: Callable[[str, int], None] = lambda *_: None,
+    **options,
 ) -> Any:
     """The mesh that was made, read from mesh.ply by trimesh."""
     request = MeshRequest(workspace, place or Georeference(), MeshOptions(**options), folder, memory, 1)
-    make_mesh(request, lambda *_: None, lambda: None)
+    make_mesh(request, start, lambda: None)
     return trimesh.load(folder / "mesh.ply", process=False)
 
 
@@ -224,9 +230,24 @@ def test_poissons_mesh_of_a_sphere_is_a_sphere(cloudy, tmp_path):
     assert (tmp_path / "mesh.glb").exists()
 
 
+def test_glb_keeps_the_axes_of_a_level_model(cloudy, tmp_path):
+    """Also where the scene's longer side lies askew to them, as those of the surface model and the orthophoto."""
+    yaw = np.radians(30)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1]])
+    turned = surveyed_workspace(tmp_path / "dense", turn=turn)
+    turned.fused_path.write_bytes(cloudy.fused_path.read_bytes())
+    mesh = made(turned, tmp_path / "mesh", method="poisson", voxel=0.7, trim=0.0)
+    found: Any = trimesh.load(tmp_path / "mesh" / "mesh.glb", process=False, force="mesh")
+    x, y, z = (mesh.vertices - mesh.bounds.mean(axis=0)).T
+    np.testing.assert_allclose(found.vertices, np.stack([x, z, -y], axis=1), atol=1e-5)
+
+
 def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path, capfd):
     full = made(cloudy, tmp_path / "full", method="poisson", voxel=0.7, trim=0.0)
-    few = made(cloudy, tmp_path / "few", method="poisson", voxel=0.7, trim=0.0, simplify=0.2, formats=("ply",))
+    steps: list[str] = []
+    chosen: dict[str, Any] = {"voxel": 0.7, "trim": 0.0, "simplify": 0.2, "formats": ("ply",)}
+    few = made(cloudy, tmp_path / "few", start=lambda name, _: steps.append(name), method="poisson", **chosen)
+    assert steps == ["poisson", "simplify"]  # which takes long, too
     assert len(few.faces) == pytest.approx(0.2 * len(full.faces), rel=0.1)
     assert few.volume == pytest.approx(full.volume, rel=0.01)
     assert not (tmp_path / "few" / "mesh.glb").exists()

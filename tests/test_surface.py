@@ -22,6 +22,7 @@ from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.surface.drawing import margin_of
 from colmap_sph.products.surface.filling import filled
+from colmap_sph.products.surface.geotiff import LayerFiles
 from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.project.claim import claimed
@@ -29,6 +30,7 @@ from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.surface.coarser import coarser_colours, coarser_surface
 from colmap_sph.stereo.surface.heights import Surface, highest_surface, hillshade
+from colmap_sph.stereo.surface.raster import Raster
 
 rasterio = pytest.importorskip("rasterio")
 
@@ -238,6 +240,29 @@ def test_each_cell_has_the_colour_of_its_own_surface(products):
     assert not colour_of(arrays, BLUE).any()
     assert not arrays["orthophoto_images"][0][arrays["orthophoto"][3] == 0].any()
     assert len(summary.images) == 13
+
+
+def test_gdal_keeps_the_blocks_it_works_with(tmp_path):
+    """Two rows of them at least, of all bands: with a cache of bytes each pixel decompressed its block again."""
+    with LayerFiles(tmp_path, {}, Raster(np.eye(3), np.zeros(3), 0, 0, 1.0, 8, 8), "", {}):
+        kept = rasterio.env.get_gdal_config("GDAL_CACHEMAX")
+    assert 2 * 512 * 4 * 3 * 4096 <= kept <= 128 << 20
+
+
+def test_gdal_takes_the_orthophotos_alpha_for_alpha(workspace, tmp_path):
+    """So QGIS shows no black where there is nothing, and overviews mix no black into the rims of holes."""
+    made(workspace, tmp_path, cell=GSD / 2)
+    path = tmp_path / "orthophoto.tif"
+    with rasterio.open(path) as file:
+        assert [each.name for each in file.colorinterp] == ["red", "green", "blue", "alpha"]
+        alpha = file.read(4)
+        np.testing.assert_array_equal(file.dataset_mask(), alpha)
+    with rasterio.open(path, overview_level=0) as file:
+        *colours, small = file.read()
+    assert alpha.min() == 0
+    assert np.count_nonzero(small) > 1000
+    # Of all three colours and their mixtures; with a quarter of black it would be 195.
+    assert np.sum(colours, axis=0, dtype=int)[small > 0].min() > sum(GREEN) - 5
 
 
 def test_the_index_names_an_image_that_sees_the_cell(workspace, products):

@@ -22,13 +22,13 @@ from colmap_sph.products.mesh.triangles import Triangles, joined, read_ply, writ
 from colmap_sph.products.mesh.tsdf import Volume, open3d
 from colmap_sph.products.places import check_places
 from colmap_sph.products.publishing import alone_in
+from colmap_sph.products.surface.placing import level_axes
 from colmap_sph.products.surface.seen import SeenView, seen_views
 from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.meshing import poisson_mesh, simplify
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
-from colmap_sph.stereo.region.map_axes import map_axes
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +98,9 @@ def make_mesh(
             mesh = _of_cloud(request, scene, seen, options.voxel or 2 * gsd, scratch)
             advance()
         if options.simplify < 1:
+            start("simplify", 1)
             mesh = _simplified(mesh, request, scratch)
+            advance()
         if not len(mesh.faces):
             raise NoResultError("There is no surface: give a larger --voxel or a smaller --min-images.")
         sheets = [plain(mesh)]
@@ -246,4 +248,4 @@ def _axes(
     """East, north and up in the scene's frame, or what comes next to them."""
     if is_on_map:
         return georeference.rotation
-    return map_axes(scene.views, np.concatenate([each.points for each in seen]).astype(np.float64))
+    return level_axes(scene, seen)

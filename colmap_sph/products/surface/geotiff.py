@@ -16,7 +16,7 @@ from colmap_sph.stereo.surface.raster import Raster
 
 NO_HEIGHT = -9999.0
 _BLOCK = 256
-_CACHE_MEGABYTES = 64
+_CACHE = 64 << 20  # bytes, in which rasterio, unlike GDAL, takes it
 _MISSING = (
     "Surface models and orthophotos need GDAL (rasterio), which is not installed; install this program with it: "
     "pip install '.[geo]'."
@@ -87,7 +87,7 @@ class LayerFiles:
 
     def __enter__(self) -> "LayerFiles":
         # What GDAL keeps counts as memory of ours; a file in parts would not be found again.
-        self._stack.enter_context(self._rasterio.Env(GDAL_CACHEMAX=_CACHE_MEGABYTES, GDAL_PAM_ENABLED="NO"))
+        self._stack.enter_context(self._rasterio.Env(GDAL_CACHEMAX=_CACHE, GDAL_PAM_ENABLED="NO"))
         with _in_words(self._scratch):
             for key, layer in self._layers.items():
                 self._open[key] = self._stack.enter_context(self._create(layer))
@@ -114,7 +114,7 @@ class LayerFiles:
             blockysize=_BLOCK,
             BIGTIFF="IF_SAFER",
             SPARSE_OK=True,
-            **({"photometric": "RGB", "alpha": "unspecified"} if len(layer.bands) == 4 else {}),
+            **({"photometric": "RGB", "alpha": "yes"} if len(layer.bands) == 4 else {}),
         )
         file.descriptions = layer.bands
         file.update_tags(AREA_OR_POINT="Area", **self._tags)

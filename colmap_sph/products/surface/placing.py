@@ -123,12 +123,14 @@ def _axes(
                 "up is given, but the model is in map coordinates, whose z is up; leave it out.", "up"
             )
         return linear, offset, georeference.wkt
-    turn = _level(scene, seen, up)
+    turn = level_axes(scene, seen, up)
     return turn, turn @ offset, ""
 
 
-def _level(scene: Scene, seen: Sequence[SeenView], up: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """Axes of a local model: its own ones where one of them is up, else across along its longer side."""
+def level_axes(
+    scene: Scene, seen: Sequence[SeenView], up: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """(3, 3) axes of a local model: its own ones where one of them is up, else across along its longer side."""
     points = np.concatenate([each.points for each in seen]).astype(np.float64)
     axes = map_axes(scene.views, points, up=up)
     nearest = int(np.argmax(np.abs(axes[2])))
