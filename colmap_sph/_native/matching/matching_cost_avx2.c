@@ -9,6 +9,8 @@
 
 enum { PLANES = 16, LOOKS_UP_ZERO = 128 };
 
+#define HIGH_BITS UINT64_C(0xf0f0f0f0f0f0f0f0)
+
 /* Number of bits in which two numbers differ. */
 static const uint8_t DISTANCES[16][16] = {
     {0, 1, 1, 2, 1, 2, 2, 3, 1, 2, 2, 3, 2, 3, 3, 4}, {1, 0, 2, 1, 2, 1, 3, 2, 2, 1, 3, 2, 3, 2, 4, 3},
@@ -71,6 +73,12 @@ static void make_planes(const uint64_t *target, match_size size, uint8_t *planes
     }
 }
 
+/* Row place / 16 of the table, twice. */
+ALWAYS_INLINE __m256i distances_at(uint64_t place) {
+    const uint8_t *distances = (const uint8_t *)DISTANCES + place;
+    return _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)(const void *)distances));
+}
+
 /* Costs of the census word `reference` in 32 * vectors slots. */
 ALWAYS_INLINE void look_up(uint64_t reference, const uint8_t *planes, ptrdiff_t stride, const ptrdiff_t vectors,
                            uint8_t *slots) {
@@ -78,14 +86,16 @@ ALWAYS_INLINE void look_up(uint64_t reference, const uint8_t *planes, ptrdiff_t 
     for (ptrdiff_t v = 0; v < vectors; v++) {
         sums[v] = _mm256_loadu_si256((const __m256i *)(const void *)(planes + PLANES * stride + 32 * v));
     }
+    /* Each 4 bits times 16, which is where their distances lie: no shift is left for each plane. */
+    uint64_t even = reference << 4 & HIGH_BITS, odd = reference & HIGH_BITS;
 #pragma GCC unroll 4
-    for (int k = 0; k < PLANES; k++, planes += stride, reference >>= 4) {
-        const uint8_t *distances = DISTANCES[reference & 15];
-        const __m256i table =
-            _mm256_broadcastsi128_si256(_mm_loadu_si128((const __m128i *)(const void *)distances));
+    for (int k = 0; k < PLANES; k += 2, planes += 2 * stride, even >>= 8, odd >>= 8) {
+        const __m256i table[2] = {distances_at(even & 255), distances_at(odd & 255)};
         for (ptrdiff_t v = 0; v < vectors; v++) {
             const __m256i bits = _mm256_loadu_si256((const __m256i *)(const void *)(planes + 32 * v));
-            sums[v] = _mm256_add_epi8(sums[v], _mm256_shuffle_epi8(table, bits));
+            const __m256i next = _mm256_loadu_si256((const __m256i *)(const void *)(planes + stride + 32 * v));
+            sums[v] = _mm256_add_epi8(sums[v], _mm256_shuffle_epi8(table[0], bits));
+            sums[v] = _mm256_add_epi8(sums[v], _mm256_shuffle_epi8(table[1], next));
         }
     }
     for (ptrdiff_t v = 0; v < vectors; v++) {
