@@ -539,10 +539,16 @@ def test_arguments_that_make_no_sense(
     assert tree(small) == before
 
 
-def test_no_pair_with_overlap(small: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, output = command(capsys, *RUN, "--min-shared-points", "100000")
+@pytest.mark.parametrize(
+    ("bound", "value"), [("--pairs.min-shared-points", "100000"), ("--pairs.min-triangulation-angle", "59")]
+)
+def test_no_pair_with_overlap(bound: str, value: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, output = command(capsys, *RUN, bound, value)
     assert code == 4
-    assert "No pair of images overlaps" in error_sentence(code, output)
+    sentence = error_sentence(code, output)
+    assert "No pair of images overlaps" in sentence
+    # What is to be lowered, as it is typed.
+    assert bound in sentence
     # The dense workspace is whole, without maps and cloud, and serves the next run.
     assert not list((small / "dense/stereo").rglob("*.bin"))
     assert not list((small / "dense").glob("fused*"))

@@ -317,7 +317,8 @@ def report_selection(selection: PairSelection, options: PairOptions) -> None:
             f"No pair of images overlaps and has parallax, going by {words[selection.source]}: at least "
             f"{options.min_shared_points} shared points and a triangulation angle of "
             f"{options.min_triangulation_angle} degrees are needed; check the model (were its images taken from "
-            f"different places?{points if selection.source == 'frusta' else ''}), or lower these bounds."
+            f"different places?{points if selection.source == 'frusta' else ''}), or lower "
+            "--pairs.min-shared-points or --pairs.min-triangulation-angle."
         )
     logger.info("%d pairs of %d images, by %s", num_unique, len(selection.partners), words[selection.source])
     for name in selection.without_partner:
