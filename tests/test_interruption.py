@@ -11,7 +11,9 @@ import textwrap
 import threading
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from conftest import SCRIPTS, copy_block, keep_images
 from projects import render_four_images
 
 from colmap_sph.app import cli
+from colmap_sph.evaluation import neighbours
 from colmap_sph.evaluation.neighbours import PointIndex
 
 NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
@@ -231,6 +234,26 @@ def test_an_interrupted_comparison_of_clouds_leaves_no_thread() -> None:
         signal.signal(signal.SIGUSR1, before)
     sender.join()
     assert threading.active_count() == threads
+
+
+def test_an_interrupted_comparison_of_clouds_begins_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where the interruption comes while it still puts its chunks into line."""
+    begun: list[slice] = []
+    submit = ThreadPoolExecutor.submit
+
+    def submit_few(self: ThreadPoolExecutor, *arguments: Any) -> Any:
+        if self._work_queue.qsize() > 100:
+            raise KeyboardInterrupt
+        return submit(self, *arguments)
+
+    def search(chunk: slice) -> None:
+        begun.append(chunk)
+        time.sleep(0.05)
+
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", submit_few)
+    with pytest.raises(KeyboardInterrupt):
+        neighbours._in_chunks(search, 1 << 30, 2)
+    assert len(begun) < 50
 
 
 def test_signals_that_are_ignored_stay_ignored(project: Path) -> None:

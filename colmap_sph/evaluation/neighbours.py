@@ -83,9 +83,11 @@ def _in_chunks(search: Callable[[slice], None], number: int, threads: int) -> No
     memory that is freed meanwhile, and the process dies of them.
     """
     chunks = [slice(start, start + _QUERY_CHUNK) for start in range(0, number, _QUERY_CHUNK)]
-    with ThreadPoolExecutor(threads) as pool:
-        for _ in pool.map(search, chunks):  # interrupted, it begins no more, and waits for those under way
-            pass
+    pool = ThreadPoolExecutor(threads)
+    try:
+        list(pool.map(search, chunks))
+    finally:
+        pool.shutdown(cancel_futures=True)  # interrupted, it begins no more, and waits for those under way
 
 
 def bounds(points: Points) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
