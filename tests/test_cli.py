@@ -643,6 +643,18 @@ def test_an_image_that_cannot_be_fused_is_left_out(small: Path, capsys: pytest.C
     assert set(itertools.chain(*read_visibility(small / "dense/fused.ply.vis"))) == {0, 1, 2}
 
 
+@pytest.mark.parametrize("how", [[], ["--dry-run"]])
+def test_a_folder_without_masks_for_fusion(
+    how: list[str], small: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Refused before anything is matched: the cloud would be made as without masks."""
+    code, output = command(capsys, *RUN, "--fusion.mask-path", "sparse", *how)
+    assert code == 2
+    wanted = f"sparse holds no mask for any image; that of {IMAGES[0]} must be sparse/{IMAGES[0]}.png."
+    assert wanted in error_sentence(code, output)
+    assert not (small / "dense/colmap_sph/pairs").exists()
+
+
 @pytest.mark.parametrize("case", ["neither", "no model", "wrong images", "not a workspace", "pairs", "threads"])
 def test_dry_run_finds_the_same_mistakes(case: str, small: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments, expected, words = BAD[case]

@@ -218,6 +218,23 @@ def test_masks_in_another_spelling(tmp_path: Path, image: str, there: str, calle
     assert not (tmp_path / "dense").exists()
 
 
+def test_a_mask_that_is_listed_in_another_spelling(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """As on file systems that take both for one; here it has two names."""
+    write_masks(tmp_path / "masks", NAMES)
+    masks = tmp_path / "masks"
+    other = masks / f"{NAMES[0].upper()}.png"
+    if not other.exists():
+        other.hardlink_to(masks / f"{NAMES[0]}.png")
+    check_names(masks, NAMES, tmp_path)
+    assert not caplog.records
+    other.unlink()
+    write_masks(masks, [NAMES[0].upper(), NAMES[0]])
+    check_names(masks, NAMES, tmp_path)
+    assert [record.getMessage().split(" belongs")[0] for record in caplog.records] == (
+        [f"the file {other.name} in {masks}"] if len(list(masks.glob("*.png"))) > 2 else []
+    )
+
+
 def test_images_that_differ_in_case_alone(tmp_path: Path) -> None:
     """Where files do: the mask of one is not that of the other."""
     write_masks(tmp_path / "masks", ["a.jpg"])

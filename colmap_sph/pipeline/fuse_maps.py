@@ -9,6 +9,7 @@ from colmap_sph.errors import InputError, NoResultError
 from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.contradictions import check_fusion
 from colmap_sph.pipeline.execute import execute
+from colmap_sph.pipeline.input.good_images import check_fusion_masks
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
@@ -85,6 +86,7 @@ def fuse_maps(
         scene = _at_map_sizes(given, mapped, options.undistortion.max_image_size)
         context = Context(workspace, scene, options, Keys(workspace, options), progress, report)
         check_fusion(context)
+        check_fusion_masks(context)
         with timed_stage("select pairs", 1, progress, report):
             pairs = _pairs_of_maps(context, mapped) or choose_pairs(workspace, scene, options, None).unique_pairs()
             progress.advance()

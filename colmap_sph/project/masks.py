@@ -109,13 +109,7 @@ def check_masks(
         for name, camera in cameras.items()
         if read_mask(mask_path(folder, name), camera.width, camera.height) is not None
     ]
-    names = [*cameras, *others]
-    unused = _unused_masks(folder, names, image_dir)
-    _refuse_misspelled(folder, names, unused)
-    if not masked:
-        name = min(cameras)
-        raise InputError(f"{folder} holds no mask for any image; that of {name} must be {folder / name}.png.")
-    _warn_of_unused(folder, unused)
+    check_names(folder, cameras, image_dir, others)
     bare = sorted(set(cameras) - set(masked))
     if bare:
         they_are = "it is" if len(bare) == 1 else "they are"
@@ -133,17 +127,21 @@ def _refuse_images(folder: Path, names: Iterable[str]) -> None:
             )
 
 
-def check_names(folder: Path, names: Iterable[str], image_dir: Path) -> None:
+def check_names(folder: Path, names: Iterable[str], image_dir: Path, others: Iterable[str] = ()) -> None:
     """Do what `check_masks` does of the names of masks alone: warn of files that belong to no image.
 
     Raises
     ------
     InputError
-        One is called as its image's mask is, but in another spelling.
+        There is no mask for any of the images `names`, or one is called as an image's in another spelling.
     """
     names = list(names)
-    unused = _unused_masks(folder, names, image_dir)
-    _refuse_misspelled(folder, names, unused)
+    both = [*names, *others]
+    unused = _unused_masks(folder, both, image_dir)
+    _refuse_misspelled(folder, both, unused)
+    if not any(mask_path(folder, name).exists() for name in names):
+        name = min(names)
+        raise InputError(f"{folder} holds no mask for any image; that of {name} must be {folder / name}.png.")
     _warn_of_unused(folder, unused)
 
 
@@ -153,11 +151,16 @@ def _unused_masks(folder: Path, names: Sequence[str], image_dir: Path) -> list[s
     if real_path(folder) == real_path(image_dir):
         known |= {folder / name for name in names}
     files = (PurePosixPath(file) for file in sorted(files_below(folder, len(names)) or []))
-    return [
+    unused = [
         str(file)
         for file in files
         if folder / file not in known and not file.name.startswith(".") and file.name not in _NO_MASKS
     ]
+    used = [path.relative_to(folder).as_posix() for path in known if path.exists()]
+    spelled = other_spellings(unused, used)
+    # Where the file system takes both spellings for one, it may list the other one.
+    same = {there for right, there in spelled.items() if (folder / there).samefile(folder / right)}
+    return [file for file in unused if file not in same]
 
 
 def _refuse_misspelled(folder: Path, names: Iterable[str], unused: Iterable[str]) -> None:

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from colmap_sph.errors import ColmapSphError, OptionError
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.input.good_images import with_good_images, without_misplaced
+from colmap_sph.pipeline.input.good_images import check_fusion_masks, with_good_images, without_misplaced
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.memory import MemoryGate
 from colmap_sph.pipeline.options import RunOptions
@@ -215,9 +215,9 @@ def foresee(
     scene = anchored(read_scene(folder) if foreseen is None else foreseen)
     keys = Keys(dense, options, fresh=overwrite or foreseen is not None)
     to_come = scene.index_of if foreseen is not None else to_make
-    context = with_good_images(
-        Context(dense, scene, options, keys, report=report).in_region(), survey, to_come=to_come
-    )
+    context = Context(dense, scene, options, keys, report=report)
+    check_fusion_masks(context)
+    context = with_good_images(context.in_region(), survey, to_come=to_come)
     context = without_misplaced(context)
     there = None if foreseen is not None else dense
     key = context.keys.stage("selection", context.scene_key)

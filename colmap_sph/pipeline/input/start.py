@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, get_args
 from colmap_sph.errors import InputError
 from colmap_sph.pipeline.context import Context, timed_stage
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
-from colmap_sph.pipeline.input.good_images import with_good_images, without_misplaced
+from colmap_sph.pipeline.input.good_images import check_fusion_masks, with_good_images, without_misplaced
 from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.polishing import MatchToPolishStage, with_polished_poses
@@ -93,6 +93,7 @@ def start(
     scene = anchored(scene.no_larger_than(options.undistortion.max_image_size))
     report.views = _views_of_photographs(scene)
     context = Context(workspace, scene, options, Keys(workspace, options), request.progress, report)
+    check_fusion_masks(context)
     context = context.in_region()
     _report_missing(context, request.expected)
     context = with_good_images(context, executor, verify=request.verify)

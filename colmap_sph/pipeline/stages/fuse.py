@@ -30,7 +30,6 @@ from colmap_sph.pipeline.stages.fusion_parts import (
     FuseTask,
     Partners,
     PartsStage,
-    check_mask_names,
     index_in_model,
     seconds_per_megapixel,
 )
@@ -160,7 +159,6 @@ class FuseStage(PartsStage):
             yield
             return
         check_places(self.context.workspace)
-        check_mask_names(self.context)
         assert self.sources.keys() == set(self._names)
         with self.in_scratch():
             yield
@@ -309,7 +307,6 @@ class ColmapFuseStage(Stage[str, ColmapFuseTask]):
                 reason = self.context.report.skipped_images[self._names[0]]
                 raise NoResultError(f"No image could be fused ({reason})")
             begin_cloud(self.context)
-            check_mask_names(self.context)
             self._warn_of_memory()
         list_fused_images(self.context, self._sound)
         yield

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from colmap_sph.errors import NoResultError
 from colmap_sph.pipeline.stages.cloud import CloudFacts, vouch_for_cloud
-from colmap_sph.pipeline.stages.fusion_parts import Partners, PartsStage, check_mask_names
+from colmap_sph.pipeline.stages.fusion_parts import Partners, PartsStage
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.pipeline.stages.view_maps import MapSources
 from colmap_sph.project.cloud_files import join_parts
@@ -62,7 +62,6 @@ class FuseToStage(PartsStage):
     @contextmanager
     def opened(self) -> Iterator[None]:
         """The parts of the cloud are there until this ends."""
-        check_mask_names(self.context)
         with self.in_scratch():
             yield
 

@@ -19,7 +19,6 @@ from colmap_sph.pipeline.stages.view_maps import MapSources, read_view_maps
 from colmap_sph.project.cloud_files import write_part
 from colmap_sph.project.files import scratch_folder
 from colmap_sph.project.images.reading import bytes_to_reduce
-from colmap_sph.project.masks import check_names
 from colmap_sph.scene import Region
 from colmap_sph.stereo.fusion import MAX_PARTNERS, FusionOptions, PackedMaps, ViewMaps, fuse_view
 from colmap_sph.stereo.partners.reads import best_order
@@ -260,11 +259,3 @@ def index_in_model(context: "Context") -> dict[str, int]:
     """What ``fused.ply.vis`` calls each image by: its place among the registered ones of the model."""
     index_of = {image_id: index for index, image_id in enumerate(context.scene.image_ids)}
     return {view.name: index_of[view.image_id] for view in context.scene.views}
-
-
-def check_mask_names(context: "Context") -> None:
-    """Report masks that fusion will not use; `InputError` where only their spelling is to blame."""
-    folder = context.options.fusion.mask_path
-    if folder is not None:
-        names = [view.name for view in context.scene.views]
-        check_names(folder, names, context.workspace.images_dir)
