@@ -21,7 +21,7 @@ from colmap_sph.errors import InputError, NoResultError, OptionError, OutputErro
 from colmap_sph.evaluation import read_geometry
 from colmap_sph.evaluation.geometry_io import Mesh
 from colmap_sph.products.georeference import Georeference
-from colmap_sph.products.mesh import make, tsdf
+from colmap_sph.products.mesh import make, preview, tsdf
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.options import MeshOptions
@@ -29,7 +29,7 @@ from colmap_sph.products.mesh.preview import write_preview
 from colmap_sph.products.mesh.texture.textured import plain
 from colmap_sph.products.mesh.triangles import Triangles, read_ply, write_ply
 from colmap_sph.project.cloud_tiles import INDEX, TileIndex
-from colmap_sph.project.workspace import Workspace
+from colmap_sph.project.workspace import PREVIEW_SIDE, Workspace
 from colmap_sph.scene import POINT
 
 PLENTY = 8 << 30
@@ -118,8 +118,13 @@ def test_a_glb_file_is_read_upright_by_others(tmp_path):
     assert np.array_equal(colours[:, :3], mesh.colours)
 
 
-def test_a_small_picture_shows_a_mesh_from_the_south_and_above(tmp_path):
-    """A level square, red in the north, green in the south, and a blue mast whose foot is in the middle."""
+@pytest.mark.parametrize("most_faces", [0, 10**6], ids=["corners", "triangles"])
+def test_a_small_picture_shows_a_mesh_from_the_south_and_above(tmp_path, monkeypatch, most_faces):
+    """A level square, red in the north, green in the south, and a blue mast whose foot is in the middle.
+
+    Corners alone would leave holes where these are farther apart than pixels.
+    """
+    monkeypatch.setattr(preview, "_MOST_FACES", most_faces)
     x, y = (each.ravel() for each in np.mgrid[-1:1:200j, -1:1:200j])
     mast = np.column_stack([np.zeros(300), np.zeros(300), np.linspace(0, 0.5, 300)])
     points = np.concatenate([np.column_stack([x, y, np.zeros(len(x))]), mast]).astype(np.float32)
@@ -127,15 +132,20 @@ def test_a_small_picture_shows_a_mesh_from_the_south_and_above(tmp_path):
     colours[len(x) :] = (0, 0, 255)
     axes = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
     axes *= np.linalg.det(axes)
-    mesh = Triangles((points @ axes).astype(np.float32), colours, np.zeros((1, 3), np.int32))
+    corner = np.arange(200 * 199)[np.arange(200 * 199) % 200 < 199, None]
+    foot = len(x) + np.arange(298)[:, None]
+    steps = ((corner, (0, 200, 1)), (corner, (1, 200, 201)), (foot, (0, 1, 2)))
+    faces = np.concatenate([first + np.array(step) for first, step in steps]).astype(np.int32)
+    mesh = Triangles((points @ axes).astype(np.float32), colours, faces)
     write_preview(tmp_path / "small.png", mesh, axes)
     found = cv2.imread(str(tmp_path / "small.png"))
     assert found is not None
     picture = found[..., ::-1]
     height, width = picture.shape[:2]
-    assert height < width <= 101
-    assert (picture[2 : height // 4, 5:40] == (255, 0, 0)).all()
-    assert (picture[-height // 4 : -2, 5:40] == (0, 255, 0)).all()
+    assert height < width <= 101 if most_faces == 0 else width == PREVIEW_SIDE
+    left = slice(width // 20, 2 * width // 5)
+    assert (picture[height // 50 + 1 : height // 4, left] == (255, 0, 0)).all()
+    assert (picture[-height // 4 : -height // 50 - 1, left] == (0, 255, 0)).all()
     blue = np.flatnonzero((picture == (0, 0, 255)).all(axis=2).any(axis=1))
     assert blue.max() <= height // 2 + 1
     assert blue.min() < 0.3 * height

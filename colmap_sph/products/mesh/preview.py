@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,14 +15,17 @@ PREVIEW = f"{PREVIEW_PREFIX}mesh.png"
 """Name of the picture."""
 # From where it is looked at, above the horizon.
 _ELEVATION = math.radians(50)
-# Corners that a pixel has, about, so that nothing shows through.
+# Of more triangles corners alone are drawn, which is faster; so many in a pixel that nothing shows through.
+_MOST_FACES = 500_000
 _CORNERS = 4.0
+# Pixels from the picture's corner, which OpenCV can draw to.
+_FAR = 30_000
 _FARTHEST = (0.5, 99.5)
 _NOTHING = 255
 
 
 def write_preview(path: Path, mesh: Triangles, axes: NDArray[np.float64]) -> None:
-    """Draw a mesh's corners as seen from the south and from above, without perspective.
+    """Draw a mesh as seen from the south and from above, without perspective.
 
     Parameters
     ----------
@@ -37,13 +41,19 @@ def write_preview(path: Path, mesh: Triangles, axes: NDArray[np.float64]) -> Non
     places = mesh.points @ np.stack([axes[0], -upwards, nearer]).T.astype(np.float32)
     low, high = np.percentile(places[:, :2], _FARTHEST, axis=0)
     extent = np.maximum(high - low, 1e-9)
-    side = min(PREVIEW_SIDE, math.sqrt(len(places) / _CORNERS))
+    is_large = len(mesh.faces) > _MOST_FACES
+    side = min(PREVIEW_SIDE, math.sqrt(len(places) / _CORNERS)) if is_large else PREVIEW_SIDE
     scale = side / float(extent.max())
     width, height = (max(1, int(length * scale)) for length in extent)
-    column, row = ((places[:, :2] - low) * scale).astype(np.int64).T
-    order = np.argsort(places[:, 2], kind="stable")  # the nearest is drawn last
-    is_shown = (column >= 0) & (row >= 0) & (column < width) & (row < height)
-    order = order[is_shown[order]]
+    pixels = np.floor((places[:, :2] - low) * scale).clip(-_FAR, _FAR).astype(np.int32)
     picture = np.full((height, width, 3), _NOTHING, np.uint8)
-    picture[row[order], column[order]] = mesh.colours[order]
+    if is_large:
+        is_shown = ((pixels >= 0) & (pixels < (width, height))).all(axis=1)
+        order = np.argsort(places[:, 2], kind="stable")  # the nearest is drawn last
+        order = order[is_shown[order]]
+        picture[pixels[order, 1], pixels[order, 0]] = mesh.colours[order]
+    else:
+        colours = mesh.colours[mesh.faces].mean(axis=1).tolist()
+        for face in np.argsort(places[mesh.faces, 2].mean(axis=1), kind="stable"):
+            cv2.fillConvexPoly(picture, pixels[mesh.faces[face]], colours[face])
     write_picture(path, picture)
