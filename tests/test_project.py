@@ -225,10 +225,24 @@ def test_the_output_would_be_a_file(
     assert Path("file").read_text() == "mine"
 
 
-@pytest.mark.parametrize("option", ["--model", "--workspace"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["run", "--model"],
+        ["run", "--workspace"],
+        ["export"],
+        ["view"],
+        ["stereo_fusion", "--output_path", "fused.ply", "--workspace_path"],
+        ["patch_match_stereo", "--workspace_path"],
+    ],
+)
 @pytest.mark.parametrize("place", ["closed/project", "closed/folder/../project", "closed/../project"])
 def test_a_folder_that_may_not_be_entered(
-    option: str, place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    command: list[str],
+    place: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     """The system refuses whatever leads through it, also where it leads out again; root would be let in."""
     closed = f"{tmp_path}/closed/"
@@ -244,7 +258,7 @@ def test_a_folder_that_may_not_be_entered(
     for name in ("stat", "lstat"):
         monkeypatch.setattr(os, name, refusing(getattr(os, name)))
     folder = tmp_path / place
-    assert cli.main(["run", option, str(folder)]) == 2
+    assert cli.main([*command, str(folder)]) == 2
     said = " ".join(capsys.readouterr().err.split())
     assert said == f"error: {folder} cannot be read (Permission denied); check its permissions."
     assert Project(model=folder / "sparse" / "0").root.name == "dense"

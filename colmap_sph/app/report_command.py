@@ -14,6 +14,7 @@ from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pages import write_page
 from colmap_sph.platforms.surroundings import has_screen
 from colmap_sph.project.claim import check_links
+from colmap_sph.project.project import check_open
 from colmap_sph.project.sparse_model import has_model
 from colmap_sph.project.workspace import Workspace
 
@@ -106,6 +107,7 @@ def _serve_cloud(workspace: Workspace, port: int, terminal: Terminal) -> int:
 def opened(folder: Path) -> Workspace:
     """The workspace in a folder; `InputError` where it is none, `OutputError` where links lead out of it."""
     workspace = Workspace(folder)
+    check_open(folder)
     if not folder.is_dir():
         wrong = "is a file" if folder.is_file() else "does not exist"
         raise InputError(f"The workspace {folder} {wrong}; give a dense workspace, such as dense.")

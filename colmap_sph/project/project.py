@@ -53,7 +53,7 @@ class Project:
             raise OptionError(f"There is nothing to work on: {_what_to_give()}")
 
     def _check_workspace(self, workspace: Path) -> None:
-        _check_open(workspace)
+        check_open(workspace)
         given = {"--images": self.images, "--output": self.output}
         surplus = [option for option, value in given.items() if value is not None]
         if surplus:
@@ -127,6 +127,16 @@ def open_workspace(project: Project) -> Workspace:
     return workspace
 
 
+def check_open(folder: Path) -> None:
+    """Raise `InputError` where permissions keep us out of a folder; what else is wrong with it is told later."""
+    try:
+        (folder / "..").stat()  # who may not enter it is not told even that
+    except PermissionError as error:
+        raise InputError(f"{folder} cannot be read ({reason_of(error)}); check its permissions.") from error
+    except OSError:
+        return
+
+
 def _check_folders(workspace: Workspace) -> None:
     root = workspace.root
     if not root.is_dir():
@@ -147,18 +157,8 @@ def _no_workspace(root: Path, lack: str) -> str:
     )
 
 
-def _check_open(folder: Path) -> None:
-    """Raise `InputError` where permissions keep us out of a folder; what else is wrong with it is told later."""
-    try:
-        (folder / "..").stat()  # who may not enter it is not told even that
-    except PermissionError as error:
-        raise InputError(f"{folder} cannot be read ({reason_of(error)}); check its permissions.") from error
-    except OSError:
-        return
-
-
 def _check_model(model: Path) -> None:
-    _check_open(model)
+    check_open(model)
     if _is_dense_workspace(model) and not has_model(model):
         raise OptionError(
             f"{model} is a dense workspace, not a sparse model; give it as --workspace {shell_word(model)}."

@@ -20,6 +20,7 @@ from colmap_sph.app.shell_words import to_repeat
 from colmap_sph.app.terminal import Terminal, standard_output
 from colmap_sph.errors import counted
 from colmap_sph.pipeline.report import RunReport
+from colmap_sph.project.project import check_open
 from colmap_sph.project.workspace import Workspace
 
 
@@ -44,6 +45,7 @@ def answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int:
         return 0
     _tell_idle(given, terminal)
     workspace = Workspace(Path(str(given.plain["workspace_path"])))
+    check_open(workspace.root)
     with workspace_log(workspace, header(arguments)), Display(terminal) as display:
         make = partial(make_maps, started=started) if name == "patch_match_stereo" else make_cloud
         report = make(given.plain, given.sectioned, command=to_repeat(arguments), progress=display)
