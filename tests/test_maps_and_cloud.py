@@ -165,7 +165,7 @@ def test_products_are_made_of_the_maps_of_the_last_run(
     assert Workspace(dense).depth_map_path(gone, "geometric").is_file()
     assert exported_maps(dense, tmp_path / "fewer") == names - {gone}
     said = " ".join(capsys.readouterr().err.split())
-    assert f"1 of 10 depth maps in {dense}, such as that of {gone}, are of another run than the cloud" in said
+    assert f"The cloud in {dense} was not made of 1 of the 10 depth maps there, such as that of {gone}" in said
     assert {each.view.name for each in seen_views(Workspace(dense))[1]} == names - {gone}
 
 

@@ -119,7 +119,7 @@ def _of_last_cloud(workspace: Workspace, mapped: list[_Mapped]) -> list[_Mapped]
     fused = images_of_cloud(workspace, [view.name for _, view, _ in mapped])
     if fused is None:
         return mapped
-    others = [view.name for _, view, path in mapped if view.name not in fused and _may_show(path)]
+    others = {view.name for _, view, path in mapped if view.name not in fused and _may_show(path)}
     if not others:
         return mapped
     if not fused:
@@ -130,11 +130,11 @@ def _of_last_cloud(workspace: Workspace, mapped: list[_Mapped]) -> list[_Mapped]
         )
         return mapped
     logger.warning(
-        "%d of %d depth maps in %s, such as that of %s, are of another run than the cloud; left out",
+        "The cloud in %s was not made of %d of the %d depth maps there, such as that of %s; left out",
+        workspace.root,
         len(others),
         len(mapped),
-        workspace.root,
-        others[0],
+        min(others),
     )
     return [each for each in mapped if each[1].name not in others]
 
