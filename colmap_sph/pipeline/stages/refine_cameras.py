@@ -4,6 +4,7 @@ First the distortion that an OPENCV camera can have, then a lens field. Each is 
 in it fit clearly better, the field where better than with the distortion.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -32,6 +33,8 @@ class CamerasToRefine:
         Of the undistorted images.
     used, held_out : Tracks
         To refine by, and to judge by.
+    step : callable
+        Called between the distortion and the fields.
     """
 
     model_dir: Path
@@ -39,6 +42,7 @@ class CamerasToRefine:
     scene: Scene
     used: Observations
     held_out: Tracks
+    step: Callable[[], None]
 
 
 def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, target: Path) -> str:
@@ -67,6 +71,8 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
     tried = np.inf
     options = task.options.for_colmap()
     for refine in (with_distortion, with_fields):
+        if refine is with_fields:
+            task.step()
         refined = refine(given, task.used, options)
         if refined is None:
             continue
@@ -80,8 +86,8 @@ def refine_cameras(task: CamerasToRefine, before: float, least_gain: float, targ
         return f"The cameras are kept as given: refined ones are not clearly better {found}."
     best.write(target)
     return (
-        f"Cameras were refined ({best.words(given)}): ties that had no part in it fit to {error:.2f} px, before "
-        f"{before:.2f} px."
+        f"Cameras were refined ({best.words(given)}): ties that had no part in it fit to {error:.2f} px, "
+        f"with the given cameras to {before:.2f} px."
     )
 
 
