@@ -374,7 +374,7 @@ def test_cameras_with_fields_are_kept(tmp_path: Path) -> None:
     model = bent_project(tmp_path)
     nothing = Tracks(np.empty(0, np.int64), np.empty(0, np.int64), np.empty((0, 2)))
     used = Observations([], nothing.track, nothing.view, nothing.pixels, np.empty((0, 3)), 0.1)
-    task = CamerasToRefine(model, UndistortionOptions(), NO_SCENE, used, nothing)
+    task = CamerasToRefine(model, UndistortionOptions(), NO_SCENE, used, nothing, lambda: None)
     said = refine_cameras(task, 0.5, 0.05, tmp_path / "refined")
     assert said == "The cameras are kept as given: they have lens fields already."
     assert not (tmp_path / "refined").exists()

@@ -1,5 +1,6 @@
 """Polishing of poses: disturbed poses come back, good ones stay, and what cannot be polished says so."""
 
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +16,7 @@ import colmap_sph
 from colmap_sph.errors import NoResultError, OptionError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
-from colmap_sph.pipeline.report import RunReport
+from colmap_sph.pipeline.report import RunReport, Silent
 from colmap_sph.project.polishing import PolishOptions
 from colmap_sph.project.project import Project
 from colmap_sph.project.workspace import Workspace
@@ -91,6 +92,22 @@ def project(pristine: Path, tmp_path: Path) -> Path:
 
 def run(project: Path, options: RunOptions = ON) -> RunReport:
     return colmap_sph.run(project / "sparse/0", options=options)
+
+
+class Steps(Silent):
+    """Of each stage: its steps, and how many of them were told while a file was not there."""
+
+    def __init__(self, result: Path) -> None:
+        self.told: dict[str, tuple[int, int]] = {}
+        self._result = result
+
+    def start(self, stage: str, total: int) -> None:
+        self._stage = stage
+        self.told[stage] = total, 0
+
+    def advance(self, seconds: float = 0.0) -> None:
+        total, before = self.told[self._stage]
+        self.told[self._stage] = total, before + (not self._result.exists())
 
 
 def models(project: Path) -> tuple[bytes, bytes]:
@@ -268,8 +285,11 @@ def test_poses_that_are_good_are_kept(project: Path) -> None:
     shutil.rmtree(project / "dense")
     shutil.rmtree(project / "sparse")
     shutil.copytree(project / "true", project / "sparse/0")
-    report = run(project)
+    steps = Steps(project / "nothing")
+    report = colmap_sph.run(project / "sparse/0", options=ON, progress=steps)
     assert "they are good already" in report.polishing
+    told, done = steps.told["polish poses"]
+    assert told == done > 1  # also those that were not needed
     assert report.made["match pairs"] == 0
     assert made(run(project)) == {}
 
@@ -293,9 +313,18 @@ def wrong_lens(model: pycolmap.Reconstruction) -> None:
 def test_cameras_are_refined_into_a_model_of_their_own(project: Path) -> None:
     change_model(project, wrong_lens)
     given = (project / "sparse/0/cameras.bin").read_bytes()
-    report = run(project, replace(OFF, polish=PolishOptions("on", cameras=True)))
-    assert "Cameras were refined" in report.polishing
     refined = project / "dense/colmap_sph/refined"
+    steps = Steps(refined)
+    options = replace(OFF, polish=PolishOptions("on", cameras=True))
+    report = colmap_sph.run(project / "sparse/0", output=project / "dense", options=options, progress=steps)
+    # Each pair's ties, the poses, the distortion; and what comes of the cameras.
+    measured = steps.told["match pairs to polish"][0] + 2
+    assert steps.told["polish poses"] == (measured + 1, measured)
+    poses, cameras = report.polishing.split("Cameras were refined")
+    # Of the same ties: with the given cameras they fit as with the better poses, not as before any polishing.
+    residuals = r"had no part in it fit to ([\d.]+) px, before ([\d.]+) px"
+    best = min(map(float, re.search(residuals, poses).groups()))  # type: ignore[union-attr]
+    assert f"px, with the given cameras to {best:.2f} px." in cameras
     assert f"--model {refined} --images {project / 'images'}" in report.polishing
     for camera in pycolmap.Reconstruction(refined).cameras.values():
         k1, k2 = camera.params[4:6]

@@ -61,7 +61,7 @@ def execute(stage: Stage[Item, Task]) -> dict[Item, Result]:
         A wrong option, an output that cannot be written, or nothing to go on with.
     """
     context = stage.context
-    with stage.opened(), context.stage(stage.name, len(stage.items)):
+    with stage.opened(), context.stage(stage.name, stage.steps):
         results = made_by_threads(stage)
         stage.close(results)
     tell_counts(stage, results)

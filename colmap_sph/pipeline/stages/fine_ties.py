@@ -4,7 +4,7 @@ Soft photographs are matched coarsely, and what is measured in coarse windows kn
 images do. Poses need the places: windows of such pairs are taken anew, a pixel of the window a pixel of the image.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,7 +23,9 @@ CACHE_BYTES = 256 << 20
 """Of images that are kept while pairs are measured."""
 
 
-def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) -> dict[tuple[str, str], ImageTies]:
+def fine_ties(
+    workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene, step: Callable[[], None]
+) -> dict[tuple[str, str], ImageTies]:
     """Ties of all pairs; a pair whose file or images cannot be read has none.
 
     Parameters
@@ -33,6 +35,8 @@ def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) ->
         Files of the disparity maps.
     scene : Scene
         With the views that they were matched with.
+    step : callable
+        Called after each pair.
 
     Returns
     -------
@@ -59,6 +63,7 @@ def fine_ties(workspace: Workspace, pairs: Mapping[Pair, Path], scene: Scene) ->
                     image_coordinates(left, geometry, "left", found.left),
                     image_coordinates(right, geometry, "right", found.right),
                 )
+            step()
     return ties
 
 

@@ -3,7 +3,7 @@
 What is accepted is decided by ties that had no part in the adjustment, and by the model's own tracks.
 """
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,7 +13,7 @@ import numpy as np
 
 from colmap_sph.pipeline.stages.facts import Facts, Polish
 from colmap_sph.pipeline.stages.fine_ties import CACHE_BYTES, fine_ties
-from colmap_sph.pipeline.stages.stage import Cost, Job, Stage
+from colmap_sph.pipeline.stages.stage import Cost, Job, Result, Stage
 from colmap_sph.project.files import remove, scratch_folder
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
 from colmap_sph.project.polishing.options import PolishOptions
@@ -75,7 +75,10 @@ class GivenModel:
 
 @dataclass(frozen=True, eq=False)
 class PolishTask:
-    """The model to polish, the disparity maps whose ties tell how, and where the result goes."""
+    """The model to polish, the disparity maps whose ties tell how, and where the result goes.
+
+    `step` is called after each step but the last: the pairs, the poses, the cameras' distortion.
+    """
 
     workspace: Workspace
     given: GivenModel
@@ -83,6 +86,7 @@ class PolishTask:
     options: PolishOptions
     undistortion: UndistortionOptions
     key: str
+    step: Callable[[], None]
 
 
 def polish_poses(task: PolishTask) -> Facts:
@@ -93,7 +97,7 @@ def polish_poses(task: PolishTask) -> Facts:
     folder = starting_model(workspace)
     given = load_model(folder)
     scene = scene_of_model(given, folder)
-    tracks = tracks_of_ties(fine_ties(workspace, task.pairs, scene), scene.index_of)
+    tracks = tracks_of_ties(fine_ties(workspace, task.pairs, scene, task.step), scene.index_of)
     tracks = sound_tracks(tracks, scene)
     reason = refusal(tracks, scene, task.options.least_residual)
     if reason:
@@ -166,9 +170,10 @@ def _with_refined_cameras(task: PolishTask, tracks: Tracks, scene: Scene, judgem
     # Not before: what it is solved with takes its time to load.
     from colmap_sph.pipeline.stages.refine_cameras import CamerasToRefine, refine_cameras
 
+    task.step()
     used, held_out = _divided(tracks)
     to_refine = CamerasToRefine(
-        task.given.model_dir, task.undistortion, scene, _observations(used, scene), held_out
+        task.given.model_dir, task.undistortion, scene, _observations(used, scene), held_out, task.step
     )
     before = min(judgement.before, judgement.after)
     return refine_cameras(to_refine, before, task.options.least_gain, task.workspace.refined_model_dir)
@@ -207,6 +212,21 @@ class PolishStage(Stage[str, PolishTask]):
         self._given = given
         self._pairs = pairs
         self._matched = matched
+        self._steps_left = self.steps - 1
+
+    @property
+    def steps(self) -> int:
+        """See `Stage.steps`: the pairs' ties, the poses, and two of the cameras."""
+        return len(self._matched) + (3 if self.context.options.polish.cameras else 1)
+
+    def _step(self) -> None:
+        self._steps_left -= 1
+        self.context.progress.advance()
+
+    def close(self, results: Mapping[str, Result]) -> None:
+        """Tell the steps that were not needed; see `Stage.close`."""
+        while self._steps_left:
+            self._step()
 
     def job(self, item: str) -> Job[PolishTask]:
         """See `Stage.job`."""
@@ -214,7 +234,13 @@ class PolishStage(Stage[str, PolishTask]):
         key = context.keys.polish(self._pairs, starting_model(context.workspace))
         paths = {pair: context.pair_path(*pair) for pair in self._matched}
         task = PolishTask(
-            context.workspace, self._given, paths, context.options.polish, context.options.undistortion, key
+            context.workspace,
+            self._given,
+            paths,
+            context.options.polish,
+            context.options.undistortion,
+            key,
+            self._step,
         )
         number = len(context.scene.views)
         is_refining = context.options.polish.cameras

@@ -121,6 +121,11 @@ class Stage(ABC, Generic[Item, Task]):
         self.context = context
         self.items = items
 
+    @property
+    def steps(self) -> int:
+        """How many steps of progress it has: the last of each item is told where this is done."""
+        return len(self.items)
+
     @abstractmethod
     def job(self, item: Item) -> Job[Task]:
         """Ask for an item; `ColmapSphError` where it cannot be done."""
