@@ -16,7 +16,8 @@ from colmap_sph.synthetic import BlockOptions, DemoBlock, make_demo_block
 SMALL_BLOCK = BlockOptions(
     width=320, height=240, nadir_gsd=0.2, oblique_gsd=0.22, strip_images=3, oblique_images=1, points=1500
 )
-
+IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
+"""Three of the block's, in a row: what `small` has."""
 
 _CALL = ChildProcess.call
 _START_FOR = ChildProcess.start_for
@@ -74,6 +75,14 @@ def project(block: DemoBlock, tmp_path: Path) -> Path:
     """A copy of the block's images and model, to do with as a test likes."""
     copy_block(block, tmp_path)
     return tmp_path
+
+
+@pytest.fixture
+def small(project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A project of three images, which is also the current folder."""
+    keep_images(project, IMAGES)
+    monkeypatch.chdir(project)
+    return project
 
 
 @dataclass(frozen=True)

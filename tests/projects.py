@@ -137,6 +137,12 @@ def make_context(workspace: Workspace) -> Context:
     return Context(workspace, read_scene(workspace.sparse_dir), options, Keys(workspace, options))
 
 
+def results(dense: Path) -> dict[str, bytes]:
+    """Maps, clouds and intermediate results of a workspace, by their paths in it."""
+    files = [*dense.glob("stereo/*_maps/*.bin"), *dense.glob("fused*"), *dense.glob("colmap_sph/p*/**/*.sph")]
+    return {str(path.relative_to(dense)): path.read_bytes() for path in files}
+
+
 FOUR_NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 FOUR_SIZE = (160, 120)
 

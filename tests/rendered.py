@@ -5,6 +5,7 @@ import numpy as np
 
 from colmap_sph import synthetic as syn
 from colmap_sph.scene import Scene, View
+from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.rectified_pair import Side
 
 SIDES: tuple[Side, Side] = ("left", "right")
@@ -32,6 +33,11 @@ def scene_of_pair(pair, count=600):
 def grey(rendering):
     """(H, W) uint8 picture."""
     return cv2.cvtColor(rendering.image, cv2.COLOR_RGB2GRAY)
+
+
+def whole(image: np.ndarray) -> RectifiedImage:
+    """A rectified image of which every pixel was seen."""
+    return RectifiedImage(image.astype(np.float32), np.full(image.shape, 255, np.uint8))
 
 
 def pixel_rays(view, x, y):

@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rendered import whole
 
 import colmap_sph
 from colmap_sph import synthetic as syn
@@ -14,7 +15,6 @@ from colmap_sph.project.images.jpeg import rounding_step
 from colmap_sph.project.map_files import read_depth_map
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.blank import blank_pixels, drop_scattered, faint_pixels, faint_rays
-from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.matching import MatchingOptions, match_pair
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 300.0
@@ -271,7 +271,7 @@ def clouds_behind_a_wall():
         image = clouds.copy()
         image[100:, first : first + 120] = wall[100:]
         image += rng.normal(0, 1, image.shape)
-        images.append(RectifiedImage(image.astype(np.float32), np.full(image.shape, 255, np.uint8)))
+        images.append(whole(image))
     is_wall = np.zeros((height, width), bool)
     is_wall[100:, 160:280] = True
     return *images, is_wall

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from rendered import whole
 from scipy import ndimage
 
 from colmap_sph.stereo.census import RectifiedImage
@@ -16,10 +17,6 @@ OFFSET = -12
 def texture(shape: tuple[int, int], seed: int = 0) -> np.ndarray:
     values = ndimage.gaussian_filter(np.random.default_rng(seed).standard_normal(shape), 1.0)
     return np.asarray(120 + 100 * values)
-
-
-def whole(image: np.ndarray) -> RectifiedImage:
-    return RectifiedImage(image.astype(np.float32), np.full(image.shape, 255, np.uint8))
 
 
 def shifted_pair() -> tuple[np.ndarray, np.ndarray]:

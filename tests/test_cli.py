@@ -20,7 +20,7 @@ import numpy as np
 import pycolmap
 import pytest
 from clouds import read_visibility
-from conftest import keep_images
+from conftest import IMAGES
 
 import colmap_sph
 from colmap_sph.app import cli, run_command, spelling
@@ -31,16 +31,7 @@ from colmap_sph.app.run_command import RunCommand
 from colmap_sph.app.spelling import in_full, with_dashed_values
 from colmap_sph.pipeline.options import RunOptions
 
-IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
 FAST = ["--threads", "2", "--num-pairs", "2"]
-
-
-@pytest.fixture
-def small(project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project of three images, which is also the current folder."""
-    keep_images(project, IMAGES)
-    monkeypatch.chdir(project)
-    return project
 
 
 def tree(folder: Path) -> list[str]:

@@ -14,8 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from conftest import copy_block, keep_images
+from conftest import IMAGES, copy_block
 from distributed import Client, LocalCluster
+from projects import results
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -34,7 +35,6 @@ from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import NO_SCENE
 from colmap_sph.synthetic import DemoBlock
 
-IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
 MORE_IMAGES = [*IMAGES, "N_1_0.jpg", "N_1_1.jpg", "N_1_2.jpg"]
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
@@ -74,19 +74,6 @@ def whole(block: DemoBlock, tmp_path_factory: pytest.TempPathFactory) -> Whole:
     copy_block(block, folder, MORE_IMAGES)
     model, dense = folder / "sparse/0", folder / "dense"
     return Whole(model, dense, colmap_sph.run(model, output=dense))
-
-
-@pytest.fixture
-def small(project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project of three images, which is also the current folder."""
-    keep_images(project, IMAGES)
-    monkeypatch.chdir(project)
-    return project
-
-
-def results(dense: Path) -> dict[str, bytes]:
-    files = [*dense.glob("stereo/*_maps/*.bin"), *dense.glob("fused*"), *dense.glob("colmap_sph/p*/**/*.sph")]
-    return {str(path.relative_to(dense)): path.read_bytes() for path in files}
 
 
 def leftovers(dense: Path) -> list[Path]:

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from refusals import assert_refused
-from rendered import SIDES, exact_disparity, grey, scene_of_pair
+from rendered import SIDES, exact_disparity, grey, scene_of_pair, whole
 from scipy import ndimage
 
 from colmap_sph import _native
@@ -88,10 +88,6 @@ def random_image(shape, seed=0):
     rng = np.random.default_rng(seed)
     values = ndimage.gaussian_filter(rng.standard_normal(shape), 1.0)
     return whole(np.clip(128 + 200 * values, 0, 255).astype(np.uint8))
-
-
-def whole(image):
-    return RectifiedImage(image.astype(np.float32), np.full(image.shape, 255, np.uint8))
 
 
 # ---- rendered scenes ---------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import pytest
 import tyro
-from conftest import keep_images
+from conftest import IMAGES
 
 from colmap_sph.app import cli, run_command
 from colmap_sph.app.config_file import arguments_of_file
@@ -24,16 +24,7 @@ from colmap_sph.app.run_command import RunCommand
 from colmap_sph.app.shell_words import as_typed
 from colmap_sph.errors import InputError
 
-IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
 RUN = ["run", "--model", "sparse/0", "--threads", "2", "--num-pairs", "2"]
-
-
-@pytest.fixture
-def small(project: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A project of three images, which is also the current folder."""
-    keep_images(project, IMAGES)
-    monkeypatch.chdir(project)
-    return project
 
 
 def events(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, list[dict[str, Any]], str]:

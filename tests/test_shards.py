@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from conftest import copy_block
 from numpy.typing import NDArray
+from projects import results
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -85,11 +86,6 @@ def hasty(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def make(project: Project, stage: StageName, number: int = 1, parts: int = 1) -> PartReport:
     return run_part(project, OPTIONS, stage, Part(number, parts))
-
-
-def results(dense: Path) -> dict[str, bytes]:
-    files = [*dense.glob("stereo/*_maps/*.bin"), *dense.glob("fused*"), *dense.glob("colmap_sph/p*/**/*.sph")]
-    return {str(path.relative_to(dense)): path.read_bytes() for path in files}
 
 
 def times(dense: Path) -> dict[Path, int]:
