@@ -1,8 +1,11 @@
 """Projects on disk made of a rendered block's pictures, seen by whatever cameras, formats and names."""
 
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import cv2
 import numpy as np
@@ -147,9 +150,17 @@ FOUR_NAMES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_1.jpg"]
 FOUR_SIZE = (160, 120)
 
 
-def render_four_images(folder: Path) -> None:
-    """Small pictures of one strip: all six pairs among them can be matched."""
+@cache
+def _four_images() -> TemporaryDirectory[str]:
+    """Rendered once for all tests of a process; goes with it."""
+    folder = TemporaryDirectory()
     width, height = FOUR_SIZE
     small = replace(SMALL_BLOCK, width=width, height=height, nadir_gsd=0.4, oblique_gsd=0.44)
-    make_demo_block(folder, small, threads=2)
-    keep_images(folder, FOUR_NAMES)
+    make_demo_block(Path(folder.name), small, threads=2)
+    keep_images(Path(folder.name), FOUR_NAMES)
+    return folder
+
+
+def copy_four_images(folder: Path) -> None:
+    """Small pictures of one strip, and their model: all six pairs among them can be matched."""
+    shutil.copytree(_four_images().name, folder, dirs_exist_ok=True)

@@ -10,7 +10,7 @@ import numpy as np
 import pycolmap
 import pytest
 from exact_maps import HEIGHT, NAMES, WIDTH, make_workspace
-from projects import FOUR_NAMES, read_picture, render_four_images
+from projects import FOUR_NAMES, copy_four_images, read_picture
 
 import colmap_sph
 from colmap_sph.app import cli
@@ -269,7 +269,7 @@ def test_of_many_images_left_out_the_first_are_listed(tmp_path, capsys):
 @pytest.fixture(scope="module")
 def four(tmp_path_factory):
     root = tmp_path_factory.mktemp("four")
-    render_four_images(root)
+    copy_four_images(root)
     return root
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from projects import render_four_images
+from projects import copy_four_images
 
 from colmap_sph.app import cli
 from colmap_sph.project.map_coordinates import move_model
@@ -66,7 +66,7 @@ def results(dense: Path) -> dict[str, bytes]:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A project that was reconstructed with all that this system has; not to be changed."""
     root = tmp_path_factory.mktemp("whole")
-    render_four_images(root)
+    copy_four_images(root)
     assert cli.main(["run", "--model", str(root / "sparse/0"), "--threads", "2"]) == 0
     return root
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from projects import FOUR_NAMES, FOUR_SIZE, render_four_images, write_picture
+from projects import FOUR_NAMES, FOUR_SIZE, copy_four_images, write_picture
 
 import colmap_sph
 from colmap_sph.app import run_command as command_module
@@ -30,7 +30,7 @@ OPTIONS = RunOptions(threads=1)
 def four(tmp_path_factory):
     """Four images, undistorted, with all results."""
     root = tmp_path_factory.mktemp("four")
-    render_four_images(root)
+    copy_four_images(root)
     colmap_sph.run(root / "sparse/0", options=OPTIONS)
     return root
 

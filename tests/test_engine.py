@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from projects import FOUR_NAMES, prepare, render_four_images
+from projects import FOUR_NAMES, copy_four_images, prepare
 
 from colmap_sph.errors import InputError, OptionError, OutputError
 from colmap_sph.pipeline.context import Context
@@ -146,7 +146,7 @@ def test_what_a_lost_worker_has_made_is_found(run: RunSeen, place: Workplace) ->
 
 def test_a_result_half_done_is_not_begun_anew(tmp_path: Path) -> None:
     """Who knows nothing but the task finds the result of a pair or an image, and an estimate without its maps."""
-    render_four_images(tmp_path)
+    copy_four_images(tmp_path)
     workspace = prepare(tmp_path / "sparse/0", tmp_path / "dense")
     workspace.create_stereo_dirs(FOUR_NAMES)
     options = RunOptions(threads=2, fusion=FusionOptions(input="photometric"))

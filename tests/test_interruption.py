@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import SCRIPTS, copy_block, keep_images
-from projects import render_four_images
+from projects import copy_four_images
 
 from colmap_sph.app import cli
 from colmap_sph.evaluation import neighbours
@@ -385,7 +385,7 @@ def test_files_that_may_not_grow(uninterrupted: Path, tmp_path: Path) -> None:
 
 def test_a_model_that_may_not_grow(tmp_path: Path) -> None:
     """COLMAP does not notice that the system cuts off its model: no fault of the one that it was made from."""
-    render_four_images(tmp_path)
+    copy_four_images(tmp_path)
     dense = tmp_path / "dense"
     command = [sys.executable, "-P", "-m", "colmap_sph", "run", "--model", str(tmp_path / "sparse/0")]
 

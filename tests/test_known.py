@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from projects import FOUR_NAMES, render_four_images
+from projects import FOUR_NAMES, copy_four_images
 
 import colmap_sph
 from colmap_sph.pipeline.known import remembering
@@ -95,7 +95,7 @@ def test_a_selection_is_read_as_it_was(tmp_path: Path) -> None:
 def dense(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished workspace; tests leave it finished."""
     project = tmp_path_factory.mktemp("known")
-    render_four_images(project)
+    copy_four_images(project)
     colmap_sph.run(project / "sparse/0", options=OPTIONS)
     return project / "dense"
 

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from projects import FOUR_NAMES, read_picture, render_four_images
+from projects import FOUR_NAMES, copy_four_images, read_picture
 
 import colmap_sph
 from colmap_sph.errors import NoResultError, OptionError
@@ -77,7 +77,7 @@ def epipolar_distance(
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Not to be changed: four images with true poses in `true`, and disturbed ones in `sparse/0`, polished."""
     project = tmp_path_factory.mktemp("polish")
-    render_four_images(project)
+    copy_four_images(project)
     shutil.copytree(project / "sparse/0", project / "true")
     disturbed(project / "sparse/0", 0.7)
     colmap_sph.run(project / "sparse/0", options=ON)

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 import pytest
 from conftest import keep_images
-from projects import FOUR_NAMES, FOUR_SIZE, read_picture, render_four_images
+from projects import FOUR_NAMES, FOUR_SIZE, copy_four_images, read_picture
 
 import colmap_sph
 from colmap_sph.errors import InputError, NoResultError, OutputError
@@ -76,7 +76,7 @@ class Finished:
 def pristine(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """Not to be changed. Small pictures: most tests run twice."""
     project = tmp_path_factory.mktemp("resume")
-    render_four_images(project)
+    copy_four_images(project)
     return Finished(project, colmap_sph.run(project / "sparse/0", options=OPTIONS))
 
 

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 import pytest
-from projects import FOUR_NAMES, prepare, render_four_images
+from projects import FOUR_NAMES, copy_four_images, prepare
 
 import colmap_sph
 from colmap_sph.errors import InputError
@@ -53,7 +53,7 @@ Task = TypeVar("Task")
 def project(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Four images, and what a run makes of them; not to be changed."""
     folder = tmp_path_factory.mktemp("stages")
-    render_four_images(folder)
+    copy_four_images(folder)
     colmap_sph.run(folder / "sparse/0", options=OPTIONS)
     return folder
 
