@@ -173,7 +173,7 @@ def test_shards_at_the_same_time(whole: Whole, prepared: Project) -> None:
         assert job.returncode == 0, said
     expected = {name: content for name, content in results(whole.dense).items() if "/pairs/" in name}
     assert {name: content for name, content in results(dense).items() if "/pairs/" in name} == expected
-    known = json.loads((dense / "colmap_sph/known/pairs.json").read_bytes())["results"]
+    known = json.loads((dense / "colmap_sph/known/pairs.json").read_bytes())["content"]
     assert len(known) == len(expected)
     assert sorted(path.name for path in (dense / "colmap_sph/logs").iterdir()) == [
         f"match-{number}-of-3.txt" for number in (1, 2, 3)
