@@ -1,6 +1,7 @@
 """Surface models and orthophotos of exact maps against the solids that were rendered, and what is refused."""
 
 import json
+import resource
 import shlex
 import sys
 import tracemalloc
@@ -22,9 +23,10 @@ from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.publishing import alone_in
 from colmap_sph.products.surface.drawing import margin_of
 from colmap_sph.products.surface.filling import filled
-from colmap_sph.products.surface.geotiff import LayerFiles
+from colmap_sph.products.surface.geotiff import Layer, LayerFiles
 from colmap_sph.products.surface.make import SurfaceRequest, make_surface
 from colmap_sph.products.surface.options import SurfaceOptions
+from colmap_sph.products.surface.tiles import Tile
 from colmap_sph.project.claim import claimed
 from colmap_sph.project.map_files import read_depth_map, write_depth_map
 from colmap_sph.project.workspace import Workspace
@@ -500,6 +502,30 @@ def test_a_full_disk_leaves_what_was_there(workspace, tmp_path, monkeypatch):
     with pytest.raises(OutputError, match=r"make room"):
         made(workspace, tmp_path / "there" / "a" / "b" / "c")
     assert list((tmp_path / "there").iterdir()) == []
+
+
+@pytest.mark.parametrize("room", [0.1, 1.1], ids=["as it is drawn", "as it is compressed"])
+def test_a_file_that_gdal_cannot_write_is_one_sentence(room, tmp_path):
+    """A disk that fills up meanwhile; noise takes more space with its overviews than without."""
+    side = 1024
+    layer = Layer("dsm.tif", "uint16", ("height",), None, "NEAREST")
+    noise = np.random.default_rng(0).integers(0, 1 << 16, (side, side), np.uint16)
+    raster = Raster(np.eye(3), np.zeros(3), 5, 5, 0.5, side, side)
+    scratch = tmp_path / ".surface.tmp"
+    scratch.mkdir()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (int(room * noise.nbytes), hard))
+    try:
+        with (
+            pytest.raises(OutputError) as error,
+            LayerFiles(scratch, {"dsm": layer}, raster, "", {}) as files,
+        ):
+            files.write("dsm", Tile(0, 0, side, side), [noise])
+            files.finish()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert str(error.value).startswith(f"{tmp_path / 'dsm.tif'} cannot be written (GDAL: ")
+    assert "check space" in str(error.value)
 
 
 def test_space_is_asked_for_without_what_a_killed_process_left(workspace, tmp_path, monkeypatch):

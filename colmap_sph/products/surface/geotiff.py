@@ -88,8 +88,8 @@ class LayerFiles:
     def __enter__(self) -> "LayerFiles":
         # What GDAL keeps counts as memory of ours; a file in parts would not be found again.
         self._stack.enter_context(self._rasterio.Env(GDAL_CACHEMAX=_CACHE, GDAL_PAM_ENABLED="NO"))
-        with _in_words(self._scratch):
-            for key, layer in self._layers.items():
+        for key, layer in self._layers.items():
+            with self._in_words(layer):
                 self._open[key] = self._stack.enter_context(self._create(layer))
         return self
 
@@ -126,7 +126,7 @@ class LayerFiles:
     def write(self, key: str, tile: Tile, bands: list[NDArray[Any]]) -> None:
         """Write a tile of a layer, band by band."""
         window = self._rasterio.windows.Window(tile.column, tile.row, tile.width, tile.height)
-        with _in_words(self._scratch):
+        with self._in_words(self._layers[key]):
             for number, band in enumerate(bands, 1):
                 self._open[key].write(np.ascontiguousarray(band), number, window=window)
 
@@ -136,7 +136,7 @@ class LayerFiles:
         done = []
         for key, layer in self._layers.items():
             path = self._scratch / layer.name
-            with _in_words(path):
+            with self._in_words(layer):
                 self._open[key].close()
                 copy(
                     self._part(layer),
@@ -154,18 +154,19 @@ class LayerFiles:
             done.append(path)
         return done
 
-
-@contextmanager
-def _in_words(path: Path) -> Iterator[None]:
-    """GDAL's errors as ours."""
-    rasterio = gdal()
-    try:
-        yield
-    except rasterio.errors.CRSError as error:
-        raise OptionError(f"crs is not known to GDAL ({reason_of(error)}); give another.", "crs") from error
-    except (rasterio.errors.RasterioError, OSError) as error:
-        cause = error.__cause__ or error
-        raise OutputError(
-            f"{path} cannot be written ({reason_of(cause)}); check space and permissions, or choose another "
-            "--output."
-        ) from error
+    @contextmanager
+    def _in_words(self, layer: Layer) -> Iterator[None]:
+        """GDAL's errors as ours, about the file that a layer becomes."""
+        errors = self._rasterio.errors
+        # Of copies, which rasterio lets through as they are: no error of its own, nor of the system.
+        raw = import_module("rasterio._err").CPLE_BaseError
+        try:
+            yield
+        except errors.CRSError as error:
+            raise OptionError(f"crs is not known to GDAL ({reason_of(error)}); give another.", "crs") from error
+        except (errors.RasterioError, raw, OSError) as error:
+            cause = error.__cause__ or error
+            raise OutputError(
+                f"{self._scratch.parent / layer.name} cannot be written (GDAL: {reason_of(cause)}); check space "
+                "and permissions, or choose another --output."
+            ) from error
