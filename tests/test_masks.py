@@ -21,7 +21,7 @@ from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.stages.pair_files import read_estimate
 from colmap_sph.project.map_files import read_depth_map, read_normal_map
-from colmap_sph.project.masks import check_names, read_mask, undistort_mask
+from colmap_sph.project.masks import check_mask_names, read_mask, undistort_mask
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace, mask_path
@@ -214,7 +214,7 @@ def test_masks_in_another_spelling(tmp_path: Path, image: str, there: str, calle
         prepare(sparse, tmp_path / "dense", masks=tmp_path / "masks")
     assert f"mask {there!a} in " in str(error.value) and f"called {called!a} " in str(error.value)
     with pytest.raises(InputError):
-        check_names(tmp_path / "masks", [image, *NAMES[2:]], tmp_path / "images")
+        check_mask_names(tmp_path / "masks", [image, *NAMES[2:]], tmp_path / "images")
     assert not (tmp_path / "dense").exists()
 
 
@@ -225,11 +225,11 @@ def test_a_mask_that_is_listed_in_another_spelling(tmp_path: Path, caplog: pytes
     other = masks / f"{NAMES[0].upper()}.png"
     if not other.exists():
         other.hardlink_to(masks / f"{NAMES[0]}.png")
-    check_names(masks, NAMES, tmp_path)
+    check_mask_names(masks, NAMES, tmp_path)
     assert not caplog.records
     other.unlink()
     write_masks(masks, [NAMES[0].upper(), NAMES[0]])
-    check_names(masks, NAMES, tmp_path)
+    check_mask_names(masks, NAMES, tmp_path)
     assert [record.getMessage().split(" belongs")[0] for record in caplog.records] == (
         [f"the file {other.name} in {masks}"] if len(list(masks.glob("*.png"))) > 2 else []
     )
@@ -238,7 +238,7 @@ def test_a_mask_that_is_listed_in_another_spelling(tmp_path: Path, caplog: pytes
 def test_images_that_differ_in_case_alone(tmp_path: Path) -> None:
     """Where files do: the mask of one is not that of the other."""
     write_masks(tmp_path / "masks", ["a.jpg"])
-    check_names(tmp_path / "masks", ["a.jpg", "A.jpg"], tmp_path)
+    check_mask_names(tmp_path / "masks", ["a.jpg", "A.jpg"], tmp_path)
 
 
 def test_masks_beside_their_images(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -6,7 +6,7 @@ used whole.
 """
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -109,7 +109,7 @@ def check_masks(
         for name, camera in cameras.items()
         if read_mask(mask_path(folder, name), camera.width, camera.height) is not None
     ]
-    check_names(folder, cameras, image_dir, others)
+    check_mask_names(folder, cameras, image_dir, others)
     bare = sorted(set(cameras) - set(masked))
     if bare:
         they_are = "it is" if len(bare) == 1 else "they are"
@@ -127,7 +127,7 @@ def _refuse_images(folder: Path, names: Iterable[str]) -> None:
             )
 
 
-def check_names(folder: Path, names: Iterable[str], image_dir: Path, others: Iterable[str] = ()) -> None:
+def check_mask_names(folder: Path, names: Collection[str], image_dir: Path, others: Iterable[str] = ()) -> None:
     """Do what `check_masks` does of the names of masks alone: warn of files that belong to no image.
 
     Raises

@@ -14,7 +14,7 @@ from colmap_sph.pipeline.keys import Keys
 from colmap_sph.pipeline.self_check import judge_copies, misplaced_views, refuse_cameras
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of, tell_changed
 from colmap_sph.pipeline.stages.stage import keys_of
-from colmap_sph.project.masks import check_names
+from colmap_sph.project.masks import check_mask_names
 from colmap_sph.project.workspace import Workspace, mask_path
 from colmap_sph.stereo.rectification import sampling_of
 
@@ -31,10 +31,10 @@ _ENOUGH = 10
 
 
 def check_fusion_masks(context: Context) -> None:
-    """See `check_names`; before hours of work, though fusion alone reads them."""
+    """See `check_mask_names`; before hours of work, though fusion alone reads them."""
     folder = context.options.fusion.mask_path
     if folder is not None:
-        check_names(folder, context.scene.index_of, context.workspace.images_dir)
+        check_mask_names(folder, context.scene.index_of, context.workspace.images_dir)
 
 
 def with_good_images(
