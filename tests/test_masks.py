@@ -235,6 +235,16 @@ def test_a_mask_that_is_listed_in_another_spelling(tmp_path: Path, caplog: pytes
     )
 
 
+def test_a_link_to_nothing_is_no_mask(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Also where it is called as a mask that is there, but for its case."""
+    write_masks(tmp_path / "masks", NAMES)
+    link = tmp_path / "masks" / f"{NAMES[0].upper()}.png"
+    if not link.exists():
+        link.symlink_to("nothing")
+    check_mask_names(tmp_path / "masks", NAMES, tmp_path)
+    assert not caplog.records
+
+
 def test_images_that_differ_in_case_alone(tmp_path: Path) -> None:
     """Where files do: the mask of one is not that of the other."""
     write_masks(tmp_path / "masks", ["a.jpg"])

@@ -6,7 +6,7 @@ used whole.
 """
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path, PurePosixPath
 
 import cv2
@@ -135,27 +135,24 @@ def check_mask_names(folder: Path, names: Collection[str], image_dir: Path, othe
     InputError
         There is no mask for any of the images `names`, or one is called as an image's in another spelling.
     """
-    names = list(names)
-    both = [*names, *others]
-    unused = _unused_masks(folder, both, image_dir)
-    _refuse_misspelled(folder, both, unused)
-    if not any(mask_path(folder, name).exists() for name in names):
+    masks = {name: mask_path(folder, name) for name in [*names, *others]}
+    missing = [name for name, mask in masks.items() if not mask.exists()]
+    unused = _unused_masks(folder, masks, image_dir)
+    _refuse_misspelled(folder, missing, unused)
+    if set(names) <= set(missing):
         name = min(names)
         raise InputError(f"{folder} holds no mask for any image; that of {name} must be {folder / name}.png.")
     _warn_of_unused(folder, unused)
 
 
-def _unused_masks(folder: Path, names: Sequence[str], image_dir: Path) -> list[str]:
+def _unused_masks(folder: Path, masks: Mapping[str, Path], image_dir: Path) -> list[str]:
     """Files in a folder of masks that belong to none of the images; none where there is much that is no mask."""
-    known = {mask_path(folder, name) for name in names}
+    known = set(masks.values())
     if real_path(folder) == real_path(image_dir):
-        known |= {folder / name for name in names}
-    files = (PurePosixPath(file) for file in sorted(files_below(folder, len(names)) or []))
-    unused = [
-        str(file)
-        for file in files
-        if folder / file not in known and not file.name.startswith(".") and file.name not in _NO_MASKS
-    ]
+        known |= {folder / name for name in masks}
+    files = (PurePosixPath(file) for file in sorted(files_below(folder, len(masks)) or []))
+    named = (file for file in files if not file.name.startswith(".") and file.name not in _NO_MASKS)
+    unused = [str(file) for file in named if folder / file not in known and (folder / file).is_file()]
     used = [path.relative_to(folder).as_posix() for path in known if path.exists()]
     spelled = other_spellings(unused, used)
     # Where the file system takes both spellings for one, it may list the other one.
@@ -163,12 +160,10 @@ def _unused_masks(folder: Path, names: Sequence[str], image_dir: Path) -> list[s
     return [file for file in unused if file not in same]
 
 
-def _refuse_misspelled(folder: Path, names: Iterable[str], unused: Iterable[str]) -> None:
+def _refuse_misspelled(folder: Path, missing: Collection[str], unused: Iterable[str]) -> None:
     """Raise `InputError` for a mask that would not be used, as its image is spelled in another way."""
-    bare = [name for name in names if not mask_path(folder, name).exists()]
-    usual = {f"{name}.png": name for name in bare}
-    others = {str(PurePosixPath(name).with_suffix(".png")): name for name in bare if PurePosixPath(name).suffix}
-    wanted = others | usual
+    wanted = [f"{name}.png" for name in missing]
+    wanted += [str(PurePosixPath(name).with_suffix(".png")) for name in missing if PurePosixPath(name).suffix]
     spelled = other_spellings(unused, wanted)
     if spelled:
         right, there = min(spelled.items())
