@@ -198,13 +198,13 @@ def facts_of_cloud(
     def read(name: str) -> DepthAndNormals:
         files = context.map_files(name, options.input)
         depth = read_depth_map(files.depth)
-        with_depth[name] = int(np.count_nonzero(depth > 0))
         if options.mask_path is not None:
+            with_depth[name] = int(np.count_nonzero(depth > 0))
             view = context.scene.view(name)
             mask = read_view_mask(mask_path(options.mask_path, name), view)
             if mask is not None:
                 depth[mask == 0] = 0
-        left[name] = int(np.count_nonzero(depth > 0))
+            left[name] = int(np.count_nonzero(depth > 0))
         return depth, read_normal_planes(files.normals)
 
     give_back_freed_memory()  # what fusion kept for its own sizes

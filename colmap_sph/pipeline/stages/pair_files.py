@@ -145,11 +145,11 @@ def bytes_to_read(path: Path, lead: str) -> tuple[int, int] | None:
         report: another worker may have found it so and removed it.
     """
     head = read_head(path)
+    if head is None:
+        return None
     try:
-        geometry = None if head is None else _geometry_of(head)
+        geometry = _geometry_of(head)
     except ValueError:
-        geometry = None
-    if head is None or geometry is None:
         return None
     left, right = (4 * geometry.height * width for width in (geometry.left_width, geometry.right_width))
     codes = left // 2
