@@ -3,8 +3,6 @@
 Nothing here is shared with the C code: plain loops over pixels, 64-bit integers or float64 throughout.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 CENSUS_INVALID = 1 << 63
@@ -462,52 +460,55 @@ def compare_depths(view, depth, sigma, partner, maps, max_error, tolerance, min_
     return verdict, observing, carried, spread, clearance
 
 
-def pixel_area(view, pixel, depth, normal):
-    """Area of a tangent plane that a pixel (col, row) covers, by differences of where its rays meet the plane."""
+def pixel_area(view, pixels, depth, normals):
+    """Areas of tangent planes that pixels (n, 2) (col, row) cover: differences of where their rays meet these."""
     inverse = np.linalg.inv(view.K)
     step = 1e-3
-    point = depth * (inverse @ [*pixel, 1.0])
 
-    def meet(column, row):
-        ray = inverse @ [column, row, 1.0]
-        return ray * (normal @ point) / (normal @ ray)
+    def rays(moved):
+        return np.column_stack([pixels + moved, np.ones(len(pixels))]) @ inverse.T
 
-    across = meet(pixel[0] + step, pixel[1]) - meet(pixel[0] - step, pixel[1])
-    down = meet(pixel[0], pixel[1] + step) - meet(pixel[0], pixel[1] - step)
-    return np.linalg.norm(np.cross(across, down)) / (2 * step) ** 2
+    points = depth[:, None] * rays((0, 0))
 
+    def meet(moved):
+        ray = rays(moved)
+        return ray * ((normals * points).sum(axis=1) / (normals * ray).sum(axis=1))[:, None]
 
-def _agreement(world, normal, partner, options):
-    """What a partner says of a world point: pixel (col, row), distance from it, whether it agrees; clearance."""
-    view = partner.view
-    seen = view.R @ world + view.t
-    if not seen[2] > 0:
-        return None, 0.0, False, np.inf
-    u, v = (view.K @ seen)[:2] / seen[2]
-    x, y = int(np.floor(u + 0.5)), int(np.floor(v + 0.5))
-    clearance = min(abs(u % 1 - 0.5), abs(v % 1 - 0.5))
-    if not (0 <= x < partner.depth.shape[1] and 0 <= y < partner.depth.shape[0]):
-        return None, 0.0, False, clearance
-    depth = float(partner.depth[y, x])
-    if not depth > 0:
-        return None, 0.0, False, clearance
-    difference = abs(depth - seen[2]) / depth / options.max_depth_error
-    cosine = normal @ view.R.T @ partner.normals[:, y, x].astype(float)
-    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / options.max_normal_error
-    clearance = min(clearance, abs(difference - 1), abs(angle - 1))
-    return (x, y), np.hypot(u - x, v - y), difference <= 1 and angle <= 1, clearance
+    across = meet((step, 0)) - meet((-step, 0))
+    down = meet((0, step)) - meet((0, -step))
+    return np.linalg.norm(np.cross(across, down), axis=1) / (2 * step) ** 2
 
 
-def gate(world, normal, partner, options):
-    """What keeps a partner from agreeing with a world point: 0 unseen, 1 depth, 2 normal, 3 nothing; the distance
-    from its pixel's centre; clearance.
+def _agreement(world, normals, partner, options):
+    """What a partner says of world points (n, 3): pixels (n, 2) (col, row), whether these have a depth, distances
+    from them, whether depth and normal agree; clearances.
     """
-    loose = replace(options, max_normal_error=180.0)
-    pixel, distance, agrees, clearance = _agreement(world, normal, partner, options)
-    if pixel is None:
-        return 0, 0.0, clearance
-    _, _, same_depth, _ = _agreement(world, normal, partner, loose)
-    return 1 + same_depth * (1 + agrees), distance, clearance
+    view = partner.view
+    seen = world @ view.R.T + view.t
+    before = seen[:, 2] > 0
+    image = seen @ view.K.T
+    place = image[:, :2] / np.where(before, image[:, 2], 1)[:, None]
+    clearance = np.where(before, np.abs(place % 1 - 0.5).min(axis=1), np.inf)
+    inside = before & (place >= -0.5).all(axis=1) & (place < np.array(partner.depth.shape[::-1]) - 0.5).all(axis=1)
+    pixels = np.where(inside[:, None], np.floor(place + 0.5), 0).astype(int)
+    x, y = pixels.T
+    depth = partner.depth[y, x].astype(float)
+    has_depth = inside & (depth > 0)
+    difference = np.abs(depth - seen[:, 2]) / np.where(has_depth, depth, 1) / options.max_depth_error
+    cosine = ((normals @ view.R.T) * partner.normals[:, y, x].T.astype(float)).sum(axis=1)
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1))) / options.max_normal_error
+    gates = np.minimum(np.abs(difference - 1), np.abs(angle - 1))
+    clearance = np.where(has_depth, np.minimum(clearance, gates), clearance)
+    distance = np.hypot(*(place - pixels).T)
+    return pixels, has_depth, distance, has_depth & (difference <= 1), has_depth & (angle <= 1), clearance
+
+
+def gate(world, normals, partner, options):
+    """What keeps a partner from agreeing with world points (n, 3): 0 unseen, 1 depth, 2 normal, 3 nothing; the
+    distances from its pixels' centres, 0 where unseen; clearances.
+    """
+    _, has_depth, distance, same_depth, same_normal, clearance = _agreement(world, normals, partner, options)
+    return has_depth * (1 + same_depth * (1 + same_normal)), has_depth * distance, clearance
 
 
 def fuse_view(reference, partners, options, stations):
@@ -517,33 +518,41 @@ def fuse_view(reference, partners, options, stations):
     The clearance is the least relative distance from any gate, from a pixel's border and between two areas.
     """
     view = reference.view
+    rows, columns = np.nonzero(reference.depth > 0)
+    pixels = np.column_stack([columns, rows])
+    z = reference.depth[rows, columns].astype(float)
+    own = reference.normals[:, rows, columns].T.astype(float)
+    rays = np.linalg.solve(view.K, np.column_stack([pixels, np.ones(len(z))]).T).T
+    world = (rays * z[:, None] - view.t) @ view.R
+    normals = own @ view.R
+    area = pixel_area(view, pixels, z, own)
+    least = np.full(len(z), np.inf)
+    covered = np.zeros(len(z), bool)
+    views = [[reference.index] for _ in z]
+    seen_from = [{0} for _ in z]
+    colours = [[colour] for colour in reference.image[rows, columns].astype(int)]
+    for partner, station in zip(partners, stations, strict=True):
+        places, _, distance, same_depth, same_normal, margin = _agreement(world, normals, partner, options)
+        least = np.minimum(least, margin)
+        agrees = np.nonzero(same_depth & same_normal)[0]
+        x, y = places[agrees].T
+        other = pixel_area(partner.view, places[agrees], partner.depth[y, x], partner.normals[:, y, x].T)
+        margin = np.minimum(
+            np.abs(distance[agrees] / options.reprojection_error - 1), np.abs(other / area[agrees] - 1)
+        )
+        least[agrees] = np.minimum(least[agrees], margin)
+        covered[agrees] |= (distance[agrees] <= options.reprojection_error) & (other < area[agrees])
+        for k, colour in zip(agrees.tolist(), partner.image[y, x].astype(int), strict=True):
+            views[k].append(partner.index)
+            seen_from[k].add(station)
+            colours[k].append(colour)
     points = {}
+    for k, pixel in enumerate(pixels.tolist()):
+        if not covered[k] and len(seen_from[k]) >= options.min_num_pixels:
+            rgb = np.floor(np.mean(colours[k], axis=0) + 0.5)[::-1]
+            points[tuple(pixel)] = (world[k], normals[k], rgb, tuple(views[k]))
     clearance = np.full(reference.depth.shape, np.inf)
-    for row, col in zip(*np.nonzero(reference.depth > 0), strict=True):
-        z = float(reference.depth[row, col])
-        own = reference.normals[:, row, col].astype(float)
-        world = view.R.T @ (np.linalg.solve(view.K, [col, row, 1.0]) * z - view.t)
-        area = pixel_area(view, (col, row), z, own)
-        views = [reference.index]
-        seen_from = {0}
-        colours = [reference.image[row, col].astype(int)]
-        covered = False
-        for partner, station in zip(partners, stations, strict=True):
-            pixel, distance, agrees, margin = _agreement(world, view.R.T @ own, partner, options)
-            clearance[row, col] = min(clearance[row, col], margin)
-            if not agrees:
-                continue
-            x, y = pixel
-            other = pixel_area(partner.view, pixel, float(partner.depth[y, x]), partner.normals[:, y, x])
-            margin = min(abs(distance / options.reprojection_error - 1), abs(other / area - 1))
-            clearance[row, col] = min(clearance[row, col], margin)
-            covered |= distance <= options.reprojection_error and other < area
-            views.append(partner.index)
-            seen_from.add(station)
-            colours.append(partner.image[y, x].astype(int))
-        if not covered and len(seen_from) >= options.min_num_pixels:
-            rgb = np.floor(np.mean(colours, axis=0) + 0.5)[::-1]
-            points[col, row] = (world, view.R.T @ own, rgb, tuple(views))
+    clearance[rows, columns] = least
     return points, clearance
 
 

@@ -141,12 +141,10 @@ def test_points_are_pixels_of_exact_surfaces(yard):
     assert np.abs(points["xyz"][on_ground].astype(float) @ [0.1, -0.05, 1]).max() < 1e-5
 
 
-@pytest.mark.parametrize("max_reproj_error", [0.5, NO_DOUBLES])
-@pytest.mark.parametrize("least", [1, 2, 3])
-def test_no_holes(yard, least, max_reproj_error):
-    """What enough views see has a point within a pixel of the finest of them."""
-    options = FusionOptions(min_num_pixels=least, max_reproj_error=max_reproj_error)
-    tree = cKDTree(fuse_all(yard, options)[0]["xyz"].astype(float))
+@pytest.fixture(scope="module")
+def seen_points(yard):
+    """Of each view: world points of its pixels, how many views see them, and the finest of their pixels there."""
+    of_views = []
     for one, maps in zip(AROUND, yard, strict=True):
         points, rows, columns = world_points(maps)
         normals = maps.normals[:, rows, columns].T @ one.R
@@ -155,6 +153,17 @@ def test_no_holes(yard, least, max_reproj_error):
             seen = visible(YARD, other, points)
             finest = np.where(seen, np.minimum(finest, pixel_side(other, points, normals)), finest)
             seen_by += seen
+        of_views.append((points, seen_by, finest))
+    return of_views
+
+
+@pytest.mark.parametrize("max_reproj_error", [0.5, NO_DOUBLES])
+@pytest.mark.parametrize("least", [1, 2, 3])
+def test_no_holes(yard, seen_points, least, max_reproj_error):
+    """What enough views see has a point within a pixel of the finest of them."""
+    options = FusionOptions(min_num_pixels=least, max_reproj_error=max_reproj_error)
+    tree = cKDTree(fuse_all(yard, options)[0]["xyz"].astype(float))
+    for points, seen_by, finest in seen_points:
         enough = seen_by >= least
         assert enough.mean() > 0.5
         assert (tree.query(points[enough])[0] < finest[enough]).all()
@@ -362,24 +371,25 @@ def test_fusion_is_the_oracles(seeds, stations, options, monkeypatch):
         with lending(2):
             (points, words), *more = fuse_view(one, others, options, stations=stations)
         assert not more
+        seen = (points["xyz"].astype(float) @ one.view.R.T + one.view.t) @ one.view.K.T
         found = {}
         position = 0
-        for point in points:
+        for point, pixel in zip(points, np.rint(seen[:, :2] / seen[:, 2:]).astype(int).tolist(), strict=True):
             listed = tuple(words[position + 1 : position + 1 + words[position]].tolist())
             position += 1 + int(words[position])
-            seen = one.view.K @ (one.view.R @ point["xyz"].astype(float) + one.view.t)
-            found[tuple(np.rint(seen[:2] / seen[2]).astype(int).tolist())] = (point, listed)
+            found[tuple(pixel)] = (*(point[name] for name in ("xyz", "normal", "rgb")), listed)
         assert position == len(words)
         assert len(found) == len(points)
         pixels = {tuple(p) for p in np.argwhere(clear.T).tolist()}
-        assert {p for p in found if p in pixels} == {p for p in expected if p in pixels}
+        both = sorted(found.keys() & pixels)
+        assert both == sorted(expected.keys() & pixels)
         num_found += len(found)
-        for pixel in pixels & found.keys():
-            (point, listed), (place, normal, rgb, views) = found[pixel], expected[pixel]
-            assert listed == views
-            np.testing.assert_array_equal(point["rgb"], rgb)
-            np.testing.assert_allclose(point["xyz"], place, rtol=1e-6, atol=1e-6)
-            np.testing.assert_allclose(point["normal"], normal, atol=1e-6)
+        place, normal, rgb, views = zip(*(found[pixel] for pixel in both), strict=True)
+        true_place, true_normal, true_rgb, true_views = zip(*(expected[pixel] for pixel in both), strict=True)
+        assert views == true_views
+        np.testing.assert_array_equal(rgb, true_rgb)
+        np.testing.assert_allclose(place, true_place, rtol=1e-6, atol=1e-6)
+        np.testing.assert_allclose(normal, true_normal, atol=1e-6)
     assert num_found > 100
 
 
@@ -406,15 +416,14 @@ def test_gates_are_the_oracles(seed):
             gate,
             distance,
         )
-        for k, (row, column) in enumerate(np.argwhere(one.depth > 0).tolist()):
-            ray = np.linalg.solve(one.view.K, [column, row, 1.0])
-            world = one.view.R.T @ (ray * float(one.depth[row, column]) - one.view.t)
-            normal = one.view.R.T @ one.normals[:, row, column].astype(float)
-            expected, far, clearance = oracle.gate(world, normal, other, options)
-            if clearance > 1e-4:
-                assert gate[k] == expected
-                assert distance[k] == pytest.approx(far, abs=1e-4)
-                seen.add(expected)
+        rays = np.linalg.solve(one.view.K, np.stack([columns, rows, np.ones(len(rows))])).T
+        world = (rays * one.depth[rows, columns, None].astype(float) - one.view.t) @ one.view.R
+        normals = one.normals[:, rows, columns].T.astype(float) @ one.view.R
+        expected, far, clearance = oracle.gate(world, normals, other, options)
+        clear = clearance > 1e-4
+        np.testing.assert_array_equal(gate[clear], expected[clear])
+        np.testing.assert_allclose(distance[clear], far[clear], rtol=1e-6, atol=1e-4)
+        seen |= set(expected[clear].tolist())
     assert seen == {0, 1, 2, 3}
 
 

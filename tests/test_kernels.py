@@ -1,5 +1,6 @@
 """The matching kernels against the slow oracle, to the bit, and their boundary against wrong arguments."""
 
+import functools
 import itertools
 
 import numpy as np
@@ -821,14 +822,9 @@ def run_match(backend, images, bases_, image, p1, p2, max_slant, check: tuple[in
     return offset
 
 
-@every_backend
-@pytest.mark.parametrize("size", SIZES)
-@pytest.mark.parametrize(
-    ("depth", "columns"), [*((depth, "same") for depth in DEPTHS), (32, "torn"), (64, "stretched")]
-)
-@pytest.mark.parametrize("kind", ["smooth", "rough", "jumps"])
-@pytest.mark.parametrize("content", ["all over", "from side to side"])
-def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind, content):
+@functools.lru_cache(maxsize=1)  # backends follow one another
+def chain_of_oracles(size, depth, columns, kind, content):
+    """Input of the matcher, and what the oracles make of it one after the other."""
     rng = np.random.default_rng(depth + size[1])
     left, right = (
         rng.choice(np.array(GREYS["full"], np.int16), (size[0] + 6, width + 8)) for width in (size[1], size[1] + 5)
@@ -841,7 +837,6 @@ def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind
         column = np.arange(size[1])
         valid[0][(column < first) | (column >= end)] = 0
     reference, target = oracle.census(left, valid[0]), oracle.census(right, valid[1])
-    np.testing.assert_array_equal(run_census(backend, right, valid[1]), target)
     image = (left[3:-3, 4:-4] // 64).astype(np.uint8)
     p2 = p2_table(rng, 10, 30, 120)
     surface, shown = base, unwarped(target.shape)
@@ -851,9 +846,21 @@ def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind
     cost = oracle.matching_cost(reference, target, base, depth)
     sums = oracle.aggregation(cost, surface, image, 10, p2, 2, oracle.spans(reference))
     expected = oracle.selection(sums, base, reference, target, *shown, 2, 5)
+    return (right, valid[1]), (reference, target, *shown), (base, surface), image, p2, expected
+
+
+@every_backend
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    ("depth", "columns"), [*((depth, "same") for depth in DEPTHS), (32, "torn"), (64, "stretched")]
+)
+@pytest.mark.parametrize("kind", ["smooth", "rough", "jumps"])
+@pytest.mark.parametrize("content", ["all over", "from side to side"])
+def test_the_matcher_is_the_chain_of_oracles(backend, size, depth, columns, kind, content):
+    picture, images, bases_, image, p2, expected = chain_of_oracles(size, depth, columns, kind, content)
+    np.testing.assert_array_equal(run_census(backend, *picture), images[1])
     # In one piece, and in bands of rows: to the bit the same.
     for rows in {1, 2, 3, max(size[0], 1)}:
-        images = reference, target, *shown
         edges = [*range(0, size[0], rows), size[0]] if size[0] else [0, 0]
-        offset = run_match(backend, images, (base, surface), image, 10, p2, 2, (2, 5), depth, edges)
+        offset = run_match(backend, images, bases_, image, 10, p2, 2, (2, 5), depth, edges)
         np.testing.assert_array_equal(offset, expected)

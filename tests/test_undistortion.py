@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from process_ends import end_process, kill_process, raise_error
 from projects import make_context, prepare
 
 from colmap_sph.errors import InputError, OptionError, OutputError
@@ -564,19 +565,6 @@ def test_colmaps_process_loads_no_reader_of_images() -> None:
     loaded = subprocess.run([sys.executable, "-P", "-c", program], capture_output=True, text=True, check=True)
     assert "pycolmap" in loaded.stdout.split()
     assert not {"cv2", "OpenImageIO", "scipy", "colmap_sph.scene"} & {*loaded.stdout.split()}
-
-
-def end_process(words: str) -> None:
-    print(words, file=sys.stderr)
-    os._exit(7)
-
-
-def kill_process(number: int) -> None:
-    os.kill(os.getpid(), number)
-
-
-def raise_error(error: Exception) -> None:
-    raise error
 
 
 @pytest.mark.usefixtures("with_child_processes")

@@ -205,7 +205,7 @@ LENSES = {
     "230 degrees": Lens("FISHEYE", (114.0, 114.0, 240.0, 240.0), 480, 480, math.radians(115)),
     "137 degrees": Lens("FISHEYE", (200.0, 200.0, 240.0, 240.0), 480, 480),
     "low": Lens("FISHEYE", (150.0, 150.0, 240.0, 100.0), 480, 200, math.radians(98)),
-    "full frame": Lens("FISHEYE", (600.0, 600.0, 900.0, 600.0), 1800, 1200),
+    "full frame": Lens("FISHEYE", (200.0, 200.0, 300.0, 200.0), 600, 400),
     "panorama": Lens(PANORAMA, (880.0, 440.0), 880, 440),
     "half a panorama": Lens(PANORAMA, (880.0, 440.0), 440, 440),
 }

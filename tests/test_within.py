@@ -3,6 +3,7 @@
 import json
 import random
 import re
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
@@ -33,9 +34,11 @@ from colmap_sph.pipeline.stages.selection import choose_pairs
 from colmap_sph.pipeline.stages.stage import Result, Stage
 from colmap_sph.pipeline.stages.vote import VoteStage
 from colmap_sph.project.project import Project
+from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.matching import MatchingOptions
 from colmap_sph.stereo.partners.pairs import PairOptions, PairSelection, select_pairs
 from colmap_sph.stereo.rectification import RectificationOptions
+from colmap_sph.synthetic import DemoBlock
 
 IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg", "N_1_0.jpg", "N_1_1.jpg", "N_1_2.jpg"]
 OPTIONS = RunOptions(threads=1)
@@ -113,15 +116,21 @@ def test_what_the_user_chose_stays() -> None:
     assert ladder[0].applied(options).matching.p1 == 16
 
 
+@pytest.fixture(scope="module")
+def prepared(block: DemoBlock, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten images, undistorted, of which nothing is matched; not to be changed."""
+    return prepare(block.sparse_dir, tmp_path_factory.mktemp("within") / "dense").root
+
+
 @pytest.fixture
-def context(project: Path, monkeypatch: pytest.MonkeyPatch) -> Context:
+def context(prepared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Context:
     """Ten images, undistorted and checked, of which nothing is matched.
 
     The page of so few small images would take longer than all else.
     """
     monkeypatch.setattr(within, "_PAGE_SECONDS", 0.02)
     monkeypatch.setattr(within, "_PAGE_SECONDS_EACH", 0.01)
-    workspace = prepare(project / "sparse/0", project / "dense")
+    workspace = Workspace(shutil.copytree(prepared, tmp_path / "dense"))
     context = with_good_images(make_context(workspace), execute)
     return replace(context, options=within.widest(OPTIONS, TimeLimit(1)))
 
@@ -175,8 +184,17 @@ def steady(factor: float) -> Callable[[str, float], float]:
     return lambda stage, now: factor
 
 
+_SPANS: dict[float, tuple[float, float]] = {}
+
+
 def span(context: Context, factor: float) -> tuple[float, float]:
-    """Seconds of the least and the best, by simulation of runs with so much or so little time."""
+    """Seconds of the least and the best, by simulation of runs with so much or so little time; once a factor."""
+    if factor not in _SPANS:
+        _SPANS[factor] = _simulated_span(context, factor)
+    return _SPANS[factor]
+
+
+def _simulated_span(context: Context, factor: float) -> tuple[float, float]:
     least, most = Simulation(context, steady(factor)), Simulation(context, steady(factor))
     assert least.run(1e-3) == LADDER[0]
     assert most.run(1e6).sampling == BEST.sampling
