@@ -6,7 +6,7 @@ import os
 import struct
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -18,6 +18,8 @@ from PIL import Image, ImageOps, JpegImagePlugin, PngImagePlugin
 from projects import read_picture
 
 from colmap_sph.errors import InputError
+from colmap_sph.pipeline.stages.check_images import ImageFile, check_image
+from colmap_sph.project.images import decoding, jpeg
 from colmap_sph.project.images.decoding import jpeg_step, read_header, read_pixels
 from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.images.reading import (
@@ -270,6 +272,28 @@ def test_damage_is_noticed(tmp_path: Path, damage: str) -> None:
     for read in (read_grey, read_colours):
         with pytest.raises(InputError, match="cannot be read as an image"):
             read(path)
+    for detail_size in (None, (400, 300)):
+        with pytest.raises(InputError) as told:
+            check_image(ImageFile(path, (400, 300), detail_size))
+        assert str(told.value) == f"{path} {problem}"
+
+
+@pytest.mark.parametrize("end", ["jpg", "png"])
+@pytest.mark.parametrize("detail_size", [None, (400, 300)])
+def test_a_check_decodes_an_image_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, detail_size: tuple[int, int] | None
+) -> None:
+    path = tmp_path / f"image.{end}"
+    path.write_bytes(bytes(cv2.imencode(f".{end}", smooth())[1]))
+    decoded = []
+
+    def counted(decode: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+        return lambda *given, **named: decoded.append(decode) or decode(*given, **named)
+
+    monkeypatch.setattr(jpeg, "decode_jpeg", counted(jpeg.decode_jpeg))
+    monkeypatch.setattr(decoding, "_check_png", counted(decoding._check_png))
+    assert (check_image(ImageFile(path, (400, 300), detail_size)).detail is None) == (detail_size is None)
+    assert len(decoded) == 1
 
 
 @pytest.mark.parametrize("layout", [{}, {"tile_width": 16, "tile_height": 16}, {"planarconfig": "separate"}])
