@@ -8,6 +8,7 @@ import time
 import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -285,10 +286,14 @@ def test_a_check_decodes_an_image_once(
 ) -> None:
     path = tmp_path / f"image.{end}"
     path.write_bytes(bytes(cv2.imencode(f".{end}", smooth())[1]))
-    decoded = []
+    decoded: list[str] = []
 
-    def counted(decode: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
-        return lambda *given, **named: decoded.append(decode) or decode(*given, **named)
+    def counted(decode: Callable[..., Any]) -> Callable[..., Any]:
+        def decode_and_count(*given: object) -> Any:
+            decoded.append(decode.__name__)
+            return decode(*given)
+
+        return decode_and_count
 
     monkeypatch.setattr(jpeg, "decode_jpeg", counted(jpeg.decode_jpeg))
     monkeypatch.setattr(decoding, "_check_png", counted(decoding._check_png))
