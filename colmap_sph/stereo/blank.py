@@ -244,8 +244,8 @@ def _variance(image: Float) -> Float:
     for axis in (0, 1):
         step = _steps(image, axis)
         mean = cv2.blur(step, window)
-        step *= step
-        mean *= mean
+        np.square(step, out=step)
+        mean = np.square(mean)
         np.maximum(largest, cv2.blur(step, window) - mean, out=largest)
     return largest
 
