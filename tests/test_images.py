@@ -6,8 +6,9 @@ import os
 import struct
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ from PIL import Image, ImageOps, JpegImagePlugin, PngImagePlugin
 from projects import read_picture
 
 from colmap_sph.errors import InputError
+from colmap_sph.pipeline.stages.check_images import ImageFile, check_image
+from colmap_sph.project.images import decoding, jpeg
 from colmap_sph.project.images.decoding import jpeg_step, read_header, read_pixels
 from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.images.reading import (
@@ -270,6 +273,32 @@ def test_damage_is_noticed(tmp_path: Path, damage: str) -> None:
     for read in (read_grey, read_colours):
         with pytest.raises(InputError, match="cannot be read as an image"):
             read(path)
+    for detail_size in (None, (400, 300)):
+        with pytest.raises(InputError) as told:
+            check_image(ImageFile(path, (400, 300), detail_size))
+        assert str(told.value) == f"{path} {problem}"
+
+
+@pytest.mark.parametrize("end", ["jpg", "png"])
+@pytest.mark.parametrize("detail_size", [None, (400, 300)])
+def test_a_check_decodes_an_image_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str, detail_size: tuple[int, int] | None
+) -> None:
+    path = tmp_path / f"image.{end}"
+    path.write_bytes(bytes(cv2.imencode(f".{end}", smooth())[1]))
+    decoded: list[str] = []
+
+    def counted(decode: Callable[..., Any]) -> Callable[..., Any]:
+        def decode_and_count(*given: object) -> Any:
+            decoded.append(decode.__name__)
+            return decode(*given)
+
+        return decode_and_count
+
+    monkeypatch.setattr(jpeg, "decode_jpeg", counted(jpeg.decode_jpeg))
+    monkeypatch.setattr(decoding, "_check_png", counted(decoding._check_png))
+    assert (check_image(ImageFile(path, (400, 300), detail_size)).detail is None) == (detail_size is None)
+    assert len(decoded) == 1
 
 
 @pytest.mark.parametrize("layout", [{}, {"tile_width": 16, "tile_height": 16}, {"planarconfig": "separate"}])

@@ -188,11 +188,12 @@ def _silent_pixels(image: NDArray[np.uint8] | Float, jpeg_step: int, levels: int
     coarsest: float | Float = bounds[-1]
     if is_local:
         coarsest = bounds[-1] / noise * _local_noise(noise, variance, scales[-1].shape)
-    silent = _quiet(scales[-1], coarsest)
-    for scale, bound in zip(scales[-2::-1], bounds[-2::-1], strict=True):
+    known: list[Float | None] = [variance if level == _NOISE_LEVEL else None for level in range(levels)]
+    silent = _quiet(scales[-1], coarsest, known[-1])
+    for scale, bound, its_variance in zip(scales[-2::-1], bounds[-2::-1], known[-2::-1], strict=True):
         if not silent.any():
             return np.zeros(image.shape, np.uint8)
-        silent = _next_finer(silent, scale.shape) & _quiet(scale, bound)
+        silent = _next_finer(silent, scale.shape) & _quiet(scale, bound, its_variance)
     return _with_edges(scales[0], silent, noise)
 
 
@@ -203,12 +204,16 @@ def _next_finer(blank: Mask, shape: tuple[int, ...]) -> Mask:
     return np.asarray(doubled[: shape[0], : shape[1]], dtype=np.uint8)
 
 
-def _quiet(image: Float, bound: float | Float) -> Mask:
-    """1 where any window that holds the pixel varies by no more than `bound`: others may hold something else."""
+def _quiet(image: Float, bound: float | Float, variance: Float | None) -> Mask:
+    """1 where any window that holds the pixel varies by no more than `bound`: others may hold something else.
+
+    `variance` is the image's, see `_variances`, where it is known.
+    """
     quiet = np.empty(image.shape, np.uint8)
     limit = np.broadcast_to(np.square(bound), image.shape)
     for band, wide, inner in _bands(image.shape[0], _SIDE):
-        quiet[band] = _variance(image[wide])[inner] <= limit[band]
+        found = _variance(image[wide])[inner] if variance is None else variance[band]
+        quiet[band] = found <= limit[band]
     return np.asarray(cv2.dilate(quiet, np.ones((_SIDE, _SIDE), np.uint8)), dtype=np.uint8)
 
 
@@ -222,7 +227,11 @@ def _bands(height: int, margin: int) -> Iterator[tuple[slice, slice, slice]]:
 
 def _steps(image: Float, axis: int) -> Float:
     """Differences of neighbours along an axis, over √2: as large as the noise of a pixel."""
-    return np.diff(image, axis=axis, append=image.take([-1], axis)) * np.float32(np.sqrt(0.5))
+    step = np.zeros(image.shape, np.float32)
+    along, there = (part.swapaxes(0, axis) for part in (image, step))
+    np.subtract(along[1:], along[:-1], out=there[:-1])
+    step *= np.float32(np.sqrt(0.5))
+    return step
 
 
 def _variance(image: Float) -> Float:
@@ -235,7 +244,9 @@ def _variance(image: Float) -> Float:
     for axis in (0, 1):
         step = _steps(image, axis)
         mean = cv2.blur(step, window)
-        np.maximum(largest, cv2.blur(step * step, window) - mean * mean, out=largest)
+        np.square(step, out=step)
+        mean = np.square(mean)
+        np.maximum(largest, cv2.blur(step, window) - mean, out=largest)
     return largest
 
 

@@ -112,9 +112,10 @@ def _band_powers(tiles: list[NDArray[Any]]) -> Float:
     used = (band >= 0) & (band < bands)
     member = (direction * bands + band)[used].astype(int)
     count = np.bincount(member)
+    around = np.outer(window, window)
     powers = []
     for tile in tiles:
-        spectrum = np.fft.rfft2((tile - tile.mean()) * np.outer(window, window))[used]
+        spectrum = np.fft.rfft2((tile - tile.mean()) * around)[used]
         powers.append(np.bincount(member, spectrum.real**2 + spectrum.imag**2) / count)
     return np.reshape(powers, (len(tiles), _DIRECTIONS, bands))
 

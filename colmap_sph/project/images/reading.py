@@ -156,7 +156,9 @@ def read_grey(path: Path, size: Size | None = None) -> NDArray[np.uint8] | NDArr
     grey = np.empty(pixels.shape[:2], dtype=np.float32)
     for first in range(0, len(grey), _BAND_ROWS):
         rows = slice(first, first + _BAND_ROWS)
-        band = stretched(pixels[rows], values) * np.float32(255)
+        # Of 8 bits, which are never stretched, that would be the number itself.
+        is_plain = pixels.dtype == np.uint8
+        band = pixels[rows].astype(np.float32) if is_plain else stretched(pixels[rows], values) * np.float32(255)
         grey[rows] = band[..., 0] if band.shape[2] == 1 else cv2.transform(band, np.array([_LUMA], np.float32))
     return fitted(grey, size)
 
