@@ -573,8 +573,10 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
         with pytest.raises(OptionError, match=f"las_scale.*{words}"):
             exported(workspace, tmp_path / "other", "las", las_scale=scale)
     write_far_cloud(workspace.fused_path, make_cloud(1)[0], [])
-    for seen, words in (([1, 9], "more than"), ([0xFFFFFFFF, 0], "damaged"), ([2, 0], "cut off")):
-        data = struct.pack("<Q", 1) + np.array(seen, "<u4").tobytes()
+    bad = [([1, 9], "more than"), ([0xFFFFFFFF, 0], "damaged"), ([2, 0], "cut off"), ([1, 0, 0], "damaged")]
+    files = [(np.array(seen, "<u4").tobytes(), words) for seen, words in bad]
+    for seen, words in [*files, (files[0][0][:-1], "cut off")]:
+        data = struct.pack("<Q", 1) + seen
         workspace.visibility_path.write_bytes(data)
         with pytest.raises(InputError, match=words):
             exported(workspace, tmp_path / "other", "splats")
