@@ -29,7 +29,7 @@ from colmap_sph.products.export import Exporter, ExportFormat, ExportOptions, ex
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.places import check_places
 from colmap_sph.project.cloud_tiles import INDEX, Tile, TileIndex
-from colmap_sph.project.map_files import write_depth_map
+from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
@@ -248,6 +248,23 @@ def test_colours_that_are_not_read_are_told(
     (path,) = exported(workspace, tmp_path / "out", "las")
     assert not laspy.read(path).red.any()
     assert f"{workspace.fused_path} has no colours as this program reads them" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["png", "npz", "nerfstudio"])
+def test_normal_maps_that_cannot_be_used_are_refused(
+    workspace: Workspace, tmp_path: Path, kind: ExportFormat
+) -> None:
+    """They were taken for none: no normals in NPZ files, and depths moved to pixels' centres without them."""
+    path = workspace.normal_map_path(NAMES[0], "geometric")
+    write_normal_map(path, np.zeros((HEIGHT, WIDTH - 1, 3), np.float32))
+    with pytest.raises(InputError, match=f"{path} is not of its depth map's size"):
+        exported(workspace, tmp_path / "size", kind)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match=f"{path} cannot be read"):
+        exported(workspace, tmp_path / "folder", kind)
+    path.rmdir()
+    exported(workspace, tmp_path / "none", kind)  # programs that make depth maps alone
 
 
 def test_visibility_of_another_cloud_is_not_used(workspace: Workspace, tmp_path: Path) -> None:
