@@ -1,13 +1,11 @@
 """What `colmap_sph export` writes is what is in the workspace, in the formats' own conventions."""
 
 import json
-import resource
 import shlex
 import struct
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -19,6 +17,7 @@ import OpenImageIO
 import pycolmap
 import pytest
 from clouds import read_points
+from conftest import no_room_beyond
 from small_workspaces import ALTITUDE, FOCAL, HEIGHT, WIDTH, ground_workspace
 
 from colmap_sph.app import cli
@@ -537,17 +536,6 @@ def test_no_product_lies_among_the_original_images(workspace: Workspace, tmp_pat
 # ---- bad input ----------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def no_room_beyond(size: int) -> Iterator[None]:
-    """As on a disk that gets full: no file can be longer."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("kind", ["las", "laz", "copc", "exr", "png", "npz", "nerfstudio", "splats"])
 def test_a_full_disk_leaves_nothing_behind(workspace: Workspace, tmp_path: Path, kind: ExportFormat) -> None:
     folder = tmp_path / "out"
@@ -556,6 +544,18 @@ def test_a_full_disk_leaves_nothing_behind(workspace: Workspace, tmp_path: Path,
         exported(workspace, folder, kind)
     assert str(folder) in str(told.value) and "cannot be written" in str(told.value)
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["las", "laz", "copc", "exr", "png", "npz", "nerfstudio", "splats", "mvsnet"])
+def test_a_disk_without_room_for_the_last_byte_is_noticed(
+    workspace: Workspace, tmp_path: Path, kind: ExportFormat
+) -> None:
+    """OpenImageIO and COLMAP do not notice: EXR, PNG and models were cut off, with exit code 0."""
+    exported(workspace, tmp_path / "whole", kind)
+    sizes = [path.stat().st_size for path in (tmp_path / "whole").rglob("*") if path.is_file()]
+    with no_room_beyond(max(sizes) - 1), pytest.raises(OutputError):
+        exported(workspace, tmp_path / "out", kind)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("place", ["images", "images/deeper", "sparse", "stereo/depth_maps", "colmap_sph", "link"])
