@@ -86,8 +86,9 @@ def write_model(model: pycolmap.Reconstruction, folder: Path, *, as_text: bool =
             for stem in (*MODEL_FILES, *RIG_FILES):
                 check_file(folder / f"{stem}.bin")
     except (InputError, RuntimeError, OSError) as error:
+        why = "" if isinstance(error, InputError) else f" ({reason_of(error)})"
         raise OutputError(
-            f"The model written to {folder} is not whole ({reason_of(error)}); check space and permissions."
+            f"The model written to {folder} is not whole{why}; check space and permissions."
         ) from error
 
 
@@ -104,7 +105,7 @@ def _check_lines(model: pycolmap.Reconstruction, folder: Path) -> None:
         with open_regular(folder / f"{stem}.txt") as file:
             found = sum(line.endswith(b"\n") and not line.startswith(b"#") for line in file)
         if found != number:
-            raise InputError(f"{stem}.txt is cut off")
+            raise InputError(f"{folder / stem}.txt is cut off.")
 
 
 def is_text(files: Sequence[Path]) -> bool:
