@@ -3,6 +3,7 @@
 import os
 import shutil
 from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -116,3 +117,16 @@ def keep_images(project: Path, names: Sequence[str]) -> None:
         if image.name not in names:
             model.deregister_frame(image.frame_id)
     model.write(project / "sparse" / "0")
+
+
+@contextmanager
+def no_room_beyond(size: int) -> Iterator[None]:
+    """As on a disk that gets full: no file can be longer."""
+    import resource  # which Windows does not have
+
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)

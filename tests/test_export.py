@@ -1,13 +1,11 @@
 """What `colmap_sph export` writes is what is in the workspace, in the formats' own conventions."""
 
 import json
-import resource
 import shlex
 import struct
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -19,6 +17,7 @@ import OpenImageIO
 import pycolmap
 import pytest
 from clouds import read_points
+from conftest import no_room_beyond
 from small_workspaces import ALTITUDE, FOCAL, HEIGHT, WIDTH, ground_workspace
 
 from colmap_sph.app import cli
@@ -29,7 +28,7 @@ from colmap_sph.products.export import Exporter, ExportFormat, ExportOptions, ex
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.places import check_places
 from colmap_sph.project.cloud_tiles import INDEX, Tile, TileIndex
-from colmap_sph.project.map_files import write_depth_map
+from colmap_sph.project.map_files import write_depth_map, write_normal_map
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
@@ -248,6 +247,23 @@ def test_colours_that_are_not_read_are_told(
     (path,) = exported(workspace, tmp_path / "out", "las")
     assert not laspy.read(path).red.any()
     assert f"{workspace.fused_path} has no colours as this program reads them" in caplog.text
+
+
+@pytest.mark.parametrize("kind", ["png", "npz", "nerfstudio"])
+def test_normal_maps_that_cannot_be_used_are_refused(
+    workspace: Workspace, tmp_path: Path, kind: ExportFormat
+) -> None:
+    """They were taken for none: no normals in NPZ files, and depths moved to pixels' centres without them."""
+    path = workspace.normal_map_path(NAMES[0], "geometric")
+    write_normal_map(path, np.zeros((HEIGHT, WIDTH - 1, 3), np.float32))
+    with pytest.raises(InputError, match=f"{path} is not of its depth map's size"):
+        exported(workspace, tmp_path / "size", kind)
+    path.unlink()
+    path.mkdir()
+    with pytest.raises(InputError, match=f"{path} cannot be read"):
+        exported(workspace, tmp_path / "folder", kind)
+    path.rmdir()
+    exported(workspace, tmp_path / "none", kind)  # programs that make depth maps alone
 
 
 def test_visibility_of_another_cloud_is_not_used(workspace: Workspace, tmp_path: Path) -> None:
@@ -520,17 +536,6 @@ def test_no_product_lies_among_the_original_images(workspace: Workspace, tmp_pat
 # ---- bad input ----------------------------------------------------------------------------------------------
 
 
-@contextmanager
-def no_room_beyond(size: int) -> Iterator[None]:
-    """As on a disk that gets full: no file can be longer."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
-
-
 @pytest.mark.parametrize("kind", ["las", "laz", "copc", "exr", "png", "npz", "nerfstudio", "splats"])
 def test_a_full_disk_leaves_nothing_behind(workspace: Workspace, tmp_path: Path, kind: ExportFormat) -> None:
     folder = tmp_path / "out"
@@ -539,6 +544,21 @@ def test_a_full_disk_leaves_nothing_behind(workspace: Workspace, tmp_path: Path,
         exported(workspace, folder, kind)
     assert str(folder) in str(told.value) and "cannot be written" in str(told.value)
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", ["las", "laz", "copc", "exr", "png", "npz", "nerfstudio", "splats", "mvsnet"])
+def test_a_disk_without_room_for_the_last_byte_is_noticed(
+    workspace: Workspace, tmp_path: Path, kind: ExportFormat
+) -> None:
+    """OpenImageIO and COLMAP do not notice: EXR, PNG and models were cut off, with exit code 0."""
+    for name in NAMES:  # so that maps are no smaller than what is beside them
+        depth = ALTITUDE + np.random.default_rng(0).random((HEIGHT, WIDTH), np.float32)
+        write_depth_map(workspace.depth_map_path(name, "geometric"), depth)
+    exported(workspace, tmp_path / "whole", kind)
+    sizes = [path.stat().st_size for path in (tmp_path / "whole").rglob("*") if path.is_file()]
+    with no_room_beyond(max(sizes) - 1), pytest.raises(OutputError):
+        exported(workspace, tmp_path / "out", kind)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("place", ["images", "images/deeper", "sparse", "stereo/depth_maps", "colmap_sph", "link"])
@@ -573,8 +593,10 @@ def test_what_is_not_there_or_in_the_way_is_told(workspace: Workspace, tmp_path:
         with pytest.raises(OptionError, match=f"las_scale.*{words}"):
             exported(workspace, tmp_path / "other", "las", las_scale=scale)
     write_far_cloud(workspace.fused_path, make_cloud(1)[0], [])
-    for seen, words in (([1, 9], "more than"), ([0xFFFFFFFF, 0], "damaged"), ([2, 0], "cut off")):
-        data = struct.pack("<Q", 1) + np.array(seen, "<u4").tobytes()
+    bad = [([1, 9], "more than"), ([0xFFFFFFFF, 0], "damaged"), ([2, 0], "cut off"), ([1, 0, 0], "damaged")]
+    files = [(np.array(seen, "<u4").tobytes(), words) for seen, words in bad]
+    for seen, words in [*files, (files[0][0][:-1], "cut off")]:
+        data = struct.pack("<Q", 1) + seen
         workspace.visibility_path.write_bytes(data)
         with pytest.raises(InputError, match=words):
             exported(workspace, tmp_path / "other", "splats")

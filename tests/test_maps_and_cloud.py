@@ -15,6 +15,7 @@ from test_pages import Page
 
 import colmap_sph
 from colmap_sph.app import cli
+from colmap_sph.errors import InputError
 from colmap_sph.pages import write_page
 from colmap_sph.products.surface.seen import seen_views
 from colmap_sph.project.state.cloud_marks import is_cloud_of
@@ -167,6 +168,20 @@ def test_products_are_made_of_the_maps_of_the_last_run(
     said = " ".join(capsys.readouterr().err.split())
     assert f"The cloud in {dense} was not made of 1 of the 10 depth maps there, such as that of {gone}" in said
     assert {each.view.name for each in seen_views(Workspace(dense))[1]} == names - {gone}
+
+
+def test_products_are_not_made_without_a_damaged_map(
+    dense: Path, finished: FinishedRun, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was left out, as one that has no part in the cloud: a hole, and exit code 0."""
+    path = Workspace(dense).depth_map_path(min(finished.report.coverage), "geometric")
+    with path.open("r+b") as file:
+        file.truncate(path.stat().st_size - 1)
+    assert cli.main(["export", str(dense), "--formats", "npz", "--output", str(tmp_path / "out")]) == 2
+    assert f"{path} is truncated or damaged" in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(InputError, match="truncated or damaged"):
+        seen_views(Workspace(dense))
 
 
 def test_products_of_maps_that_are_not_fused_say_so(

@@ -115,7 +115,7 @@ EXCEPTIONS = {
     ("pipeline/program.py", "platform"),  # Python's version
     ("project/claim.py", "is_symlink"),  # of an entry of a folder
     ("project/cloud_output.py", "shutil.move"),  # to a temporary name
-    ("project/cloud_output.py", "write_text"),  # COLMAP's
+    ("project/sparse_model.py", "write_text"),  # COLMAP's
 }
 
 

@@ -21,6 +21,7 @@ from colmap_sph.app import cli
 from colmap_sph.errors import InputError, NoResultError, OptionError, OutputError
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.publishing import alone_in
+from colmap_sph.products.surface import make
 from colmap_sph.products.surface.drawing import margin_of
 from colmap_sph.products.surface.filling import filled
 from colmap_sph.products.surface.geotiff import Layer, LayerFiles
@@ -604,6 +605,29 @@ def test_small_pictures_show_the_surface(products, workspace, tmp_path):
     coloured = arrays["orthophoto"][3] > 0
     np.testing.assert_array_equal(orthophoto[coloured], np.moveaxis(arrays["orthophoto"][2::-1], 0, 2)[coloured])
     assert (orthophoto[~coloured] == 255).all()
+
+
+@pytest.mark.parametrize("step", ["sync_file", "move_into_place"])
+def test_an_interruption_leaves_no_files_beside_the_summary_of_others(workspace, tmp_path, monkeypatch, step):
+    """The disk may take seconds for each: that is waited for before the first is in its place."""
+    made(workspace, tmp_path, cell=0.5)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    do = getattr(make, step)
+
+    def interrupted(*paths: Path) -> None:
+        do(*paths)
+        if paths[0].name == "orthophoto.tif":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(make, step, interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        made(workspace, tmp_path, cell=0.4)
+    after = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+    if step == "sync_file":
+        assert after == before
+    else:
+        assert after.keys() == before.keys() - {"surface.json"}
+        assert after["orthophoto.tif"] != before["orthophoto.tif"]
 
 
 def test_the_command_says_what_it_made(workspace, tmp_path, capsys):

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from conftest import no_room_beyond
 from projects import prepare
 from test_undistortion import NAMES, make_project
 
@@ -15,7 +16,7 @@ from colmap_sph.errors import InputError, OutputError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.project.project import Project
 from colmap_sph.project.scene_reader import read_scene
-from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.sparse_model import load_model, write_model
 from colmap_sph.project.undistortion.originals import read_originals
 
 
@@ -53,6 +54,23 @@ def test_images_without_second_lines_are_all_read(text: Path, caplog: pytest.Log
     assert len(pycolmap.Reconstruction(text).images) == 2  # what is guarded against
     assert poses(load_model(text)) == truth
     assert "images.txt has no second line for 4 of its 4 images" in caplog.text
+
+
+@pytest.mark.parametrize("ending", ["bin", "txt"])
+@pytest.mark.parametrize("stem", ["images", "points3D"])
+def test_models_that_the_disk_does_not_take_whole(text: Path, tmp_path: Path, ending: str, stem: str) -> None:
+    """COLMAP does not notice: clouds as models, projects for splatting, local models were cut off."""
+    model = pycolmap.Reconstruction(text)
+    as_text = ending == "txt"
+    write_model(model, tmp_path / "whole", as_text=as_text)
+    data = (tmp_path / "whole" / f"{stem}.{ending}").read_bytes()
+    last_line = len(data.rstrip(b"\n").rpartition(b"\n")[0]) + 1 if as_text else len(data) - 8
+    written = tmp_path / "written"
+    for size in (len(data) - 1, last_line, 30):
+        with no_room_beyond(size), pytest.raises(OutputError, match=f"written to {written} is not whole"):
+            write_model(model, written, as_text=as_text)
+    write_model(model, written, as_text=as_text)
+    assert poses(load_model(written)) == poses(model)
 
 
 def test_no_place_for_temporary_files(text: Path, monkeypatch: pytest.MonkeyPatch) -> None:

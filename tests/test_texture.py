@@ -11,6 +11,7 @@ from surveyed import BLUE, BOX, GREEN, RED, ROOF, surveyed_workspace
 
 from colmap_sph.errors import OutputError
 from colmap_sph.products.georeference import Georeference
+from colmap_sph.products.mesh import obj
 from colmap_sph.products.mesh.glb import write_glb
 from colmap_sph.products.mesh.make import MeshRequest, make_mesh
 from colmap_sph.products.mesh.obj import write_obj
@@ -143,6 +144,19 @@ def test_parts_of_images_do_not_overlap_on_pages(workspace, solids):
         taken[page][corner[1] : corner[1] + height, corner[0] : corner[0] + width] += 1
     assert all(page.max() == 1 for page in taken)
     assert sorted(on_pages.faces.tolist()) == np.flatnonzero(chosen >= 0).tolist()
+
+
+def test_an_interruption_leaves_no_obj_with_the_pictures_of_another_mesh(solids, sheets, tmp_path, monkeypatch):
+    places = [sheet.points for sheet in sheets]
+    write_obj(tmp_path / "mesh.obj", sheets, places)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(obj, "_write_sheet", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_obj(tmp_path / "mesh.obj", sheets, places)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mesh.mtl", "mesh_0.jpg"]
 
 
 def test_other_programs_read_glb_and_obj_with_their_pictures(solids, sheets, tmp_path):

@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from conftest import no_room_beyond
 from projects import prepare
 
 from colmap_sph.app import cli
-from colmap_sph.errors import InputError
+from colmap_sph.errors import InputError, OutputError
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.stages import undistort as undistort_stage
@@ -493,6 +494,18 @@ def test_the_same_range_map_is_the_same_file_at_any_time(tmp_path: Path) -> None
         time.sleep(1.1)  # dates in OpenEXR have seconds
     assert digests[0] == digests[1]
     assert (tmp_path / "a.exr").read_bytes() == (tmp_path / "b.exr").read_bytes()
+
+
+@pytest.mark.parametrize("lost", [1, 300])
+def test_a_range_map_whose_last_bytes_the_disk_does_not_take(tmp_path: Path, lost: int) -> None:
+    """OpenImageIO does not notice: a run took a map that was cut off for whole, and kept it for good."""
+    rng = np.random.default_rng(0)
+    maps = rng.random((40, 60), np.float32), rng.random((40, 60, 3), np.float32)
+    range_maps.write_range_map(tmp_path / "whole.exr", *maps)
+    size = (tmp_path / "whole.exr").stat().st_size
+    with no_room_beyond(size - lost), pytest.raises(OutputError, match=r"a\.exr cannot be written"):
+        range_maps.write_range_map(tmp_path / "a.exr", *maps)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.exr"]
 
 
 def test_a_kill_while_a_range_map_is_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,7 @@ MARK = "made_by_colmap_sph.txt"
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
+def told(path: Path) -> Iterator[None]:
     """Errors of the system while `path` is written, as one sentence about it."""
     try:
         yield
@@ -76,7 +76,7 @@ def published(path: Path) -> Iterator[Path]:
     make_dir(path.parent)
     temporary = path.parent / f".{path.name}.part"
     try:
-        with _told(path):
+        with told(path):
             temporary.unlink(missing_ok=True)  # of a process that was killed
             check_no_folder(path)
             yield temporary
@@ -115,7 +115,7 @@ def published_folder(path: Path) -> Iterator[Path]:
     make_dir(path.parent)
     with scratch_beside(path.parent / f".{path.name}") as scratch:
         made = scratch / "made"
-        with _told(path):
+        with told(path):
             made.mkdir()
             yield made
             write_text(made / MARK, f"Made by colmap_sph {version('colmap_sph')}, which replaces this folder.\n")

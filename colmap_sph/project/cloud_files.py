@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from colmap_sph.errors import OutputError
 from colmap_sph.platforms.files import is_link, move_into_place, write_text
 from colmap_sph.platforms.links import link, symbolic_link
-from colmap_sph.project.files import atomic_file, make_dir, set_aside
+from colmap_sph.project.files import atomic_file, set_aside
 from colmap_sph.project.map_coordinates import move_cloud, move_model
-from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES
+from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, write_model
 from colmap_sph.project.workspace import Workspace
 
 # Copied at a time: what a cache holds.
@@ -145,13 +145,12 @@ def link_workspace(
     OSError, RuntimeError
         The system's, or COLMAP's, where something cannot be written; for the caller to put into a sentence.
     OutputError
-        The model's folder cannot be created.
+        The model cannot be written.
     """
     linked = Workspace(folder)
-    make_dir(linked.sparse_dir)
     if origin.any():
         move_model(model, origin)
-    model.write_binary(linked.sparse_dir)
+    write_model(model, linked.sparse_dir)
     for place, target in ((linked.images_dir, workspace.images_dir), (linked.stereo_dir, workspace.stereo_dir)):
         link(place, target)
 

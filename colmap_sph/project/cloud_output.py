@@ -3,7 +3,6 @@
 import os
 import re
 import shutil
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,7 +15,7 @@ from colmap_sph.errors import InputError, OutputError, reason_of, unwritable
 from colmap_sph.platforms.files import move_into_place
 from colmap_sph.project.files import make_dir, open_regular, real_path, whole_digest
 from colmap_sph.project.map_coordinates import move_cloud
-from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, load_model
+from colmap_sph.project.sparse_model import MODEL_FILES, RIG_FILES, load_model, write_model
 from colmap_sph.project.state.records import altered_files, begin, read_record, vouch
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import POINT
@@ -105,8 +104,7 @@ class CloudOutput:
                 model = cloud_as_model(made.cloud_paths, sparse_dir, origin)
                 record, files = self._model(self.kind)
                 begin(record, files)  # from here on they are ours, whatever happens
-                write: Callable[[Path], None] = model.write_binary if self.kind == "bin" else model.write_text
-                write(self.path)
+                write_model(model, self.path, as_text=self.kind == "txt")
                 vouch(record, "", {file: whole_digest(file) for file in files})
         except (OSError, RuntimeError) as error:
             raise unwritable(self.path, error) from error

@@ -5,8 +5,9 @@ from pathlib import Path
 
 import pycolmap
 
-from colmap_sph.errors import InputError, reason_of
-from colmap_sph.project.given.binary_model import read_binary_model
+from colmap_sph.errors import InputError, OutputError, reason_of
+from colmap_sph.project.files import make_dir, open_regular
+from colmap_sph.project.given.binary_model import check_file, read_binary_model
 from colmap_sph.project.given.image_names import check_names
 from colmap_sph.project.given.text_model import read_text_model
 
@@ -57,6 +58,54 @@ def load_model(sparse_dir: Path) -> pycolmap.Reconstruction:
         )
     check_names(names, sparse_dir)
     return model
+
+
+def write_model(model: pycolmap.Reconstruction, folder: Path, *, as_text: bool = False) -> None:
+    """Write a model, and make sure that the disk has taken it: COLMAP does not notice that one is full.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+    folder : Path
+        Created where missing.
+    as_text : bool
+        Whether as text, not binary.
+
+    Raises
+    ------
+    OutputError
+        A file cannot be written, or not to its end.
+    """
+    make_dir(folder)
+    try:
+        if as_text:
+            model.write_text(folder)
+            _check_lines(model, folder)
+        else:
+            model.write_binary(folder)
+            for stem in (*MODEL_FILES, *RIG_FILES):
+                check_file(folder / f"{stem}.bin")
+    except (InputError, RuntimeError, OSError) as error:
+        why = "" if isinstance(error, InputError) else f" ({reason_of(error)})"
+        raise OutputError(
+            f"The model written to {folder} is not whole{why}; check space and permissions."
+        ) from error
+
+
+def _check_lines(model: pycolmap.Reconstruction, folder: Path) -> None:
+    """Raise `InputError` where the files of a text model do not have all lines, each to its end."""
+    numbers = {
+        "cameras": model.num_cameras(),
+        "images": 2 * model.num_reg_images(),
+        "points3D": model.num_points3D(),
+        "rigs": model.num_rigs(),
+        "frames": model.num_reg_frames(),
+    }
+    for stem, number in numbers.items():
+        with open_regular(folder / f"{stem}.txt") as file:
+            found = sum(line.endswith(b"\n") and not line.startswith(b"#") for line in file)
+        if found != number:
+            raise InputError(f"{folder / stem}.txt is cut off.")
 
 
 def is_text(files: Sequence[Path]) -> bool:

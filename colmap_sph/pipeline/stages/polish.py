@@ -22,10 +22,9 @@ from colmap_sph.project.polishing.polished import (
     known_outcome,
     publish_polished,
     starting_model,
-    write_model,
 )
 from colmap_sph.project.scene_reader import scene_of_model
-from colmap_sph.project.sparse_model import has_model, load_model
+from colmap_sph.project.sparse_model import has_model, load_model, write_model
 from colmap_sph.project.state.typed import from_plain
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace

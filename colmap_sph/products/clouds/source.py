@@ -141,6 +141,8 @@ class Cloud:
                 seen = (None, None) if visibility is None else visibility.take(number)
                 piece = self._piece(np.frombuffer(data, self.kind), *seen)
                 yield piece.only(is_plausible(piece.xyz))
+            if visibility is not None:
+                visibility.check_end()
 
     def _piece(
         self, points: NDArray[np.void], counts: NDArray[np.uint32] | None, images: NDArray[np.uint32] | None
@@ -232,9 +234,7 @@ class _Visibility:
         for index in range(number):
             while position >= len(words) or position + words[position] >= len(words):
                 if position < len(words) and words[position] > _MOST_IMAGES:
-                    raise InputError(
-                        f"{_visibility_path(self._path)} is damaged; fuse again, or remove that file."
-                    )
+                    raise self._told("damaged")
                 self._read_on()
                 words = self._words.data
             starts[index] = position
@@ -244,7 +244,15 @@ class _Visibility:
         return taken[starts], np.delete(taken, starts)
 
     def _read_on(self) -> None:
-        more = np.frombuffer(self._file.read(4 * _WORDS_AT_A_TIME), "<u4")
-        if not len(more):
-            raise InputError(f"{_visibility_path(self._path)} is cut off; fuse again, or remove that file.")
-        self._words = np.concatenate([self._words, more])
+        more = self._file.read(4 * _WORDS_AT_A_TIME)
+        if not more or len(more) % 4:
+            raise self._told("cut off")
+        self._words = np.concatenate([self._words, np.frombuffer(more, "<u4")])
+
+    def check_end(self) -> None:
+        """Raise `InputError` where there is more than of all points: then some counts are wrong."""
+        if len(self._words) or self._file.read(1):
+            raise self._told("damaged")
+
+    def _told(self, what: str) -> InputError:
+        return InputError(f"{_visibility_path(self._path)} is {what}; fuse again, or remove that file.")

@@ -15,6 +15,7 @@ from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.maps.reading import DepthAtCentres, MappedScene
 from colmap_sph.products.publishing import published_folder
 from colmap_sph.project.files import make_dir
+from colmap_sph.project.images.decoding import check_end
 from colmap_sph.project.workspace import checked_name
 from colmap_sph.scene import View
 
@@ -128,3 +129,4 @@ def write_image(path: Path, pixels: NDArray[Any], channels: list[str]) -> None:
     problem = output.geterror()
     if not (output.close() and is_whole):
         raise OSError(problem or output.geterror())
+    check_end(path)

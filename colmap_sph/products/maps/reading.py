@@ -1,6 +1,7 @@
 """The geometric maps of a workspace → depth at the centres of pixels, with the camera that has these."""
 
 import logging
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,7 +65,9 @@ class MappedScene:
         """The maps of a view; `InputError` where they are damaged."""
         depth = read_depth_map(self.workspace.depth_map_path(view.name, "geometric"))
         path = self.workspace.normal_map_path(view.name, "geometric")
-        if path.is_file() and map_size(path, 3) == (view.width, view.height):
+        if os.path.lexists(path):
+            if map_size(path, 3) != (view.width, view.height):
+                raise InputError(f"{path} is not of its depth map's size; delete it and compute it again.")
             normals = read_normal_planes(path)
         else:
             normals = np.zeros((3, *depth.shape), np.float32)
@@ -101,7 +104,7 @@ def views_with_maps(workspace: Workspace) -> tuple[Scene, list[_Mapped]]:
     Raises
     ------
     InputError
-        There is none, or the model cannot be read.
+        There is none, the model cannot be read, or a map is damaged.
     """
     scene = read_scene(workspace.sparse_dir)
     paths = (workspace.depth_map_path(view.name, "geometric") for view in scene.views)
@@ -119,7 +122,8 @@ def _of_last_cloud(workspace: Workspace, mapped: list[_Mapped]) -> list[_Mapped]
     fused = images_of_cloud(workspace, [view.name for _, view, _ in mapped])
     if fused is None:
         return mapped
-    others = {view.name for _, view, path in mapped if view.name not in fused and _may_show(path)}
+    # Those that are empty had no part in it either, and are no others.
+    others = {view.name for _, view, path in mapped if view.name not in fused and has_depth(path, possible=True)}
     if not others:
         return mapped
     if not fused:
@@ -137,14 +141,6 @@ def _of_last_cloud(workspace: Workspace, mapped: list[_Mapped]) -> list[_Mapped]
         min(others),
     )
     return [each for each in mapped if each[1].name not in others]
-
-
-def _may_show(path: Path) -> bool:
-    """Whether a depth map is not known to be empty, as those are that no cloud is made of."""
-    try:
-        return has_depth(path, possible=True)
-    except InputError:
-        return True
 
 
 def no_depth(workspace: Workspace) -> NoResultError:

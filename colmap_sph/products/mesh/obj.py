@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.products.mesh.texture.textured import Sheet
-from colmap_sph.project.files import NewFile, atomic_file
+from colmap_sph.project.files import NewFile, atomic_file, remove
 
 _CHUNK = 1 << 16
 
@@ -35,6 +35,7 @@ def write_obj(path: Path, sheets: Sequence[Sheet], places: Sequence[NDArray[np.f
     """
     materials = path.with_suffix(".mtl")
     pictures = []
+    remove(path)  # an earlier one, whose pictures would be those of another mesh, should this be ended
     with atomic_file(materials) as file:
         for number, sheet in enumerate(sheets):
             file.write(f"newmtl part_{number}\nKd 1 1 1\nillum 0\n".encode())

@@ -20,7 +20,7 @@ from colmap_sph.products.publishing import published_folder, scratch_beside
 from colmap_sph.products.scenes.links import link_images
 from colmap_sph.project.cloud_output import cloud_as_model
 from colmap_sph.project.map_coordinates import local_origin, move_model
-from colmap_sph.project.sparse_model import load_model
+from colmap_sph.project.sparse_model import load_model, write_model
 from colmap_sph.project.workspace import Workspace
 
 _POINT = np.dtype(
@@ -70,8 +70,7 @@ def write_splats(workspace: Workspace, cloud: ThinCloud, folder: Path) -> None:
         if origin.any():
             move_model(model, origin)
             write_text(made / _ORIGIN, " ".join(map(repr, origin.tolist())) + "\n")
-        (made / "sparse" / "0").mkdir(parents=True)
-        model.write_binary(made / "sparse" / "0")
+        write_model(model, made / "sparse" / "0")
 
 
 def _as_points(cloud: ThinCloud) -> np.ndarray:

@@ -10,11 +10,11 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.errors import NoResultError, OutputError, reason_of
+from colmap_sph.errors import NoResultError, OutputError
 from colmap_sph.platforms.files import move_into_place, sync_file
 from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.places import check_places
-from colmap_sph.products.publishing import alone_in
+from colmap_sph.products.publishing import alone_in, told
 from colmap_sph.products.surface.drawing import Drawing, Drawn, margin_of
 from colmap_sph.products.surface.geotiff import NO_HEIGHT, Layer, LayerFiles, gdal
 from colmap_sph.products.surface.options import SurfaceOptions
@@ -23,7 +23,7 @@ from colmap_sph.products.surface.placing import Placement, place
 from colmap_sph.products.surface.previews import PREVIEWS, write_previews
 from colmap_sph.products.surface.seen import SeenView, seen_views
 from colmap_sph.products.surface.tiles import Sightings, Tile, choose_side, tiles_of
-from colmap_sph.project.files import atomic_file, free_space, scratch_folder
+from colmap_sph.project.files import atomic_file, free_space, remove, scratch_folder
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene
 
@@ -141,10 +141,10 @@ def make_surface(request: SurfaceRequest, start: Start, advance: Advance) -> tup
             made = files.finish()
             made += write_previews(made)
         summary = _summary(scene, placement, counts)
-        paths = _publish(made, request.folder)
-    path = request.folder / _SUMMARY
-    with atomic_file(path) as file:
-        file.write(msgspec.json.format(msgspec.json.encode(summary), indent=1))
+        path = request.folder / _SUMMARY
+        paths = _publish(made, path)
+        with atomic_file(path) as file:
+            file.write(msgspec.json.format(msgspec.json.encode(summary), indent=1))
     return [*paths, path], summary
 
 
@@ -214,17 +214,19 @@ def _summary(scene: Scene, placement: Placement, counts: NDArray[np.int64]) -> S
     )
 
 
-def _publish(made: list[Path], folder: Path) -> list[Path]:
-    """Move complete files to their places."""
+def _publish(made: list[Path], summary: Path) -> list[Path]:
+    """Move complete files to their places, beside each other: to wait for the disk takes long, and comes before.
+
+    The summary of earlier ones is gone before the first is there: it tells of no others, should this be ended.
+    """
+    for path in made:
+        with told(summary.with_name(path.name)):
+            sync_file(path)
+    remove(summary)
     paths = []
     for path in made:
-        target = folder / path.name
-        try:
-            sync_file(path)
+        target = summary.with_name(path.name)
+        with told(target):
             move_into_place(path, target)
-        except OSError as error:
-            raise OutputError(
-                f"{target} cannot be written ({reason_of(error)}); choose another --output."
-            ) from error
         paths.append(target)
     return paths

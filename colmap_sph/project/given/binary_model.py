@@ -37,14 +37,14 @@ def read_binary_model(files: list[Path]) -> pycolmap.Reconstruction:
         COLMAP's own, where the records contradict each other; for the caller to put into a sentence.
     """
     for path in files:
-        _check_file(path)
+        check_file(path)
     model = pycolmap.Reconstruction()
     model.read_binary(files[0].parent)
     normalize_rotations(model)
     return model
 
 
-def _check_file(path: Path) -> None:
+def check_file(path: Path) -> None:
     """Raise `InputError` unless `path` holds exactly the records it announces."""
     try:
         with open_regular(path) as file:

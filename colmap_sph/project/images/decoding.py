@@ -23,6 +23,7 @@ from colmap_sph.project.images.jpeg import DamagedError
 # The kinds that COLMAP's library surely reads; it has others, of which some end the process.
 _FORMATS = {"bmp", "dpx", "hdr", "jpeg", "openexr", "png", "pnm", "sgi", "targa", "tiff"}
 _PNG_START = b"\x89PNG\r\n\x1a\n"
+_PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 # Its first chunk: length, kind, width, height, bits, kind of colours, compression, filter, interlacing, checksum.
 _PNG_HEADER = struct.Struct(">I4sIIBB3xI")
 _PNG_GREY = (0, 4)
@@ -76,6 +77,29 @@ class Header:
     def is_deep(self) -> bool:
         """Whether it has more than 8 bits."""
         return self.dtype != "uint8"
+
+
+def check_end(path: Path) -> None:
+    """Raise `OSError` where a PNG or OpenEXR image that OpenImageIO has just written is cut off.
+
+    The library does not notice when a disk is full for the last of its bytes.
+    """
+    if path.suffix == ".png":
+        is_whole = path.read_bytes().endswith(_PNG_END)
+    else:
+        image = oiio.ImageInput.open(str(path))
+        is_whole = image is not None and _last_row(image) is not None
+        oiio.geterror()  # which is kept otherwise, and printed at the end
+    if not is_whole:
+        raise OSError("the file is cut off")
+
+
+def _last_row(image: oiio.ImageInput) -> NDArray[Any] | None:
+    spec = image.spec()
+    row: NDArray[Any] | None = image.read_scanlines(
+        0, 0, spec.height - 1, spec.height, 0, 0, spec.nchannels, "float"
+    )
+    return row
 
 
 def is_jpeg(path: Path) -> bool:

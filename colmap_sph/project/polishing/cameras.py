@@ -17,8 +17,7 @@ from colmap_sph.project.lens.files import write_lens_fields
 from colmap_sph.project.lens.straight import pixel_rays, straight_camera
 from colmap_sph.project.polishing.adjustment import Observations, adjusted_model
 from colmap_sph.project.polishing.lens_fields import FoundField, adjusted_with_fields, found_fields, sparse_error
-from colmap_sph.project.polishing.polished import write_model
-from colmap_sph.project.sparse_model import cameras_of_images, image_names, submodel
+from colmap_sph.project.sparse_model import cameras_of_images, image_names, submodel, write_model
 
 # Models that map as OPENCV does with these of its parameters: focal lengths, principal point, k1, k2.
 _AS_OPENCV = {

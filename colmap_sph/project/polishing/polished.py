@@ -11,11 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import pycolmap
-
-from colmap_sph.errors import InputError, OutputError, reason_of
-from colmap_sph.project.files import make_dir, remove, scratch_folder
-from colmap_sph.project.sparse_model import load_model
+from colmap_sph.errors import OutputError, reason_of
+from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.undistortion.marker import (
     Marker,
     is_model_changed,
@@ -74,19 +71,6 @@ def keep_given(workspace: Workspace, key: str, outcome: dict[str, Any]) -> None:
     restore_given(workspace)
     marker = _finished_marker(workspace)
     write_marker(workspace, replace(marker, polish={"key": key, "outcome": outcome}))
-
-
-def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model into a new folder; `OutputError` where it does not come out whole, on a full disk say."""
-    remove(folder)
-    make_dir(folder)
-    try:
-        model.write_binary(folder)
-        load_model(folder)  # COLMAP does not notice whether the disk took it
-    except (InputError, RuntimeError, OSError) as error:
-        raise OutputError(
-            f"The model written to {folder} is not whole ({reason_of(error)}); check space and permissions."
-        ) from error
 
 
 def restore_given(workspace: Workspace) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, OutputError, unwritable
 from colmap_sph.project.files import SCRATCH_ENDING, atomic_file, make_dir
 from colmap_sph.project.images.bands import in_bands
+from colmap_sph.project.images.decoding import check_end
 from colmap_sph.project.wide.projection import Lens, camera_rays
 
 Pixels = NDArray[np.float32]
@@ -194,6 +195,7 @@ def write_range_map(path: Path, distance: Pixels, normals: Pixels) -> str:
             made = Path(folder) / "made.exr"
             if not image.write(str(made)):
                 raise OutputError(f"{path} cannot be written ({image.geterror()}); check space and permissions.")
+            check_end(made)
             with atomic_file(path, sync=False) as file:
                 file.write(made.read_bytes())
                 return file.digest
