@@ -259,9 +259,8 @@ def test_glb_of_a_geocentric_map_is_upright(cloudy, tmp_path):
     place = Georeference("EPSG:4978", "GEOCCS[]", 1.0, turn, 6367489.0 * up)
     made(cloudy, tmp_path, place=place, method="poisson", voxel=0.7, trim=0.0)
     made(cloudy, tmp_path / "near", method="poisson", voxel=0.7, trim=0.0)
-    found, near = (
-        trimesh.load(folder / "mesh.glb", process=False, force="mesh") for folder in (tmp_path, tmp_path / "near")
-    )
+    found: Any = trimesh.load(tmp_path / "mesh.glb", process=False, force="mesh")
+    near: Any = trimesh.load(tmp_path / "near" / "mesh.glb", process=False, force="mesh")
     # The normal of the ellipsoid is .19 degrees off the direction from its middle.
     np.testing.assert_allclose(found.vertices, near.vertices, atol=0.1)
 
