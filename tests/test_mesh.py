@@ -252,6 +252,19 @@ def test_glb_keeps_the_axes_of_a_level_model(cloudy, tmp_path):
     np.testing.assert_allclose(found.vertices, np.stack([x, z, -y], axis=1), atol=1e-5)
 
 
+def test_glb_of_a_geocentric_map_is_upright(cloudy, tmp_path):
+    """At 45° south and 45° east: its z is the Earth's axis, which lies there as far below the horizon."""
+    east, up = np.array([-1.0, 1.0, 0.0]) / np.sqrt(2), np.array([0.5, 0.5, -np.sqrt(0.5)])
+    turn = np.column_stack([east, np.cross(up, east), up])
+    place = Georeference("EPSG:4978", "GEOCCS[]", 1.0, turn, 6367489.0 * up)
+    made(cloudy, tmp_path, place=place, method="poisson", voxel=0.7, trim=0.0)
+    made(cloudy, tmp_path / "near", method="poisson", voxel=0.7, trim=0.0)
+    found: Any = trimesh.load(tmp_path / "mesh.glb", process=False, force="mesh")
+    near: Any = trimesh.load(tmp_path / "near" / "mesh.glb", process=False, force="mesh")
+    # The normal of the ellipsoid is .19 degrees off the direction from its middle.
+    np.testing.assert_allclose(found.vertices, near.vertices, atol=0.1)
+
+
 def test_simplified_meshes_have_fewer_faces(cloudy, tmp_path, capfd):
     full = made(cloudy, tmp_path / "full", method="poisson", voxel=0.7, trim=0.0)
     steps: list[str] = []

@@ -229,7 +229,10 @@ def test_up_is_found(name: str) -> None:
 
 
 def test_maps_of_map_coordinates_have_north_on_top() -> None:
-    assert np.array_equal(map_axes([view_at(0, 0, 50.0)], np.zeros((0, 3)), is_georeferenced=True), np.eye(3))
+    ground = np.random.default_rng(3).uniform((-60, -60, 0), (120, 120, 4), (500, 3))
+    for origin in ([5e5, 5.4e6, 300], [5e5, 6.365e6, 300]):  # the latter, 57.4° north, could be geocentric
+        for views in BLOCKS.values():
+            assert np.array_equal(map_axes(views, ground, origin=np.array(origin)), np.eye(3))
 
 
 def test_a_map_is_seen_from_above() -> None:

@@ -361,6 +361,36 @@ def test_a_model_on_the_map_has_its_coordinates(workspace, tmp_path):
         made(workspace, tmp_path, place=place, up="z")
 
 
+@pytest.mark.parametrize("aligned", [False, True], ids=["own coordinates", "aligned"])
+def test_a_geocentric_model_is_seen_from_above(aligned, workspace, tmp_path):
+    """Its z is the Earth's axis. East, north and up by latitude and longitude, as textbooks have them."""
+    latitude, longitude, height = np.radians(-34.0), np.radians(18.5), 120.0
+    sin, cos = np.sin(latitude), np.cos(latitude)
+    east = np.array([-np.sin(longitude), np.cos(longitude), 0.0])
+    up = np.array([cos * np.cos(longitude), cos * np.sin(longitude), sin])
+    turn = np.column_stack([east, np.cross(up, east), up])
+    radius = 6378137.0 / np.sqrt(1 - 0.00669437999 * sin**2)
+    place = np.array([*((radius + height) * up[:2]), (radius * (1 - 0.00669437999) + height) * sin])
+    if aligned:
+        scale = 2.0
+        wkt = rasterio.crs.CRS.from_epsg(4978).to_wkt()
+        georeference = Georeference("EPSG:4978", wkt, scale, turn, place)
+        found, _, summary = made(workspace, tmp_path / "out", place=georeference, cell=2 * GSD)
+        to_raster, level = np.array(summary.model_to_raster), 0.0
+        np.testing.assert_allclose(to_raster[:, :3], 2 * np.eye(3), atol=1e-3)
+    else:
+        scale = 1.0
+        moved = surveyed_workspace(tmp_path / "dense", turn=turn, shift=place)
+        found, _, summary = made(moved, tmp_path / "out")
+        to_raster = np.array(summary.model_to_raster)
+        np.testing.assert_allclose(to_raster[:, :3] @ turn, np.eye(3), atol=1e-3)
+        level = (to_raster[:, :3] @ place + to_raster[:, 3])[2]
+    heights = found["dsm"][0][found["dsm"][0] > -9999] - level
+    assert min((np.abs(heights) < 0.05).sum(), (np.abs(heights - scale * ROOF) < 0.05).sum()) > 0.8 * 48 / GSD**2
+    with rasterio.open(tmp_path / "out" / "dsm.tif") as file:
+        assert file.crs is None  # those of the map are not those of the raster
+
+
 def test_a_facade_is_seen_from_outside(workspace, tmp_path):
     """The southern wall: 8 m wide, 4 m high, in the plane y = -3."""
     corners = ("-4,-3,0", "4,-3,0", "-4,-3,4")

@@ -208,6 +208,37 @@ def test_edited_poses_beside_frames_are_told(tmp_path: Path) -> None:
     assert load_model(sparse).image(2).cam_from_world().translation[0] == 0.7
 
 
+@pytest.mark.parametrize("text", [True, False])
+@pytest.mark.parametrize(
+    ("unit", "shift", "moved"),
+    [(2.0, 0.0, "scaled"), (1e-6, 0.0, "scaled"), (1.0, 5e6, "turned")],
+    ids=["twice as large", "in tiny units", "turned in map coordinates"],
+)
+def test_poses_of_before_in_frames_are_told(
+    tmp_path: Path, text: bool, unit: float, shift: float, moved: str
+) -> None:
+    """A program that knows no frames has written over a model that has them."""
+    sparse = make_project(tmp_path, text=text)
+    model = pycolmap.Reconstruction(sparse)
+    model.transform(pycolmap.Sim3d(unit, pycolmap.Rotation3d(), np.full(3, shift)))
+    write = model.write_text if text else model.write_binary
+    write(sparse)
+    load_model(sparse)
+    kept = {path: path.read_bytes() for path in sparse.iterdir() if path.stem in ("rigs", "frames")}
+    turn = pycolmap.Rotation3d(np.array([0.0, 0.0, 0.001, 1.0]) if moved == "turned" else np.array([0, 0, 0, 1.0]))
+    model.transform(pycolmap.Sim3d(1.001, turn, np.zeros(3)))
+    write(sparse)
+    changed = load_model(sparse).image(2).cam_from_world().matrix()
+    for path, content in kept.items():
+        path.write_bytes(content)
+    ending = "txt" if text else "bin"
+    with pytest.raises(InputError, match=rf"two poses of .*delete rigs\.{ending} and frames\.{ending} if images"):
+        load_model(sparse)
+    for path in kept:
+        path.unlink()
+    np.testing.assert_allclose(load_model(sparse).image(2).cam_from_world().matrix(), changed, rtol=1e-12)
+
+
 @pytest.mark.parametrize("length", [1.2, -3e4, 1e-4])
 @pytest.mark.parametrize("text", [True, False])
 def test_quaternions_of_any_length_are_rotations(tmp_path: Path, text: bool, length: float) -> None:

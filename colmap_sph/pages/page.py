@@ -184,7 +184,7 @@ class _Block:
         self._as_partner = {view.name: Partner(view, self.samples[view.name]) for view in self.scene.views}
         self._shown = self._choose_shown()
         centers = np.array([view.center for view in self.scene.views])
-        axes = map_axes(self.scene.views, surface, is_georeferenced=bool(self.scene.origin.any()))
+        axes = map_axes(self.scene.views, surface, origin=self.scene.origin)
         self.frame = frame_around(surface, centers, axes)
         self.ground = Ground(self.frame)
 

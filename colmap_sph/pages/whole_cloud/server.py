@@ -134,7 +134,7 @@ def _frame_of(workspace: Workspace) -> CloudFrame:
     points, _, _ = read_some_points(workspace.fused_path, _FRAME_SAMPLE)
     if not len(points):
         raise InputError(f"The cloud {workspace.fused_path} has no points; its page says why.")
-    axes = map_axes(scene.views, points - scene.origin, is_georeferenced=bool(scene.origin.any()))
+    axes = map_axes(scene.views, points - scene.origin, origin=scene.origin)
     middle = np.median(points, axis=0)
     reach = float(np.percentile(np.linalg.norm(points - middle, axis=1), 90))
     return CloudFrame(axes, middle, reach if reach > 0 else 1.0)

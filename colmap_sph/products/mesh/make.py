@@ -22,7 +22,7 @@ from colmap_sph.products.mesh.triangles import Triangles, joined, read_ply, writ
 from colmap_sph.products.mesh.tsdf import Volume, open3d
 from colmap_sph.products.places import check_places
 from colmap_sph.products.publishing import alone_in
-from colmap_sph.products.surface.placing import level_axes
+from colmap_sph.products.surface.placing import axes_on_map, level_axes
 from colmap_sph.products.surface.seen import SeenView, seen_views
 from colmap_sph.project.cloud_tiles import index_of
 from colmap_sph.project.files import scratch_folder
@@ -247,5 +247,5 @@ def _axes(
 ) -> NDArray[np.float64]:
     """East, north and up in the scene's frame, or what comes next to them."""
     if is_on_map:
-        return georeference.rotation
+        return axes_on_map(scene, seen, georeference) @ georeference.rotation
     return level_axes(scene, seen)

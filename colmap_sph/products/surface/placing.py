@@ -13,6 +13,7 @@ from colmap_sph.products.surface.options import SurfaceOptions
 from colmap_sph.products.surface.seen import SeenView
 from colmap_sph.scene import Scene
 from colmap_sph.stereo.region.map_axes import map_axes
+from colmap_sph.stereo.region.vertical import east_north_up, upwards
 from colmap_sph.stereo.surface.raster import Raster
 
 # An axis of the model is up where the found direction is as near to it: as near as images tell.
@@ -120,11 +121,22 @@ def _axes(
     if is_on_map:
         if up is not None:
             raise OptionError(
-                "up is given, but the model is in map coordinates, whose z is up; leave it out.", "up"
+                "up is given, but the model is in map coordinates, which tell it; leave it out.", "up"
             )
-        return linear, offset, georeference.wkt
+        axes = axes_on_map(scene, seen, georeference)
+        if (axes == np.eye(3)).all():
+            return linear, offset, georeference.wkt
+        # Geocentric: heights from the Earth's middle would lose their digits.
+        return axes @ linear, np.zeros(3), ""
     turn = level_axes(scene, seen, up)
     return turn, turn @ offset, ""
+
+
+def axes_on_map(scene: Scene, seen: Sequence[SeenView], georeference: Georeference) -> NDArray[np.float64]:
+    """(3, 3) east, north and up along the axes of the map, of a scene that is on one."""
+    points = np.concatenate([each.points for each in seen]).astype(np.float64)
+    up = georeference.rotation @ upwards(scene.views, points)
+    return east_north_up(georeference.to_map(scene.origin), up)
 
 
 def level_axes(

@@ -15,7 +15,7 @@ import pycolmap
 
 from colmap_sph.errors import InputError, reason_of
 from colmap_sph.project.files import open_regular
-from colmap_sph.project.given.poses import normalize_rotations
+from colmap_sph.project.given.poses import check_written_poses, normalize_rotations
 
 _POSE_BYTES = 7 * 8
 
@@ -41,7 +41,22 @@ def read_binary_model(files: list[Path]) -> pycolmap.Reconstruction:
     model = pycolmap.Reconstruction()
     model.read_binary(files[0].parent)
     normalize_rotations(model)
+    if files[-1].stem == "frames":
+        check_written_poses(model, _written_poses(files[1]), files)
     return model
+
+
+def _written_poses(path: Path) -> dict[int, tuple[float, ...]]:
+    """Quaternions and translations of ``images.bin``, which is whole, by the ids of images."""
+    poses = {}
+    with open_regular(path) as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+        (count,) = struct.unpack_from("<Q", data)
+        offset = 8
+        for _ in range(count):
+            image_id, *pose = struct.unpack_from("<I7d", data, offset)
+            poses[image_id] = tuple(pose)
+            offset = image_end(data, offset)
+    return poses
 
 
 def check_file(path: Path) -> None:

@@ -1,5 +1,7 @@
-"""Poses of a model as others write them: rotations brought to length one, and those refused that look away."""
+"""Poses of a model as others write them: rotations brought to length one; those that look away, or that there are
+two of, are refused."""
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +12,8 @@ from colmap_sph.project.wide.projection import PANORAMA
 
 # Quaternions in single precision are off by less, which moves nothing.
 _FAR_FROM_ONE = 1e-6
+# Of rotations, and of translations as a share of the largest: what is written with six digits is off by less.
+_SAME_POSE = 1e-5
 # Of so many images, and of each so many observations, points are looked at.
 _MOST_IMAGES = 200
 _MOST_OBSERVATIONS = 50
@@ -29,6 +33,45 @@ def normalize_rotations(model: pycolmap.Reconstruction) -> None:
         if abs(length - 1.0) > _FAR_FROM_ONE and 0.0 < length < np.inf:
             rotation = pycolmap.Rotation3d(pose.rotation.quat / length)
             frame.rig_from_world = pycolmap.Rigid3d(rotation, pose.translation)
+
+
+def check_written_poses(
+    model: pycolmap.Reconstruction, written: Mapping[int, Sequence[float]], files: Sequence[Path]
+) -> None:
+    """Raise `InputError` where an image has another pose in the frames, which COLMAP takes, than beside its name.
+
+    So it is where a program that knows no frames, such as COLMAP before 3.12, has written a changed model over one
+    that has them.
+
+    Parameters
+    ----------
+    model : pycolmap.Reconstruction
+        As it was read.
+    written : mapping of int to sequence of float
+        Quaternion (w, x, y, z) and translation of images by their ids, as the file of images has them.
+    files : sequence of Path
+        The model's files.
+    """
+    there = {path.stem: path for path in files}
+    if "frames" not in there:
+        return
+    far = max((abs(value) for pose in written.values() for value in pose[4:] if np.isfinite(value)), default=0.0)
+    for image_id, (w, x, y, z, *translation) in written.items():
+        image = model.image(image_id)
+        if not image.has_pose:
+            continue
+        rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
+        rotation.normalize()
+        pose = np.column_stack([rotation.matrix(), translation])
+        with np.errstate(all="ignore"):  # impossible poses are told later
+            off = np.abs(image.cam_from_world().matrix() - pose)
+        if np.isfinite(pose).all() and not (off <= _SAME_POSE * np.array([1.0, 1.0, 1.0, far])).all():
+            rigs, frames, images = (there[stem].name for stem in ("rigs", "frames", "images"))
+            raise InputError(
+                f"The model in {there['images'].parent} has two poses of {image.name!r}, one in {images} and "
+                f"another in {frames}; delete {rigs} and {frames} if {images} is right, or export the model from "
+                "COLMAP again."
+            )
 
 
 def check_points_in_front(model: pycolmap.Reconstruction, sparse_dir: Path) -> None:

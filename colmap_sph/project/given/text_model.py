@@ -15,12 +15,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pycolmap
 
 from colmap_sph.errors import InputError, OutputError, reason_of
 from colmap_sph.project.files import open_regular
-from colmap_sph.project.given.poses import normalize_rotations
+from colmap_sph.project.given.poses import check_written_poses, normalize_rotations
 
 logger = logging.getLogger(__name__)
 
@@ -29,7 +28,6 @@ _WHITE = b" \t\n\v\f\r"
 _BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _WIDE_MARKS = (b"\xff\xfe", b"\xfe\xff")
 _SHOWN = 60
-_SAME_POSE = 1e-4
 # COLMAP's numbers of cameras and images have 32 bits, those of points 64; the last one stands for none.
 _END_OF_IDS = 2**32 - 1
 _END_OF_POINT_IDS = 2**64 - 1
@@ -123,13 +121,19 @@ def read_text_model(files: list[Path]) -> pycolmap.Reconstruction:
         raise
     normalize_rotations(model)
     folder = files[0].parent
+    written = {image.image_id: tuple(map(float, image.pose.split())) for image in images}
     _check_count(folder, "images", len(images), model.num_images())
     _check_count(folder, "points", len(point_ids), model.num_points3D())
     for image in images:
         read = model.image(image.image_id)
         read.name = image.name
         _check_count(folder, f"features of {image.name!r}", image.num_features, read.num_points2D())
-        _check_pose(folder, image, read)
+        if not any(written[image.image_id][:4]):  # COLMAP makes some rotation of it
+            raise InputError(
+                f"The model in {folder} has no rotation of {image.name!r}: its quaternion in images.txt is zero; "
+                "export the model again, or remove the image."
+            )
+    check_written_poses(model, written, files)
     return model
 
 
@@ -273,24 +277,4 @@ def _check_count(folder: Path, what: str, written: int, read: int) -> None:
         raise InputError(
             f"The model in {folder} has {written} {what}, of which COLMAP reads {read}; "
             "export the model from COLMAP again."
-        )
-
-
-def _check_pose(folder: Path, image: _Image, read: pycolmap.Image) -> None:
-    """COLMAP takes the poses of ``frames.txt``, where there is one; those beside it must not be others."""
-    w, x, y, z, *translation = map(float, image.pose.split())
-    if not any((w, x, y, z)):  # COLMAP makes some rotation of it
-        raise InputError(
-            f"The model in {folder} has no rotation of {image.name!r}: its quaternion in images.txt is zero; "
-            "export the model again, or remove the image."
-        )
-    rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
-    rotation.normalize()
-    pose = np.column_stack([rotation.matrix(), translation])
-    found = read.cam_from_world().matrix()
-    size = max(1.0, np.abs(pose).max())
-    if np.isfinite(pose).all() and not np.allclose(found, pose, rtol=0, atol=_SAME_POSE * size):
-        raise InputError(
-            f"The model in {folder} has two poses of {image.name!r}, one in images.txt and another in frames.txt; "
-            "delete rigs.txt and frames.txt if images.txt is right, or export the model from COLMAP again."
         )

@@ -15,7 +15,7 @@ from colmap_sph.errors import InputError, percent
 from colmap_sph.scene import Region, Scene, View
 from colmap_sph.stereo.partners.frusta import sees
 from colmap_sph.stereo.region.inside import is_inside
-from colmap_sph.stereo.region.vertical import upwards
+from colmap_sph.stereo.region.vertical import east_north_up, upwards
 
 # Points and views that are looked at, times each other, at most; and points at least and at most.
 _MOST_SIGHTS = 40_000_000
@@ -197,8 +197,9 @@ def _quantile(values: NDArray[np.float64], weights: NDArray[np.float64], share: 
 
 def _box_around(scene: Scene, core: NDArray[np.float64]) -> Region:
     """A box along the model's axes; or where that is much larger, an upright one."""
-    # In map coordinates z is up.
-    up = np.eye(3)[2] if scene.origin.any() else upwards(scene.views, core)
+    up = upwards(scene.views, core)
+    if scene.origin.any():
+        up = east_north_up(scene.origin, up)[2]
     axes = _upright_axes(core, up)
     plain = _reach(core)
     turned = _reach(core @ axes.T)

@@ -6,14 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.scene import View
-from colmap_sph.stereo.region.vertical import upwards
+from colmap_sph.stereo.region.vertical import east_north_up, upwards
 
 
 def map_axes(
     views: Sequence[View],
     points: NDArray[np.float64],
     *,
-    is_georeferenced: bool = False,
+    origin: NDArray[np.float64] | None = None,
     up: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
     """Axes of a map of a scene.
@@ -24,8 +24,8 @@ def map_axes(
         At least one.
     points : (n, 3) float64 ndarray
         Some points of its surface.
-    is_georeferenced : bool
-        Whether the scene is in map coordinates, whose z is up.
+    origin : (3,) float64 ndarray, optional
+        Map coordinates of the scene's origin, as `Scene.origin`; zeros where it is in a frame of its own.
     up : (3,) float64 ndarray, optional
         Unit vector; found from views and points where it is not given.
 
@@ -34,9 +34,9 @@ def map_axes(
     (3, 3) float64 ndarray
         Rows: to the right, to the top, and up, towards who looks at the map; a rotation.
     """
-    if is_georeferenced:
-        return np.eye(3)
     up = upwards(views, points) if up is None else up
+    if origin is not None and origin.any():
+        return east_north_up(origin, up)
     # The long side of the scene lies across.
     level = points - points.mean(axis=0) if len(points) else np.zeros((1, 3))
     level = level - np.outer(level @ up, up)
