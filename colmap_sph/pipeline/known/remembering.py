@@ -14,7 +14,7 @@ from colmap_sph.project.workspace import KnownFile
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
-_NO_COST = Cost(0.0, 0.0, 0.0)
+NO_COST = Cost(0.0, 0.0, 0.0)
 
 
 class RememberingStage(Stage[Item, Task]):
@@ -89,4 +89,4 @@ def _name(item: Any) -> str:
 
 def done(key: str, facts: Facts) -> Job[Any]:
     """The job of a result that is there, of which nothing else will be asked."""
-    return Job(key, facts, _NO_COST, None)
+    return Job(key, facts, NO_COST, None)
