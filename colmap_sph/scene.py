@@ -6,7 +6,7 @@ the first pixel's centre is at (0.5, 0.5).
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
@@ -287,6 +287,13 @@ def pixel_transfer(source: View, target: View) -> NDArray[np.float64]:
     transfer[:, :3] = target.K @ rotation @ source.inverse_K
     transfer[:, 3] = target.K @ (target.t - rotation @ source.t)
     return transfer
+
+
+def in_bands(shape: Sequence[int], most: int) -> Iterator[slice]:
+    """Rows of an image (height, width, ...), from the top, in bands of at most `most` pixels, or one row."""
+    height, width = shape[:2]
+    step = max(most // width, 1)
+    return (slice(first, min(first + step, height)) for first in range(0, height, step))
 
 
 def observed_by(

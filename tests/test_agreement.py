@@ -17,13 +17,7 @@ from colmap_sph.app import cli
 from colmap_sph.app.run_command import print_summary
 from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import NoResultError
-from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.input.good_images import without_misplaced
-from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.plan import make_plan
-from colmap_sph.pipeline.report import RunReport
-from colmap_sph.pipeline.self_check import (
+from colmap_sph.pipeline.checks.self_check import (
     judge_agreement,
     judge_copies,
     judge_reprojection,
@@ -32,6 +26,12 @@ from colmap_sph.pipeline.self_check import (
     refuse_disagreement,
     share_in_sight,
 )
+from colmap_sph.pipeline.context import Context
+from colmap_sph.pipeline.input.good_images import without_misplaced
+from colmap_sph.pipeline.keys import Keys
+from colmap_sph.pipeline.options import RunOptions
+from colmap_sph.pipeline.plan import make_plan
+from colmap_sph.pipeline.report import RunReport
 from colmap_sph.pipeline.stages.facts import Agreement
 from colmap_sph.products.maps.reading import check_maps
 from colmap_sph.project.map_files import read_depth_map, write_depth_map

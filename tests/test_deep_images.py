@@ -15,7 +15,7 @@ from test_undistortion import make_project
 import colmap_sph
 from colmap_sph.evaluation import compare_depth_map
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.stages.check_images import Known, read_known, write_known
+from colmap_sph.pipeline.stages.check_images import KnownImage, read_known, write_known
 from colmap_sph.project.images.decoding import read_pixels
 from colmap_sph.project.images.depth import ValueRange, ValueSample, common_ranges, describe_ranges, sample_values
 from colmap_sph.project.images.reading import read_grey
@@ -252,7 +252,7 @@ def test_a_damaged_list_of_images_is_not_believed(old: bytes, tmp_path: Path) ->
     prepare(sparse, workspace.root)
     assert known.read_bytes() == whole
     key = make_context(workspace).keys.known_images()
-    images = {"a.png": Known((96, 64), "digest", (1, 2), ValueSample("odd", (1.0,)))}
+    images = {"a.png": KnownImage((96, 64), "digest", (1, 2), ValueSample("odd", (1.0,)))}
     assert read_known(known, key)
     write_known(known, key, images)
     assert read_known(known, key) == {}
@@ -262,7 +262,7 @@ def test_a_damaged_list_of_images_is_not_believed(old: bytes, tmp_path: Path) ->
 
 def test_what_is_known_of_images_depends_on_the_program(tmp_path: Path) -> None:
     """Another version may find damage in them that this one does not."""
-    images = {"a.png": Known((96, 64), "digest", (1, 2))}
+    images = {"a.png": KnownImage((96, 64), "digest", (1, 2))}
     write_known(tmp_path / "images.json", "key", images)
     assert read_known(tmp_path / "images.json", "key") == images
     assert read_known(tmp_path / "images.json", "other") == {}

@@ -14,7 +14,7 @@ from projects import FOUR_NAMES, copy_four_images
 import colmap_sph
 from colmap_sph.pipeline.known import remembering
 from colmap_sph.pipeline.known.selection import read_selection, write_selection
-from colmap_sph.pipeline.known.table import Known, ResultTable, stamp_of_files
+from colmap_sph.pipeline.known.table import KnownResult, ResultTable, stamp_of_files
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
 from colmap_sph.pipeline.stages import selection as selection_module
@@ -42,7 +42,7 @@ def table(tmp_path: Path, key: str = "input") -> ResultTable:
 
 def test_a_table_keeps_what_it_is_given(tmp_path: Path, file: Path) -> None:
     facts = Facts(0.5, 0.25, Agreement(3, 2, 1), row_residual=0.001)
-    known = Known("key", stamp_of_files([str(file)]), facts)
+    known = KnownResult("key", stamp_of_files([str(file)]), facts)
     table(tmp_path).add({"a": known})
     table(tmp_path).add({"b": known})
     assert table(tmp_path).find("a", [str(file)]) == table(tmp_path).find("b", [str(file)]) == known
@@ -52,7 +52,7 @@ def test_a_table_keeps_what_it_is_given(tmp_path: Path, file: Path) -> None:
 
 @pytest.mark.parametrize("change", ["content", "same size and time", "copy", "gone", "folder"])
 def test_a_touched_file_is_unknown(tmp_path: Path, file: Path, change: str) -> None:
-    table(tmp_path).add({"a": Known("key", stamp_of_files([str(file)]), Facts())})
+    table(tmp_path).add({"a": KnownResult("key", stamp_of_files([str(file)]), Facts())})
     status = file.stat()
     if change == "content":
         file.write_bytes(b"contents")
@@ -71,7 +71,7 @@ def test_a_touched_file_is_unknown(tmp_path: Path, file: Path, change: str) -> N
 
 @pytest.mark.parametrize("damage", [b"", b"{}", b'{"key": "input", "check": "", "content": {}}', b"\xff\xfe"])
 def test_a_damaged_table_knows_nothing(tmp_path: Path, file: Path, damage: bytes) -> None:
-    table(tmp_path).add({"a": Known("key", stamp_of_files([str(file)]), Facts())})
+    table(tmp_path).add({"a": KnownResult("key", stamp_of_files([str(file)]), Facts())})
     (tmp_path / "known/table.json").write_bytes(damage)
     assert table(tmp_path).find("a", [str(file)]) is None
 

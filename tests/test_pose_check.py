@@ -12,10 +12,10 @@ from rendered import SIDES, grey
 
 from colmap_sph import synthetic as syn
 from colmap_sph.errors import InputError, NoResultError
-from colmap_sph.pipeline import pose_check
+from colmap_sph.pipeline.checks import pose_check
+from colmap_sph.pipeline.checks.pose_check import Compared, distance_of_pairs, fitting_factor
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.plan import make_plan
-from colmap_sph.pipeline.pose_check import Compared, distance_of_pairs, fitting_factor
 from colmap_sph.pipeline.reconstruct import run
 from colmap_sph.project.project import Project
 from colmap_sph.scene import Photograph, View

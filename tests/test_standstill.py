@@ -136,13 +136,13 @@ def test_images_that_others_are_compared_with_are_read_once(tmp_path, monkeypatc
     context = with_still_pixels(context_of(tmp_path, [picture] * IMAGES, views), [view.name for view in views])
     place = context.workspace.image_path
     read: list[str] = []
-    small = photo.read_small
+    small = photo.read_small_grey
 
     def count(path: Path, side: int) -> photo.Mask:
         read.append(path.name)
         return small(path, side)
 
-    monkeypatch.setattr(photo, "read_small", count)
+    monkeypatch.setattr(photo, "read_small_grey", count)
     with photo.kept_masks.holding(1 << 24):
         for view in views:
             assert photo.still_mask(view, place(view.name), [*map(place, context.still[view.name])]).any()
@@ -255,7 +255,7 @@ def test_images_are_read_at_once_as_memory_allows(tmp_path, monkeypatch, memory,
     views = views_of(cameras)
     context = context_of(tmp_path, [photograph(egg(), cameras[0], 0)[0]] * IMAGES, views)
     context = replace(context, options=replace(context.options, memory=memory, threads=3))
-    small, lock = photo.read_small, threading.Lock()
+    small, lock = photo.read_small_grey, threading.Lock()
     reading: list[int] = [0]
 
     def read(path: Path, side: int) -> photo.Mask:
@@ -267,6 +267,6 @@ def test_images_are_read_at_once_as_memory_allows(tmp_path, monkeypatch, memory,
             reading.append(reading[-1] - 1)
         return found
 
-    monkeypatch.setattr("colmap_sph.pipeline.input.standing.read_small", read)
+    monkeypatch.setattr("colmap_sph.pipeline.input.standing.read_small_grey", read)
     assert still_images(context) == IMAGES
     assert max(reading) == most

@@ -12,6 +12,7 @@ import numpy as np
 import oracle
 import pytest
 import surveyed
+from projects import read_picture
 from refusals import assert_refused
 from surveyed import BLUE, BOX, GREEN, GSD, RED, ROOF, surveyed_workspace
 
@@ -62,13 +63,6 @@ def made(
                 arrays[path.stem] = file.read()
                 transform = file.transform
     return arrays, transform, summary
-
-
-def read_picture(path: Path) -> np.ndarray:
-    """(h, w, 3) blue, green and red."""
-    picture = cv2.imread(str(path))
-    assert picture is not None
-    return np.asarray(picture)
 
 
 def places(arrays, transform):

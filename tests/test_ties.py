@@ -10,8 +10,8 @@ import pytest
 from rendered import SIDES, disparities, exact_disparity, grey, pixel_rays, scene_of_pair
 
 from colmap_sph import synthetic as syn
+from colmap_sph.pipeline.checks.self_check import judge_rows
 from colmap_sph.pipeline.report import RunReport
-from colmap_sph.pipeline.self_check import judge_rows
 from colmap_sph.pipeline.stages.pair_files import facts_of_pair, read_pair, read_pair_with_ties, write_pair
 from colmap_sph.scene import Scene, View
 from colmap_sph.stereo.confirm import ConfirmOptions, confirm_depth

@@ -84,7 +84,7 @@ class ImageFacts:
         return self.shares[Reason.CONFIRMED] / max(1 - self.shares[Reason.OUTSIDE], 1e-9)
 
 
-def read_picture(workspace: Workspace, view: View) -> Bytes | None:
+def read_small_picture(workspace: Workspace, view: View) -> Bytes | None:
     """A view's image, small: (h, w, 3), blue, green and red; None where it cannot be read."""
     path = workspace.image_path(view.name)
     with suppress(InputError):
@@ -96,7 +96,7 @@ def read_picture(workspace: Workspace, view: View) -> Bytes | None:
 def find_blank(
     workspace: Workspace, name: str, picture: Bytes | None, shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
-    """Where an image, small as of `read_picture`, shows nothing that could be matched, at samples of its maps."""
+    """Where an image, of `read_small_picture`, shows nothing that could be matched, at samples of its maps."""
     if picture is None:
         return np.zeros(shape, bool)
     step = coarsest_jpeg_step(workspace.image_path(name), undistorted_place(workspace, name).record)
@@ -141,7 +141,7 @@ def small_pictures(
     samples : MapSamples
     reasons : (h, w) uint8 ndarray
     picture : (H, W, 3) uint8 ndarray or None
-        Blue, green and red, as of `read_picture`.
+        Blue, green and red, as of `read_small_picture`.
     shown : int
         Images whose pictures share the page.
     """

@@ -20,7 +20,7 @@ from colmap_sph.pages.image_facts import (
     Picture,
     facts_of_image,
     find_blank,
-    read_picture,
+    read_small_picture,
     small_pictures,
 )
 from colmap_sph.pages.markup import render
@@ -194,7 +194,7 @@ class _Block:
         return self._look_at_cut(photograph.name, cuts) if cuts else self._look_at_whole(photograph.lead)
 
     def _look_at_whole(self, view: View) -> ImageFacts:
-        samples, picture = self.samples[view.name], read_picture(self.workspace, view)
+        samples, picture = self.samples[view.name], read_small_picture(self.workspace, view)
         reasons, depth = self._reasons(view, picture)
         self.ground.add(view, samples, reasons, depth)
         pictures: tuple[Picture, ...] = ()
@@ -207,7 +207,7 @@ class _Block:
         is_shown = name in self._shown
         image = WideImage(name, cuts[0][1].lens, samples_per_side(len(self.photographs)), is_shown)
         for view, cut in cuts:
-            samples, picture = self.samples[view.name], read_picture(self.workspace, view)
+            samples, picture = self.samples[view.name], read_small_picture(self.workspace, view)
             reasons, depth = self._reasons(view, picture)
             normals = read_normals(self.workspace, view, samples) if is_shown else None
             image.add(view, cut, samples, reasons, depth, normals, picture)

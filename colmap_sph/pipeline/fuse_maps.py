@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.pipeline.checks.contradictions import check_fusion
 from colmap_sph.pipeline.context import Context, timed_stage
-from colmap_sph.pipeline.contradictions import check_fusion
 from colmap_sph.pipeline.execute import execute
 from colmap_sph.pipeline.input.good_images import check_fusion_masks
 from colmap_sph.pipeline.keys import Keys

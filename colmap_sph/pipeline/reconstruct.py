@@ -10,8 +10,16 @@ from pathlib import Path
 from typing import TypeVar
 
 from colmap_sph.errors import NoResultError, OptionError
+from colmap_sph.pipeline.checks.contradictions import check_numbers
+from colmap_sph.pipeline.checks.pose_check import check_poses
+from colmap_sph.pipeline.checks.self_check import (
+    judge_agreement,
+    judge_reprojection,
+    judge_rows,
+    refuse_disagreement,
+    share_in_sight,
+)
 from colmap_sph.pipeline.context import Context, Until
-from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.execute import Executor, execute, executor_of
 from colmap_sph.pipeline.forecast.foresight import foreseen_stages
 from colmap_sph.pipeline.forecast.sizes import with_affordable_size
@@ -22,16 +30,8 @@ from colmap_sph.pipeline.input.prepared import prepare
 from colmap_sph.pipeline.input.start import Request, start
 from colmap_sph.pipeline.keys import program_digests
 from colmap_sph.pipeline.options import RunOptions
-from colmap_sph.pipeline.pose_check import check_poses
 from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.report_files import command_of, keep_or_make_page, write_report
-from colmap_sph.pipeline.self_check import (
-    judge_agreement,
-    judge_reprojection,
-    judge_rows,
-    refuse_disagreement,
-    share_in_sight,
-)
 from colmap_sph.pipeline.stages.confirm import ConfirmStage
 from colmap_sph.pipeline.stages.fuse import fuse_stage
 from colmap_sph.pipeline.stages.match import MatchStage

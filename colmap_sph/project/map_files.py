@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import DamageError, InputError, reason_of
 from colmap_sph.project.files import atomic_file, open_regular
+from colmap_sph.scene import in_bands
 
 # Depths beyond, in any unit, come from damage.
 _FARTHEST = 1e12
@@ -267,11 +268,10 @@ def find_flaw(depth: NDArray[np.float32], normals: NDArray[np.float32]) -> str |
     # Neither NaN nor infinity gets past both; a sum of them all could overflow.
     if not np.isfinite([depth.min(), depth.max()]).all():
         return "a depth that is not finite"
-    step = max(_BAND_VALUES // depth.shape[1], 1)
     # What is too large to be squared becomes infinite, and is found so.
     with np.errstate(over="ignore", invalid="ignore"):
-        for first in range(0, depth.shape[0], step):
-            x, y, z = normals[:, first : first + step]
+        for rows in in_bands(depth.shape, _BAND_VALUES):
+            x, y, z = normals[:, rows]
             squared = x * x
             squared += y * y
             squared += z * z

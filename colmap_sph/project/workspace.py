@@ -11,7 +11,7 @@ from colmap_sph.platforms.names import longest_path, name_problem
 from colmap_sph.project.files import make_dir
 
 MapKind = Literal["photometric", "geometric"]
-Known = Literal["selection", "pairs", "photometric", "geometric", "page"]
+KnownFile = Literal["selection", "pairs", "photometric", "geometric", "page"]
 
 PREVIEW_PREFIX = "preview_"
 """What small pictures of products, for the page, are called at first."""
@@ -173,14 +173,14 @@ class Workspace:
         """What is known of results, so that it need not be found out again."""
         return self.state_dir / "known"
 
-    def known_path(self, of: Known) -> Path:
+    def known_path(self, of: KnownFile) -> Path:
         """What is known of results of a kind, of the pairs that were chosen, or of the page."""
         return self.known_dir / f"{of}.json"
 
     @property
     def known_paths(self) -> list[Path]:
         """All of these; need not exist."""
-        return [self.known_path(of) for of in get_args(Known)]
+        return [self.known_path(of) for of in get_args(KnownFile)]
 
     @cached_property
     def pairs_dir(self) -> Path:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from colmap_sph import _native
 from colmap_sph.errors import OptionError
-from colmap_sph.scene import POINT, View, pixel_transfer
+from colmap_sph.scene import POINT, View, in_bands, pixel_transfer
 from colmap_sph.stereo.partners.stations import OWN_STATION
 from colmap_sph.stereo.search.idle import at_once
 
@@ -230,14 +230,13 @@ def fuse_view(
             at_once(*_in_bands(reference, partner, options, bit, covered, agreeing, colour))
         del partner  # or it is there while the next is read
     view = reference.view
-    step = max(_BAND_PIXELS // shape[1], 1)
     gates = (options.min_num_pixels, _station_bits(stations))
     pixels = (reference.depth, reference.normals, covered, agreeing, colour, *gates)
     world_from_pixel = view.R.T @ view.inverse_K
     world_from_camera = view.R.T
     frame = (np.ascontiguousarray(world_from_pixel), np.ascontiguousarray(world_from_camera), view.center + offset)
-    for first in range(0, shape[0], step):
-        rows = (first, min(first + step, shape[0]))
+    for band in in_bands(shape, _BAND_PIXELS):
+        rows = (band.start, band.stop)
         num_points, num_words = _native.count_points(*pixels, *rows)
         points = np.empty((num_points, POINT.itemsize), np.uint8)
         visibility = np.empty(num_words, np.uint32)

@@ -12,8 +12,8 @@ from dataclasses import replace
 from statistics import median
 from typing import TYPE_CHECKING, Any
 
+from colmap_sph.pipeline.checks.contradictions import check_numbers
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.forecast.earlier import keep_choice, not_beyond
 from colmap_sph.pipeline.forecast.foresight import estimate, estimated_fusion, foreseen_stages
 from colmap_sph.pipeline.forecast.ladder import BEST, Choice, Settings, choices

@@ -8,10 +8,10 @@ from pathlib import Path
 from statistics import mean
 from typing import TYPE_CHECKING
 
+from colmap_sph.pipeline.checks.self_check import judge_copies, misplaced_views, refuse_cameras
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.input.standing import with_still_pixels
 from colmap_sph.pipeline.keys import Keys
-from colmap_sph.pipeline.self_check import judge_copies, misplaced_views, refuse_cameras
 from colmap_sph.pipeline.stages.check_images import CheckStage, ImagePlaces, details_of, tell_changed
 from colmap_sph.pipeline.stages.stage import keys_of
 from colmap_sph.project.masks import check_mask_names

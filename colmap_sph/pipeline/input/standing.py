@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, percent
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.memory import MemoryGate
-from colmap_sph.pipeline.stages.photo import read_small
+from colmap_sph.pipeline.stages.photo import read_small_grey
 from colmap_sph.project.masks import read_view_mask
 from colmap_sph.scene import View
 from colmap_sph.stereo.poses.standstill import slightly_turned_views, still_pixels, turned_views
@@ -72,7 +72,7 @@ def _still_shares(
 
     def read(name: str) -> None:
         with suppress(InputError):  # told by the stage that needs it
-            small[name] = read_small(context.workspace.image_path(name), _LOOKED_AT)
+            small[name] = read_small_grey(context.workspace.image_path(name), _LOOKED_AT)
 
     def share(name: str) -> float | None:
         if beside[name] not in small:

@@ -6,21 +6,21 @@ from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from colmap_sph.pipeline.known.table import Known, ResultTable, stamp_of_files
+from colmap_sph.pipeline.known.table import KnownResult, ResultTable, stamp_of_files
 from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.pipeline.stages.stage import Cost, Item, Job, Result, Stage, Task
-from colmap_sph.project.workspace import Known as WhatIsKnown
+from colmap_sph.project.workspace import KnownFile
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
 
-_NO_COST = Cost(0.0, 0.0, 0.0)
+NO_COST = Cost(0.0, 0.0, 0.0)
 
 
 class RememberingStage(Stage[Item, Task]):
     """A stage whose `job` looks up what is known, and asks only for the rest."""
 
-    remembered_as: ClassVar[WhatIsKnown | None] = None
+    remembered_as: ClassVar[KnownFile | None] = None
     """Of what it remembers results, see `Workspace.known_path`; None: it does not."""
 
     def __init__(self, context: "Context", items: Sequence[Item]) -> None:
@@ -79,7 +79,7 @@ class RememberingStage(Stage[Item, Task]):
                 if not self.is_there(item, result.key):
                     continue  # someone has put something else there meanwhile, or it is not complete
             if stamp:
-                known[_name(item)] = Known(result.key, stamp, result.facts)
+                known[_name(item)] = KnownResult(result.key, stamp, result.facts)
         self._table.add(known)
 
 
@@ -89,4 +89,4 @@ def _name(item: Any) -> str:
 
 def done(key: str, facts: Facts) -> Job[Any]:
     """The job of a result that is there, of which nothing else will be asked."""
-    return Job(key, facts, _NO_COST, None)
+    return Job(key, facts, NO_COST, None)

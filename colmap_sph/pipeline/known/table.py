@@ -21,7 +21,7 @@ from colmap_sph.pipeline.stages.facts import Facts
 from colmap_sph.project.files import folder_locked, make_dir
 
 
-class Known(msgspec.Struct, frozen=True, array_like=True):
+class KnownResult(msgspec.Struct, frozen=True, array_like=True):
     """Of a result that was up to date: its key, the stamp of its files, and its facts."""
 
     key: str
@@ -45,15 +45,15 @@ class ResultTable:
         self._key = key
 
     @cached_property
-    def _known(self) -> dict[str, Known]:
-        return read_kept(self._path, self._key, dict[str, Known]) or {}
+    def _known(self) -> dict[str, KnownResult]:
+        return read_kept(self._path, self._key, dict[str, KnownResult]) or {}
 
-    def find(self, item: str, files: Iterable[str]) -> Known | None:
+    def find(self, item: str, files: Iterable[str]) -> KnownResult | None:
         """What is known of an item, whose files are as they were then; None where that is nothing."""
         known = self._known.get(item)
         return known if known is not None and known.stamp == stamp_of_files(files) else None
 
-    def add(self, results: Mapping[str, Known]) -> None:
+    def add(self, results: Mapping[str, KnownResult]) -> None:
         """Keep what is known of more items, or anew; those without a stamp are left out."""
         kept = {item: known for item, known in results.items() if known.stamp}
         if all(self._known.get(item) == known for item, known in kept.items()):

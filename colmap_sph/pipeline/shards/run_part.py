@@ -12,8 +12,8 @@ from time import monotonic, sleep
 from typing import Any, TypeVar
 
 from colmap_sph.errors import InputError, OptionError
+from colmap_sph.pipeline.checks.contradictions import check_numbers
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.contradictions import check_numbers
 from colmap_sph.pipeline.engine.lag import PATIENCE
 from colmap_sph.pipeline.execute import execute, made_by_threads, tell_counts
 from colmap_sph.pipeline.forecast.foresight import estimate

@@ -71,7 +71,7 @@ def check_image(task: ImageFile) -> ImageFacts:
 
 
 @dataclass(frozen=True)
-class Known:
+class KnownImage:
     """Of an image that was found good: its size, the digest of its content, when that was read, and its facts.
 
     `doubt` is empty but for an image that was changed while a run worked with it, see `tell_changed`.
@@ -91,12 +91,12 @@ class Known:
         return digest(self.digest, self.doubt) if self.doubt else self.digest
 
 
-def read_known(path: Path, key: str) -> dict[str, Known]:
+def read_known(path: Path, key: str) -> dict[str, KnownImage]:
     """Read what `write_known` wrote under this key; nothing where the file holds anything else."""
-    return read_kept(path, key, dict[str, Known]) or {}
+    return read_kept(path, key, dict[str, KnownImage]) or {}
 
 
-def write_known(path: Path, key: str, images: Mapping[str, Known]) -> None:
+def write_known(path: Path, key: str, images: Mapping[str, KnownImage]) -> None:
     """Keep what is known of images; `OutputError` where that fails."""
     write_kept(path, key, images, sync=True)  # doubts are not found out again
 
@@ -165,7 +165,7 @@ class CheckStage(Stage[str, ImageFile]):
             self._known = {
                 name: replace(each, digest="", stamp=()) for name, each in self._known.items() if each.doubt
             }
-        self._seen: dict[str, Known] = {}
+        self._seen: dict[str, KnownImage] = {}
 
     @property
     def is_new(self) -> bool:
@@ -183,7 +183,8 @@ class CheckStage(Stage[str, ImageFile]):
         is_read = known is not None and known.stamp == stamp
         content = known.digest if known is not None and is_read else file_digest(image.path)
         doubt = "" if known is None else known.doubt
-        self._seen[item] = seen = Known(image.size, content, stamp, detail_size=image.detail_size, doubt=doubt)
+        seen = KnownImage(image.size, content, stamp, detail_size=image.detail_size, doubt=doubt)
+        self._seen[item] = seen
         facts = None
         wanted = (content, image.size, image.detail_size)
         if known is not None and (known.digest, known.size, known.detail_size) == wanted:
@@ -280,5 +281,5 @@ def tell_changed(
         context.leave_incomplete(name, f"{path} was changed while the run was at work; run again")
 
 
-def _is_changed(path: Path, known: Known) -> bool:
+def _is_changed(path: Path, known: KnownImage) -> bool:
     return stamp_of(path.stat()) != known.stamp and file_digest(path) != known.digest

@@ -25,7 +25,7 @@ from colmap_sph.project.files import make_dir
 from colmap_sph.project.images.reading import bytes_to_reduce, grey_bytes
 from colmap_sph.project.state.array_file import OLD_SUFFIX, read_head
 from colmap_sph.project.state.ownership import remove_array_files, remove_flat_pairs, undistorted_place
-from colmap_sph.project.workspace import Known
+from colmap_sph.project.workspace import KnownFile
 from colmap_sph.scene import Photograph, View
 from colmap_sph.stereo.census import RectifiedImage
 from colmap_sph.stereo.matching import MatchingOptions, match_pair, pair_scratch_bytes
@@ -194,7 +194,7 @@ class MatchStage(RememberingStage[Pair, MatchTask]):
     """Matches pairs of image names."""
 
     name = "match pairs"
-    remembered_as: ClassVar[Known | None] = "pairs"
+    remembered_as: ClassVar[KnownFile | None] = "pairs"
     make = staticmethod(make_disparity_maps)
     caches = (_photos, kept_masks)
 

@@ -95,7 +95,7 @@ class PhotoFile:
 
 def still_mask(view: View, image: Path, turned: Sequence[Path]) -> Mask:
     """1 where an image of a view and those that it is compared with show the same, see `still_pixels`, else 0."""
-    still = still_pixels(read_small(image, _STILL_SIDE), map(_compared, turned))
+    still = still_pixels(read_small_grey(image, _STILL_SIDE), map(_compared, turned))
     return np.asarray(cv2.resize(still, (view.width, view.height), interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
@@ -111,11 +111,11 @@ def still_bytes(view: View) -> float:
 
 def _compared(path: Path) -> Mask:
     """A small image that many are compared with."""
-    small = kept_masks.get(f"{file_stamp(path)} small", lambda: read_small(path, _STILL_SIDE))
+    small = kept_masks.get(f"{file_stamp(path)} small", lambda: read_small_grey(path, _STILL_SIDE))
     assert small is not None
     return small
 
 
-def read_small(path: Path, longest: int) -> Mask:
+def read_small_grey(path: Path, longest: int) -> Mask:
     """Read the grey values of an image, small: (h, w) uint8, its longest side at most `longest` pixels."""
     return np.asarray(cv2.cvtColor(read_small_colours(path, longest), cv2.COLOR_BGR2GRAY), np.uint8)

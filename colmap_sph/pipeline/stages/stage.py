@@ -65,7 +65,7 @@ class Job(Generic[Task]):
     done : Facts or None
         What is known of the result where it is there under this key; None where it must be made.
     cost : Cost
-        Of making it.
+        Of making it; where it is done it may be left out.
     task : Task
         What `Stage.make` needs; can be pickled.
     """

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from colmap_sph.errors import NoResultError
-from colmap_sph.pipeline.known.remembering import RememberingStage
+from colmap_sph.pipeline.known.remembering import NO_COST, RememberingStage
 from colmap_sph.pipeline.stages.facts import Agreement, Facts
 from colmap_sph.pipeline.stages.maps import MAP_BYTES, MapFiles
 from colmap_sph.pipeline.stages.pair_files import (
@@ -215,45 +215,43 @@ class VoteStage(RememberingStage[str, VoteTask]):
         residuals = [self._residuals[pair] for pair in pairs]
         keys = [self._pair_keys[pair] for pair in pairs]
         key = context.keys.vote(view, keys, stations, residuals, context.cut(item))
-        maps_key = context.keys.photometric(key)
-        estimate = context.estimate_path(item)
-        window = context.window(item)
-        maps = context.map_files(item, "photometric")
-        is_voted = facts_of_estimate(estimate, key, window.view(view)) is not None
         task = VoteTask(
             view.without_points(),
             lead,
             files,
             tuple(keys),
             context.workspace.mask_path(item),
-            estimate,
+            context.estimate_path(item),
             tuple(stations),
             tuple(residuals),
             context.options.vote,
             context.options.normals,
             context.options.rectification.depths,
-            window,
+            context.window(item),
             context.focus,
             tuple(matched),
-            maps,
+            context.map_files(item, "photometric"),
             context.wants_photometric,
             key,
-            maps_key,
+            context.keys.photometric(key),
         )
-        done = self.found(task)
-        only_maps = is_voted and done is None  # to make, or to remove
-        return Job(key, done, self._cost(view, lead, window.num_pixels, files, only_maps), task)
+        facts = self.found(task)
+        # What making it costs stands in the heads of all its pairs' files.
+        return Job(key, facts, self._cost(task) if facts is None else NO_COST, task)
 
-    def _cost(self, view: View, lead: str, pixels: int, files: tuple[Path, ...], only_maps: bool) -> Cost:
+    def _cost(self, task: VoteTask) -> Cost:
+        pixels = task.window.num_pixels
         unknown = (_DISPARITY_BYTES * pixels, 0.0)
-        disparities = [bytes_to_read(file, lead) or unknown for file in files]
-        seconds = 0.0 if only_maps else vote_seconds(len(files))
+        disparities = [bytes_to_read(file, task.lead) or unknown for file in task.pairs]
+        view = task.window.view(task.view)
+        only_maps = facts_of_estimate(task.estimate, task.vote_key, view) is not None  # to make, or to remove
+        seconds = 0.0 if only_maps else vote_seconds(len(task.pairs))
         disk = 0.0 if only_maps else _ESTIMATE_BYTES * pixels
         at_once, maps = _VOTE_BYTES if self.context.focus is None else _MAPS_BYTES, 0.0
         if self.context.wants_photometric:
             seconds += normals_seconds(self.context.options.normals)
-            disk += MAP_BYTES * view.num_pixels
-            at_once, maps = _MAPS_BYTES, MAP_BYTES * (view.num_pixels - pixels)
+            disk += MAP_BYTES * task.view.num_pixels
+            at_once, maps = _MAPS_BYTES, MAP_BYTES * (task.view.num_pixels - pixels)
         memory = max([at_once * pixels + maps, *(reading for _, reading in disparities)])
         memory += sum(kept for kept, _ in disparities)
         return Cost(seconds * pixels / 1e6, memory, disk)

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError
 from colmap_sph.project.files import atomic_file, make_dir
-from colmap_sph.project.images.bands import in_bands
 from colmap_sph.project.images.decoding import date_of, is_jpeg, read_pixels, unreadable
 from colmap_sph.project.images.depth import ValueRange, stretched
 from colmap_sph.project.images.jpeg import DamagedError
 from colmap_sph.project.images.orientation import copy_without_orientation
 from colmap_sph.project.lens.field import LensField
 from colmap_sph.project.lens.straight import place_in_original, straight_camera
+from colmap_sph.scene import in_bands
 
 # Pixels that are floating-point numbers at a time.
 _BAND_PIXELS = 1 << 18
@@ -158,7 +158,7 @@ def _forget_time_of_writing(written: Path, source: Path) -> None:
 
 def _stretched(pixels: NDArray[Any], values: ValueRange) -> NDArray[np.uint16]:
     image = pixels if pixels.dtype == np.uint16 else np.empty(pixels.shape, np.uint16)
-    for rows in in_bands(len(pixels), pixels.shape[1], _BAND_PIXELS):
+    for rows in in_bands(pixels.shape, _BAND_PIXELS):
         image[rows] = np.rint(stretched(pixels[rows], values) * _WHITE)
     return image
 
@@ -193,7 +193,7 @@ def undistorted_pixels(
     if reduce:
         target.rescale(camera.width, camera.height)
     warped = np.empty((target.height, target.width, image.shape[2]), image.dtype)
-    for rows in in_bands(target.height, target.width, _BAND_PIXELS):
+    for rows in in_bands(warped.shape, _BAND_PIXELS):
         warped[rows] = _warped_rows(image, place_in_original(camera, target, field, rows), target.width)
     return _resized(warped, size) if reduce else warped
 

@@ -7,7 +7,7 @@ from typing import get_args
 import xxhash
 
 from colmap_sph.project.cloud_tiles import INDEX
-from colmap_sph.project.state.records import recorded_facts, stamp_of
+from colmap_sph.project.state.records import content_stamp, recorded_facts
 from colmap_sph.project.workspace import MapKind, Workspace
 
 
@@ -20,7 +20,7 @@ class _Marked:
 
 def map_mark(workspace: Workspace, name: str, kind: MapKind) -> str:
     """16 digits that tell the depth map of an image from others of it, and from those of other images."""
-    stamp = stamp_of(workspace.depth_map_path(name, kind))
+    stamp = content_stamp(workspace.depth_map_path(name, kind))
     return xxhash.xxh3_64_hexdigest(f"{name}\0{kind}\0{stamp}".encode("utf-8", "surrogateescape"))
 
 

@@ -348,7 +348,7 @@ def _digest(path: Path) -> str | None:
     return None
 
 
-def stamp_of(path: Path) -> str:
+def content_stamp(path: Path) -> str:
     """What tells a file from others without reading all of it; empty for one that cannot be read."""
     return _stamp_if_readable(path) or ""
 

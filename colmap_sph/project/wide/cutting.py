@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError
 from colmap_sph.project.files import atomic_file, make_dir
-from colmap_sph.project.images.bands import in_bands
 from colmap_sph.project.images.depth import ValueRange
 from colmap_sph.project.images.undistorting import read_original
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.wide.cuts import Cut
 from colmap_sph.project.wide.layout import Face, shown
 from colmap_sph.project.wide.projection import PANORAMA, Lens, image_points
+from colmap_sph.scene import in_bands
 
 Places = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 
@@ -83,7 +83,7 @@ def _places(lens: Lens, face: Face) -> Places:
     x = np.empty((face.height, face.width), np.float32)
     y = np.empty_like(x)
     is_shown = np.empty(x.shape, np.bool_)
-    for rows in in_bands(face.height, face.width, _BAND_PIXELS):
+    for rows in in_bands((face.height, face.width), _BAND_PIXELS):
         points = image_points(lens, face.rays(rows))
         is_shown[rows] = shown(lens, points).reshape(-1, face.width)
         column, row = (np.nan_to_num(part, nan=0.5).reshape(-1, face.width) - 0.5 for part in points.T)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, OutputError, unwritable
 from colmap_sph.project.files import SCRATCH_ENDING, atomic_file, make_dir
-from colmap_sph.project.images.bands import in_bands
 from colmap_sph.project.images.decoding import check_end
 from colmap_sph.project.wide.projection import Lens, camera_rays
+from colmap_sph.scene import in_bands
 
 Pixels = NDArray[np.float32]
 
@@ -77,7 +77,7 @@ def range_and_normals(lens: Lens, views: Sequence[ViewMaps]) -> tuple[Pixels, Pi
     """
     found = np.zeros((lens.height, lens.width), np.float32)
     normals = np.zeros((lens.height, lens.width, 3), np.float32)
-    for rows in in_bands(lens.height, lens.width, _BAND_PIXELS):
+    for rows in in_bands((lens.height, lens.width), _BAND_PIXELS):
         rays = np.ascontiguousarray(_rays(lens)[rows].reshape(-1, 3).T, np.float64)
         distance = np.zeros(rays.shape[1])
         normal = normals[rows].reshape(-1, 3)
@@ -163,7 +163,7 @@ def pixels_shown(lens: Lens) -> int:
 def _rays(lens: Lens) -> Pixels:
     """(H, W, 3) rays of the centres of a lens's pixels; NaN where it shows nothing."""
     rays = np.empty((lens.height, lens.width, 3), np.float32)
-    for rows in in_bands(lens.height, lens.width, _BAND_PIXELS):
+    for rows in in_bands((lens.height, lens.width), _BAND_PIXELS):
         x, y = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(rows.start, rows.stop) + 0.5)
         rays[rows] = camera_rays(lens, np.column_stack([x.ravel(), y.ravel()])).reshape(-1, lens.width, 3)
     return rays

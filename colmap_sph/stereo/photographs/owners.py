@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.scene import View
+from colmap_sph.scene import View, in_bands
 
 # Pixels that are looked at together, at some hundred bytes each.
 _BAND_PIXELS = 1 << 16
@@ -44,16 +44,14 @@ def owned_pixels(view: View, others: Sequence[View]) -> NDArray[np.bool_]:
     79
     """
     owned = np.empty((view.height, view.width), bool)
-    step = max(_BAND_PIXELS // view.width, 1)
-    for first in range(0, view.height, step):
-        band = owned[first : first + step]
-        band[:] = _owned_in_rows(view, others, first, first + len(band))
+    for band in in_bands(owned.shape, _BAND_PIXELS):
+        owned[band] = _owned_in_band(view, others, band)
     return owned
 
 
-def _owned_in_rows(view: View, others: Sequence[View], first: int, end: int) -> NDArray[np.bool_]:
-    """`owned_pixels` of the rows from `first` to before `end`."""
-    columns, rows = np.meshgrid(np.arange(view.width), np.arange(first, end))
+def _owned_in_band(view: View, others: Sequence[View], band: slice) -> NDArray[np.bool_]:
+    """`owned_pixels` of a band of rows."""
+    columns, rows = np.meshgrid(np.arange(view.width), np.arange(band.start, band.stop))
     pixels = np.stack([columns, rows, np.ones_like(columns)]).reshape(3, -1).astype(float)
     owned = np.ones(pixels.shape[1], bool)
     for other in others:
@@ -62,4 +60,4 @@ def _owned_in_rows(view: View, others: Sequence[View], first: int, end: int) -> 
         nearer = (depth > 1) | ((depth == 1) & (other.name < view.name))
         inside = (x >= 0) & (x <= other.width * depth) & (y >= 0) & (y <= other.height * depth)
         owned &= ~(nearer & inside)
-    return owned.reshape(end - first, view.width)
+    return owned.reshape(-1, view.width)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from colmap_sph.scene import Polygons, Region, View
+from colmap_sph.scene import Polygons, Region, View, in_bands
 
 # Pixels that are looked at in one go.
 _BAND_PIXELS = 1 << 21
@@ -74,10 +74,9 @@ def pixels_inside(view: View, depth: NDArray[np.float32], region: Region) -> NDA
     """
     inside = np.zeros(depth.shape, bool)
     directions = view.R.T @ view.inverse_K
-    step = max(_BAND_PIXELS // depth.shape[1], 1)
-    for first in range(0, depth.shape[0], step):
-        rows, columns = np.nonzero(depth[first : first + step] > 0)
-        rows += first
+    for band in in_bands(depth.shape, _BAND_PIXELS):
+        rows, columns = np.nonzero(depth[band] > 0)
+        rows += band.start
         pixels = np.stack([columns, rows, np.ones_like(rows)]).astype(np.float64)
         points = (directions @ pixels * depth[rows, columns]).T + view.center
         inside[rows, columns] = is_inside(region, points)

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from colmap_sph.errors import InputError, NoResultError
+from colmap_sph.pipeline.checks.self_check import add_doubt
 from colmap_sph.pipeline.context import Context
-from colmap_sph.pipeline.self_check import add_doubt
 from colmap_sph.pipeline.stages.photo import still_mask
 from colmap_sph.pipeline.stages.stage import Result
 from colmap_sph.project.images.reading import read_whole_grey
