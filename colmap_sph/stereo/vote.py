@@ -144,6 +144,15 @@ def _disparity_sigma(view: View, geometry: RectifiedPair, options: VoteOptions, 
     return math.hypot(options.disparity_sigma * softness, shift)
 
 
+def _band_rows(view: View, pairs: int) -> int:
+    return min(max(_BAND_BYTES // (8 * view.width * max(pairs, 1)), 1), view.height)
+
+
+def bytes_of_band(view: View, pairs: int) -> int:
+    """Bytes in use while a band of rows is voted on: so many candidates of 8 each, and what is too unsure (6)."""
+    return (8 * pairs + 6) * _band_rows(view, pairs) * view.width
+
+
 def vote_depth(
     view: View,
     pairs: Iterable[PairDisparity],
@@ -199,8 +208,8 @@ def vote_depth(
     voted = DepthEstimate(np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.uint8))
     numbers = np.arange(len(sources)) if stations is None else np.asarray(stations)
     shifts = [0.0] * len(sources) if residuals is None else residuals
-    step = max(_BAND_BYTES // (8 * view.width * max(len(sources), 1)), 1)
-    room = np.empty(2 * len(sources) * min(step, view.height) * view.width, np.float32)
+    step = _band_rows(view, len(sources))
+    room = np.empty(2 * len(sources) * step * view.width, np.float32)
     for first in range(0, view.height if sources else 0, step):
         rows = slice(first, min(first + step, view.height))
         size = (2, len(sources), rows.stop - first, view.width)

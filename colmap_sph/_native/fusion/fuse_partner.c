@@ -91,11 +91,14 @@ static inline int is_aside(const float *depth, const fusion_transfer *transfer, 
     return behind | (before & (left | right | above | below));
 }
 
+/* Neighbours are looked up side by side, mostly in one line of the cache: of so many, one is fetched. */
+enum { FETCHED_TOGETHER = 4 };
+
 /* What will be looked up of a block is fetched before, all at once: fusion waits for memory. Inlined, since GCC
  * takes a function that only fetches for one without effect, and drops its calls. */
 ALWAYS_INLINE void fetch(const view_maps *partner, const uint8_t *image, const block *k) {
     const ptrdiff_t plane = partner->height * partner->width;
-    for (ptrdiff_t i = 0; i < k->count; i++) {
+    for (ptrdiff_t i = 0; i < k->count; i += FETCHED_TOGETHER) {
         if (is_in_view(partner, k->seen[i])) {
             const ptrdiff_t q = (ptrdiff_t)k->seen[i].v * partner->width + (ptrdiff_t)k->seen[i].u;
             __builtin_prefetch(partner->depth + q);
@@ -107,9 +110,14 @@ ALWAYS_INLINE void fetch(const view_maps *partner, const uint8_t *image, const b
     }
 }
 
-void fuse_partner(const view_maps *reference, const view_maps *partner, const uint8_t *image,
-                  const fusion_transfer *transfer, fusion_gates gates, int bit, ptrdiff_t first_row,
-                  ptrdiff_t end_row, const fusion_verdict *verdict) {
+void fuse_partner(const view_maps *reference_maps, const view_maps *partner_maps, const uint8_t *image,
+                  const fusion_transfer *partner_transfer, fusion_gates gates, int bit, ptrdiff_t first_row,
+                  ptrdiff_t end_row, const fusion_verdict *whole_verdict) {
+    /* Of its own, or compilers read all of them anew after each byte that is written. */
+    const view_maps own_maps = *reference_maps, other_maps = *partner_maps;
+    const view_maps *reference = &own_maps, *partner = &other_maps;
+    const fusion_transfer own_transfer = *partner_transfer, *transfer = &own_transfer;
+    const fusion_verdict own_verdict = *whole_verdict, *verdict = &own_verdict;
     const double max_error_squared = (double)gates.max_reprojection_error * gates.max_reprojection_error;
     const ptrdiff_t blocks = (reference->width + BLOCK - 1) / BLOCK;
     uint8_t *agreeing = verdict->agreeing + bit / 8 * reference->height * reference->width;

@@ -34,7 +34,7 @@ from colmap_sph.stereo.region.focus import Focus, region_of
 from colmap_sph.stereo.region.inside import drop_outside
 from colmap_sph.stereo.region.shown import count_focus
 from colmap_sph.stereo.region.window import Window
-from colmap_sph.stereo.vote import VoteOptions, vote_depth
+from colmap_sph.stereo.vote import VoteOptions, bytes_of_band, vote_depth
 
 if TYPE_CHECKING:
     from colmap_sph.pipeline.context import Context
@@ -47,10 +47,10 @@ _NORMALS_SECONDS = 0.027
 REGION_MARGIN = 24
 # Bytes on disk per pixel: of the estimate.
 _ESTIMATE_BYTES = 9.0
-# Largest bytes in use at a time, per pixel, beside the pairs' disparity maps once these are read: of the estimate
-# (9), a band of candidates, and a mask (7); more while maps are made of the estimate, or pixels counted that show
+# Largest bytes in use at a time, per pixel: of a mask that is read beside the estimate, when the disparity maps of
+# pairs are not in use any more; and beside these while maps are made of the estimate, or pixels counted that show
 # a region. And of a disparity map that is not made yet.
-_VOTE_BYTES = 24.0
+_MASK_BYTES = 7.0
 _MAPS_BYTES = 45.0
 _DISPARITY_BYTES = 4.0
 
@@ -243,17 +243,21 @@ class VoteStage(RememberingStage[str, VoteTask]):
         pixels = task.window.num_pixels
         unknown = (_DISPARITY_BYTES * pixels, 0.0)
         disparities = [bytes_to_read(file, task.lead) or unknown for file in task.pairs]
-        view = task.window.view(task.view)
-        only_maps = facts_of_estimate(task.estimate, task.vote_key, view) is not None  # to make, or to remove
-        seconds = 0.0 if only_maps else vote_seconds(len(task.pairs))
-        disk = 0.0 if only_maps else _ESTIMATE_BYTES * pixels
-        at_once, maps = _VOTE_BYTES if self.context.focus is None else _MAPS_BYTES, 0.0
+        view = task.view
+        is_voted = facts_of_estimate(task.estimate, task.vote_key, task.window.view(view)) is not None
+        seconds = 0.0 if is_voted else vote_seconds(len(task.pairs))
+        disk = 0.0 if is_voted else _ESTIMATE_BYTES * pixels
+        kept = sum(kept for kept, _ in disparities)
+        memory = max(
+            [_ESTIMATE_BYTES * pixels + bytes_of_band(view, len(task.pairs)), *(more for _, more in disparities)]
+        )
+        memory = max(memory + kept, _ESTIMATE_BYTES * pixels + _MASK_BYTES * view.num_pixels)
+        if self.context.focus is not None:
+            memory = max(memory, _MAPS_BYTES * pixels + kept)
         if self.context.wants_photometric:
             seconds += normals_seconds(self.context.options.normals)
-            disk += MAP_BYTES * task.view.num_pixels
-            at_once, maps = _MAPS_BYTES, MAP_BYTES * (task.view.num_pixels - pixels)
-        memory = max([at_once * pixels + maps, *(reading for _, reading in disparities)])
-        memory += sum(kept for kept, _ in disparities)
+            disk += MAP_BYTES * view.num_pixels
+            memory = max(memory, _MAPS_BYTES * pixels + MAP_BYTES * (view.num_pixels - pixels) + kept)
         return Cost(seconds * pixels / 1e6, memory, disk)
 
     @contextmanager
