@@ -235,6 +235,24 @@ def test_maps_of_map_coordinates_have_north_on_top() -> None:
             assert np.array_equal(map_axes(views, ground, origin=np.array(origin)), np.eye(3))
 
 
+@pytest.mark.parametrize("azimuth", [0, 90, 180, 270])
+def test_facades_on_maps_and_in_geocentric_coordinates_are_upright(azimuth: int) -> None:
+    """Their images take what is in front of them for up: that must not turn them."""
+    views = [view_at(x, 0, 5.0, R=looking(azimuth, 0)) for x in range(0, 30, 5)]
+    wall = np.random.default_rng(5).uniform((-20, -15, 19.9), (20, 0, 20.1), (500, 3)) @ looking(azimuth, 0)
+    for latitude, longitude in ((60, 11), (45, -90), (10, 100), (-1, 37), (-34, 18.5), (-75, 0)):
+        a, b = np.radians([latitude, longitude])
+        east = np.array([-np.sin(b), np.cos(b), 0])
+        up = np.array([np.cos(a) * np.cos(b), np.cos(a) * np.sin(b), np.sin(a)])
+        radius = 6378137.0 / np.sqrt(1 - 0.00669437999 * np.sin(a) ** 2)
+        turn = np.column_stack([east, np.cross(up, east), up])
+        turned = [View(1, "", WIDTH, HEIGHT, K, view.R @ turn.T, view.t, view.point_indices) for view in views]
+        axes = map_axes(turned, wall @ turn.T, origin=radius * up * [1, 1, 1 - 0.00669437999])
+        np.testing.assert_allclose(axes @ turn, np.eye(3), atol=1e-6)
+    if azimuth != 180:  # to the south: that cannot be told from one on the equator
+        assert np.array_equal(map_axes(views, wall, origin=np.array([5e5, 6.365e6, 30])), np.eye(3))
+
+
 def test_a_map_is_seen_from_above() -> None:
     """A red square under a green one, seen from above; x to the right, y to the top.
 

@@ -55,23 +55,27 @@ def check_written_poses(
     there = {path.stem: path for path in files}
     if "frames" not in there:
         return
-    far = max((abs(value) for pose in written.values() for value in pose[4:] if np.isfinite(value)), default=0.0)
-    for image_id, (w, x, y, z, *translation) in written.items():
-        image = model.image(image_id)
-        if not image.has_pose:
-            continue
-        rotation = pycolmap.Rotation3d(np.array([x, y, z, w]))
-        rotation.normalize()
-        pose = np.column_stack([rotation.matrix(), translation])
-        with np.errstate(all="ignore"):  # impossible poses are told later
-            off = np.abs(image.cam_from_world().matrix() - pose)
-        if np.isfinite(pose).all() and not (off <= _SAME_POSE * np.array([1.0, 1.0, 1.0, far])).all():
-            rigs, frames, images = (there[stem].name for stem in ("rigs", "frames", "images"))
-            raise InputError(
-                f"The model in {there['images'].parent} has two poses of {image.name!r}, one in {images} and "
-                f"another in {frames}; delete {rigs} and {frames} if {images} is right, or export the model from "
-                "COLMAP again."
-            )
+    images = [image for image in map(model.image, written) if image.has_pose]
+    found = np.array([image.cam_from_world().params for image in images]).reshape(-1, 7)
+    w, x, y, z, *translation = np.array([written[image.image_id] for image in images]).reshape(-1, 7).T
+    told = np.array([x, y, z, w, *translation]).T
+    with np.errstate(all="ignore"):  # impossible poses are told later
+        for poses in (found, told):
+            poses[:, :4] /= np.linalg.norm(poses[:, :4], axis=1, keepdims=True)
+        # Both signs of a quaternion are the same rotation.
+        found[:, :4] *= np.copysign(1.0, (found[:, :4] * told[:, :4]).sum(axis=1, keepdims=True))
+        off = np.abs(found - told)
+    is_possible = np.isfinite(told).all(axis=1)
+    far = np.abs(told[is_possible, 4:]).max(initial=0.0)
+    is_same = (off <= _SAME_POSE * np.array([1.0] * 4 + [far] * 3)).all(axis=1)
+    if (is_possible & ~is_same).any():
+        name = images[int(np.argmax(is_possible & ~is_same))].name
+        in_rigs, in_frames, in_images = (there[stem].name for stem in ("rigs", "frames", "images"))
+        raise InputError(
+            f"The model in {there['images'].parent} has two poses of {name!r}, one in {in_images} and another in "
+            f"{in_frames}; delete {in_rigs} and {in_frames} if {in_images} is right, or export the model from "
+            "COLMAP again."
+        )
 
 
 def check_points_in_front(model: pycolmap.Reconstruction, sparse_dir: Path) -> None:

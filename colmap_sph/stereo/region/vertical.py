@@ -14,6 +14,10 @@ _ONE_DIRECTION = 0.05
 # The Earth's ellipsoid (WGS 84), metres. Photographs are taken from a kilometre below it to twelve above.
 _SEMI_AXES = np.array([6378137.0, 6378137.0, 6356752.0])
 _LOWEST, _HIGHEST = 0.9998, 1.002
+# Heights on maps are less, in metres as in feet.
+_MOST_HEIGHT = 50_000.0
+# Cosine: so near to a direction is what images take for up, be they from above or oblique.
+_NEAR_UP = 0.7
 
 
 def upwards(views: Sequence[View], points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -34,8 +38,8 @@ def upwards(views: Sequence[View], points: NDArray[np.float64]) -> NDArray[np.fl
 def east_north_up(place: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
     """East, north and up at a place in map coordinates, whose axes these are, unless they are geocentric (ECEF).
 
-    In UTM a band of 13 km, some 57° from the equator or 33° south, has places that could be geocentric ones; there
-    what the images take for up decides.
+    In UTM a band of 13 km, some 57° from the equator or 33° south, has places that could be geocentric ones near
+    the equator; there what the images take for up decides. Elsewhere it does not: of a façade it is to the front.
 
     Parameters
     ----------
@@ -59,8 +63,9 @@ def east_north_up(place: NDArray[np.float64], up: NDArray[np.float64]) -> NDArra
     """
     normal = place / _SEMI_AXES**2
     normal = normal / (np.linalg.norm(normal) or 1.0)
-    if not _LOWEST < np.linalg.norm(place / _SEMI_AXES) < _HIGHEST or up[2] >= up @ normal:
+    is_possible = _LOWEST < np.linalg.norm(place / _SEMI_AXES) < _HIGHEST
+    if not is_possible or (abs(place[2]) < _MOST_HEIGHT and up @ normal < _NEAR_UP):
         return np.eye(3)
     east = np.array([-normal[1], normal[0], 0.0])
-    east = east / np.linalg.norm(east) if east.any() else np.eye(3)[0]  # at the south pole any will do
+    east = east / np.linalg.norm(east) if east.any() else np.eye(3)[0]  # at a pole any will do
     return np.array([east, np.cross(normal, east), normal])
