@@ -120,6 +120,7 @@ STAGES = {
 
 
 def test_a_run_loads_no_other_commands() -> None:
+    """Nor what only a page needs, nor the parser what it does without."""
     program = (
         "import sys; from colmap_sph.app import cli; cli.main(['run', '--model', 'nowhere']); print(*sys.modules)"
     )
@@ -127,7 +128,7 @@ def test_a_run_loads_no_other_commands() -> None:
     assert "the model folder nowhere does" in ended.stderr.lower()
     loaded = {".".join(name.split(".")[:2]) for name in ended.stdout.split()}
     assert "colmap_sph.pipeline" in loaded
-    assert not {"colmap_sph.evaluation", "colmap_sph.products", "colmap_sph.pages", "jinja2"} & loaded
+    assert not {"colmap_sph.evaluation", "colmap_sph.products", "colmap_sph.pages", "jinja2", "typeguard"} & loaded
 
 
 @pytest.mark.parametrize("name", cli.commands())
