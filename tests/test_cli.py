@@ -264,8 +264,14 @@ def test_help_of_other_commands(
     assert not re.search(r"None|MISSING|default: ", output)
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert command(capsys, "--version") == (0, f"colmap_sph {colmap_sph.__version__}\n")
+@pytest.mark.parametrize("flag", ["--version", "-V"])
+def test_version(flag: str) -> None:
+    """Told at once: no library is loaded for it."""
+    program = "import sys; from colmap_sph.__main__ import main; print(main(), *sys.modules)"
+    done = subprocess.run([sys.executable, "-P", "-c", program, flag], capture_output=True, text=True, check=True)
+    name, version, code, *loaded = done.stdout.split()
+    assert (name, version, code) == ("colmap_sph", colmap_sph.__version__, "0")
+    assert not {"numpy", "pycolmap", "cv2", "tyro"} & {*loaded}
 
 
 # ---- a run -------------------------------------------------------------------------------------------------
