@@ -7,8 +7,9 @@ import sys
 from contextlib import suppress
 from types import FrameType, TracebackType
 
+import colmap_sph
 from colmap_sph.app.colmap.names import hand_over, is_handed_over
-from colmap_sph.app.standard_streams import prepare_process, silence
+from colmap_sph.app.standard_streams import prepare_process, silence, standard_output
 from colmap_sph.errors import InputError, OutOfMemoryError, OutputError, printable, reason_of
 from colmap_sph.platforms.processes import held_back
 
@@ -56,6 +57,22 @@ def _command() -> int:
     if is_handed_over(sys.argv[1:]):
         with suppress(InputError):  # said below
             hand_over(sys.argv[1:])
+    is_version = sys.argv[1:2] in (["--version"], ["-V"])  # for which nothing is loaded
+    code = 0 if is_version else _answer()
+    try:
+        with standard_output():
+            if is_version:
+                print(f"colmap_sph {colmap_sph.__version__}")
+            sys.stdout.flush()
+    except OutputError as error:
+        silence(1)
+        print(f"error: {error}", file=sys.stderr)
+        return error.exit_code
+    return code
+
+
+def _answer() -> int:
+    """Load the command line, and have it do what is asked for."""
     # NumPy's linear algebra, loaded below, would spin on all cores for products of a few columns.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     gc.disable()  # what is loaded stays: nothing to be found
@@ -65,20 +82,11 @@ def _command() -> int:
     gc.freeze()  # nor while the command runs
     gc.enable()
     try:
-        code = cli.main()
+        return cli.main()
     except SystemExit as stop:  # the parser, after help or a mistake
-        code = 0 if stop.code is None else stop.code if isinstance(stop.code, int) else 2
+        return 0 if stop.code is None else stop.code if isinstance(stop.code, int) else 2
     finally:
         gc.unfreeze()  # or libraries would say on leaving that objects of theirs are left
-    try:
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        silence(1)
-        print(f"error: The standard output cannot be written ({reason_of(error)}).", file=sys.stderr)
-        return OutputError.exit_code
-    return code
 
 
 def _load_colmap() -> None:

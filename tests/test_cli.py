@@ -120,6 +120,7 @@ STAGES = {
 
 
 def test_a_run_loads_no_other_commands() -> None:
+    """Nor what only a page needs, nor the parser what it does without."""
     program = (
         "import sys; from colmap_sph.app import cli; cli.main(['run', '--model', 'nowhere']); print(*sys.modules)"
     )
@@ -127,7 +128,7 @@ def test_a_run_loads_no_other_commands() -> None:
     assert "the model folder nowhere does" in ended.stderr.lower()
     loaded = {".".join(name.split(".")[:2]) for name in ended.stdout.split()}
     assert "colmap_sph.pipeline" in loaded
-    assert not {"colmap_sph.evaluation", "colmap_sph.products"} & loaded
+    assert not {"colmap_sph.evaluation", "colmap_sph.products", "colmap_sph.pages", "jinja2", "typeguard"} & loaded
 
 
 @pytest.mark.parametrize("name", cli.commands())
@@ -263,8 +264,14 @@ def test_help_of_other_commands(
     assert not re.search(r"None|MISSING|default: ", output)
 
 
-def test_version(capsys: pytest.CaptureFixture[str]) -> None:
-    assert command(capsys, "--version") == (0, f"colmap_sph {colmap_sph.__version__}\n")
+@pytest.mark.parametrize("flag", ["--version", "-V"])
+def test_version(flag: str) -> None:
+    """Told at once: no library is loaded for it."""
+    program = "import sys; from colmap_sph.__main__ import main; print(main(), *sys.modules)"
+    done = subprocess.run([sys.executable, "-P", "-c", program, flag], capture_output=True, text=True, check=True)
+    name, version, code, *loaded = done.stdout.split()
+    assert (name, version, code) == ("colmap_sph", colmap_sph.__version__, "0")
+    assert not {"numpy", "pycolmap", "cv2", "tyro"} & {*loaded}
 
 
 # ---- a run -------------------------------------------------------------------------------------------------

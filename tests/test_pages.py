@@ -25,7 +25,6 @@ from colmap_sph.pages import write_page
 from colmap_sph.pages.image_facts import small_pictures
 from colmap_sph.pages.samples import read_normals, read_samples, samples_per_side
 from colmap_sph.pages.words import duration
-from colmap_sph.pipeline import report_files
 from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.report_files import command_of
 from colmap_sph.pipeline.stages.facts import Facts
@@ -207,7 +206,7 @@ def test_a_page_that_fails_does_not_fail_the_run(
     def fail(*_: object, **__: object) -> str:
         raise RuntimeError("no ink")
 
-    monkeypatch.setattr(report_files, "write_page", fail)
+    monkeypatch.setattr("colmap_sph.pages.write_page", fail)
     report = colmap_sph.run(workspace=dense)
     assert report.points == finished.report.points
     (warning,) = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]

@@ -428,7 +428,7 @@ def test_a_library_that_cannot_be_loaded() -> None:
         from colmap_sph.__main__ import main
         sys.exit(main())
     """)
-    done = subprocess.run([sys.executable, "-c", code, "--version"], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code, "--help"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 6
     assert re.fullmatch(r"error: .*libx\.so: failed to map segment.*ulimit -a\)\.\n", done.stderr)
 

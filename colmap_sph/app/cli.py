@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import tyro
 
-import colmap_sph
 from colmap_sph.app.colmap.names import is_colmap_command
 from colmap_sph.app.colmap.spelling import spelling_of
 from colmap_sph.app.display import Display
@@ -25,7 +24,8 @@ from colmap_sph.app.refusals import refusals_in_words, refuse_empty_paths
 from colmap_sph.app.report_command import ReportCommand, ViewCommand, report_command, view_command
 from colmap_sph.app.run_command import RunCommand, header, help_text, print_summary, run_command
 from colmap_sph.app.spelling import flag_of, short_completion, with_dashed_values
-from colmap_sph.app.terminal import Terminal, print_result, standard_output, warnings_shown
+from colmap_sph.app.standard_streams import standard_output
+from colmap_sph.app.terminal import Terminal, print_result, warnings_shown
 from colmap_sph.errors import ColmapSphError, InputError, OptionError, OutputError, reason_of
 from colmap_sph.pipeline.forecast.time_limit import process_start
 from colmap_sph.pipeline.options import RunOptions
@@ -97,9 +97,6 @@ def _in_words(error: BaseException) -> ColmapSphError | None:
 
 
 def _answer(arguments: Sequence[str], terminal: Terminal, started: float) -> int:
-    if arguments and arguments[0] in ("--version", "-V"):
-        print_result(f"colmap_sph {colmap_sph.__version__}")
-        return 0
     if arguments and is_colmap_command(arguments[0]):
         return _answer_as_colmap(arguments, terminal, started)
     if (asked := _help_asked_for(arguments)) is not None:

@@ -11,7 +11,6 @@ import tyro
 from colmap_sph.app.display import Display
 from colmap_sph.app.terminal import Terminal, print_result
 from colmap_sph.errors import InputError, OptionError, OutputError
-from colmap_sph.pages import write_page
 from colmap_sph.platforms.surroundings import has_screen
 from colmap_sph.project.claim import check_links
 from colmap_sph.project.project import check_open
@@ -142,6 +141,8 @@ def _is_old(workspace: Workspace) -> bool:
 
 
 def _make(workspace: Workspace, terminal: Terminal) -> None:
+    from colmap_sph.pages import write_page  # see `make_page`
+
     with Display(terminal) as display:
         missing = write_page(workspace, display)
     if missing:

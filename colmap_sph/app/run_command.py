@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Optional
 
 import tyro
 from rich.console import Console
@@ -64,7 +64,8 @@ class RunCommand:
     stage: StageName | None = None
     """Make the results of one stage alone, as the jobs of a cluster's arrays do: prepare, then match, vote and
     confirm, and at last all that is left without this option."""
-    shard: str | None = None
+    # Not `str | None`, of which the command line's parser would load a library to check the default.
+    shard: Optional[str] = None  # noqa: UP045
     """Part of the stage, I/N: of so many jobs this one, counted from 1, such as 3/16."""
     dry_run: tyro.conf.FlagCreatePairsOff[bool] = False
     """Write nothing: say what is to do, and about how much time, memory and disk it takes."""
@@ -73,7 +74,7 @@ class RunCommand:
     kept under another name."""
     verify: tyro.conf.FlagCreatePairsOff[bool] = False
     """Look at every byte of earlier results first, and make again what is damaged."""
-    config: Path | None = None
+    config: Optional[Path] = None  # noqa: UP045
     """File with options, which those typed here win over: TOML, or the report.json of an earlier run."""
     progress: Literal["auto", "json", "none"] = "auto"
     """How the run tells how far it is: bars, or lines off a terminal; events as lines of JSON on the standard

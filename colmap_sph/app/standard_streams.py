@@ -7,9 +7,11 @@ import io
 import os
 import select
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
+from colmap_sph.errors import OutputError, reason_of
 from colmap_sph.platforms.limits import (
     address_space_limit,
     data_limit,
@@ -73,6 +75,25 @@ def silence(descriptor: int) -> None:
         null = os.open(os.devnull, os.O_WRONLY)
         os.dup2(null, descriptor)
         os.close(null)
+
+
+@contextmanager
+def standard_output() -> Iterator[None]:
+    """Print on the standard output, and nothing else, meanwhile.
+
+    Raises
+    ------
+    OutputError
+        It cannot be written. `BrokenPipeError` where its reader has seen enough.
+    """
+    try:
+        yield
+    except BrokenPipeError:
+        raise
+    except OSError as error:
+        raise OutputError(
+            f"The standard output cannot be written ({reason_of(error)}); check its space."
+        ) from error
 
 
 def _open_what_is_closed() -> None:

@@ -19,7 +19,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from colmap_sph.errors import OutputError, printable, reason_of
+from colmap_sph.app.standard_streams import standard_output
+from colmap_sph.errors import printable
 
 # Columns that bars and tables need; a narrower terminal, or one that hides its width, gets plain lines.
 _LEAST_WIDTH = 40
@@ -188,25 +189,6 @@ def print_result(text: str) -> None:
     """Print on the standard output what was asked for; see `standard_output`."""
     with standard_output():
         print("\n".join(map(printable, text.split("\n"))), flush=True)
-
-
-@contextmanager
-def standard_output() -> Iterator[None]:
-    """Print on the standard output, and nothing else, meanwhile.
-
-    Raises
-    ------
-    OutputError
-        It cannot be written. `BrokenPipeError` where its reader has seen enough.
-    """
-    try:
-        yield
-    except BrokenPipeError:
-        raise
-    except OSError as error:
-        raise OutputError(
-            f"The standard output cannot be written ({reason_of(error)}); check its space."
-        ) from error
 
 
 class _Warnings(logging.Handler):

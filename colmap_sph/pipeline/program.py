@@ -5,6 +5,7 @@ package would make everything anew for the edit of a help text. What a stage say
 maker, and changes the digest, too.
 """
 
+import os
 import platform
 import re
 from functools import cache
@@ -21,8 +22,9 @@ from colmap_sph.pipeline.digests import digest, file_digest, new_digest
 from colmap_sph.project.colmap_library import COLMAP_VERSION
 
 _ROOT = Path(__file__).parents[1]
-# Import statements of formatted code, from the start of a line on: to parse all code would take ten times as long.
-_IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+)?import[ \t]+(\([^)]*\)|.*)", re.MULTILINE)
+# Import statements of formatted code, from the end of a line on, which is found quicker than the start of one: to
+# parse all code would take ten times as long.
+_IMPORT = re.compile(r"\n[ \t]*(?:from[ \t]+([\w.]+)[ \t]+)?import[ \t]+(\([^)]*\)|.*)")
 _COMMENT = re.compile(r"#.*")
 # What only type checkers import: the statement, and all lines that are further in, or empty.
 _FOR_TYPES = re.compile(rb"^([ \t]*)if TYPE_CHECKING:.*\n(?:\1[ \t]+.*\n|[ \t]*\n)*", re.MULTILINE)
@@ -37,8 +39,13 @@ def program_digest(module: str) -> str:
     module : str
         Such as "colmap_sph.stereo.matching".
     """
-    files = {name: _looked_at(_source_of(_ROOT, name))[0] for name in reached_modules(module)}
-    return digest(files, file_digest(Path(_native.__file__)), list(_libraries().values()))
+    files = {name: _looked_at(_ROOT, name)[0] for name in reached_modules(module)}
+    return digest(files, _kernels_digest(), list(_libraries().values()))
+
+
+@cache
+def _kernels_digest() -> str:
+    return file_digest(Path(_native.__file__))
 
 
 def versions() -> dict[str, str]:
@@ -67,32 +74,39 @@ def reached_modules(module: str) -> list[str]:
         name = waiting.pop()
         if name not in reached:
             reached.add(name)
-            waiting += _looked_at(_source_of(_ROOT, name))[1]
+            waiting += _looked_at(_ROOT, name)[1]
             package, _, _ = name.rpartition(".")
             waiting += [package] if package else []
     return sorted(reached)
 
 
 @cache
-def _looked_at(source: Path) -> tuple[str, tuple[str, ...]]:
+def _looked_at(root: Path, module: str) -> tuple[str, frozenset[str]]:
     """Digest of a module's code, and the names of this package's modules that it imports."""
-    code = source.read_bytes()
+    sources = _sources(root)
+    code = sources[module].read_bytes()
     state = new_digest()
     state.update(code)
-    names = dict.fromkeys(_ours_imported(code))
-    return state.hexdigest(), tuple(name for name in names if _source_of(_ROOT, name).is_file())
+    return state.hexdigest(), frozenset(_ours_imported(code)) & sources.keys()
 
 
 def _ours_imported(source: bytes) -> tuple[str, ...]:
     """Full names of what a module's code imports of this package, of ``from a import b`` also ``a.b``."""
     names: list[str] = []
-    for package, imported in _IMPORT.findall(_FOR_TYPES.sub(b"", source).decode()):
+    if b"TYPE_CHECKING" in source:  # few are: the search takes longer than all else
+        source = _FOR_TYPES.sub(b"", source)
+    for package, imported in _IMPORT.findall("\n" + source.decode()):
         modules = [name.split()[0] for name in _COMMENT.sub("", imported).strip("()").split(",") if name.strip()]
         names += [package, *(f"{package}.{name}" for name in modules)] if package else modules
     return tuple(name for name in names if name.partition(".")[0] == _ROOT.name)
 
 
 @cache
-def _source_of(root: Path, module: str) -> Path:
-    path = root.joinpath(*module.split(".")[1:])
-    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+def _sources(root: Path) -> dict[str, Path]:
+    """Files of the package's modules, by the modules' full names."""
+    sources: dict[str, Path] = {}
+    for folder, _, files in os.walk(root):
+        package = ".".join([root.name, *Path(folder).relative_to(root).parts])
+        modules = {name: f"{package}.{name.removesuffix('.py')}" for name in files if name.endswith(".py")}
+        sources |= {module.removesuffix(".__init__"): Path(folder, name) for name, module in modules.items()}
+    return sources

@@ -11,9 +11,7 @@ from typing import Any
 
 import msgspec
 
-import colmap_sph.pages
 from colmap_sph.errors import OutputError, reason_of, shell_word
-from colmap_sph.pages import write_page
 from colmap_sph.pipeline.context import Context
 from colmap_sph.pipeline.digests import digest, file_digest
 from colmap_sph.pipeline.known.table import stamp_of_files
@@ -108,7 +106,7 @@ def _know_page(path: Path, key: str, page: Path) -> None:
 def _page_key(context: Context) -> str:
     """Digest of what a page is made from, of maps and a cloud that are as they were; less times and numbers."""
     content = {name: value for name, value in _content(context).items() if name not in _OF_THE_RUN}
-    files = sorted(path for path in Path(colmap_sph.pages.__file__).parent.rglob("*.*") if path.is_file())
+    files = sorted(path for path in (Path(__file__).parents[1] / "pages").rglob("*.*") if path.is_file())
     templates = [file_digest(path) for path in files if path.suffix != ".pyc"]
     return digest(program_digest("colmap_sph.pages.page"), templates, json.dumps(content, default=str))
 
@@ -118,6 +116,8 @@ def make_page(context: Context) -> None:
     workspace = context.workspace
     start = time.perf_counter()
     try:
+        from colmap_sph.pages import write_page  # which takes a while to load, and not all runs make a page
+
         write_page(workspace, context.progress, threads=_page_threads(context))
     except Exception as error:
         with suppress(OutputError):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Optional
 
 from colmap_sph.errors import InputError, OptionError, reason_of, shell_word
 from colmap_sph.platforms.files import plain_path
@@ -17,16 +18,18 @@ from colmap_sph.project.workspace import Workspace
 class Project:
     """What a run works on: a sparse model and its images, or a dense workspace that is there already."""
 
-    model: Path | None = None
+    # Not `Path | None`: to check a default against that, the command line's parser would load a library of a tenth
+    # of a second.
+    model: Optional[Path] = None  # noqa: UP045
     """Sparse model (binary or text), such as sparse/0. Its images are undistorted into --output."""
-    images: Path | None = None
+    images: Optional[Path] = None  # noqa: UP045
     """Original images. Default: the folder "images" beside or above the model."""
-    masks: Path | None = None
+    masks: Optional[Path] = None  # noqa: UP045
     """Masks: a.jpg.png or a.png for image a.jpg, with its folders; black = ignored. Of the original images, or
     with --workspace of the undistorted ones."""
-    output: Path | None = None
+    output: Optional[Path] = None  # noqa: UP045
     """Dense workspace to create. Default: `dense` beside `sparse`, for sparse/1 `dense-1`."""
-    workspace: Path | None = None
+    workspace: Optional[Path] = None  # noqa: UP045
     """Existing dense workspace, instead of --model, --images and --output."""
 
     def check(self) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Optional
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,8 @@ class FusionOptions:
     min_num_pixels: int = 2
     """Pixels, of different images, that must agree on a point (COLMAP: 5). In our own fusion images that stand
     side by side count as one."""
-    max_reproj_error: float | None = None
+    # Not `float | None`, of which the command line's parser would load a library to check the default.
+    max_reproj_error: Optional[float] = None  # noqa: UP045
     """A pixel makes no point of its own where it projects within this many pixels of the centre of a finer image's
     pixel that agrees: less makes a denser cloud. COLMAP's fusion merges pixels this near (COLMAP: 2). None: 0.35;
     0.5 for COLMAP's."""
@@ -55,7 +56,7 @@ class FusionOptions:
     """Largest angle, degrees, of normals that agree (COLMAP: 10)."""
     check_num_images: int = 50
     """Overlapping images to look for agreement in; our own looks in no more than 64."""
-    mask_path: Path | None = None
+    mask_path: Optional[Path] = None  # noqa: UP045
     """Folder of masks in undistorted geometry, named as those of --masks, black = excluded."""
     max_num_pixels: int = 10000
     """Most pixels to merge into one point (COLMAP's only)."""

@@ -17,7 +17,8 @@ from colmap_sph.app.log_file import workspace_log
 from colmap_sph.app.option_list import print_explained
 from colmap_sph.app.run_command import PARTIAL_EXIT_CODE, header, print_summary
 from colmap_sph.app.shell_words import to_repeat
-from colmap_sph.app.terminal import Terminal, standard_output
+from colmap_sph.app.standard_streams import standard_output
+from colmap_sph.app.terminal import Terminal
 from colmap_sph.errors import counted
 from colmap_sph.pipeline.report import RunReport
 from colmap_sph.project.project import check_open
