@@ -1,7 +1,9 @@
 """What `colmap_sph export` writes is what is in the workspace, in the formats' own conventions."""
 
 import json
+import os
 import shlex
+import socket
 import struct
 import sys
 import time
@@ -663,3 +665,26 @@ def test_a_link_out_of_the_workspace_is_not_followed(workspace: Workspace, tmp_p
 
 def test_zones() -> None:
     assert utm_zone_of(0.0, 179.99) == "EPSG:32660" and utm_zone_of(-1e-9, -180.0) == "EPSG:32701"
+
+
+@pytest.mark.parametrize("what", ["pipe", "folder", "socket", "link to nowhere"])
+@pytest.mark.parametrize("kind", ["png", "nerfstudio", "laz"])
+def test_something_else_in_the_place_of_a_map_is_refused(
+    workspace: Workspace, tmp_path: Path, kind: ExportFormat, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counted as no map, and its image was left out."""
+    path = workspace.depth_map_path(NAMES[2], "geometric")
+    path.unlink()
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    elif what == "socket":
+        with socket.socket(socket.AF_UNIX) as end:
+            monkeypatch.chdir(path.parent)  # names of sockets are short
+            end.bind(path.name)
+    else:
+        path.symlink_to("nowhere")
+    with pytest.raises(InputError, match=rf"{path} cannot be read \(it is not a regular file\)"):
+        exported(workspace, tmp_path / "out", kind)
+    assert not (tmp_path / "out").exists()
