@@ -667,6 +667,25 @@ def test_zones() -> None:
     assert utm_zone_of(0.0, 179.99) == "EPSG:32660" and utm_zone_of(-1e-9, -180.0) == "EPSG:32701"
 
 
+@pytest.mark.parametrize("kind", ["mvsnet", "nerfstudio", "splats"])
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_images_that_are_not_whole_are_refused(
+    tmp_path: Path, kind: ExportFormat, ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of one was handed on; OpenCV shows the rest in grey, without a word."""
+    monkeypatch.setattr(spread, "_LEAST_SHOWN", 0.0)
+    names = [f"{number}{ending}" for number in range(4)]
+    workspace = ground_workspace(tmp_path / "dense", names)
+    write_far_cloud(workspace.fused_path, *make_cloud(50))
+    path = workspace.image_path(names[2])
+    assert cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
+    exported(workspace, tmp_path / "whole", kind)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match=rf"The image {path} is damaged or no image"):
+        exported(workspace, tmp_path / "out", kind)
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("what", ["pipe", "folder", "socket", "link to nowhere"])
 @pytest.mark.parametrize("kind", ["png", "nerfstudio", "laz"])
 def test_something_else_in_the_place_of_a_map_is_refused(
