@@ -3,8 +3,10 @@
 import json
 import os
 import shlex
+import signal
 import socket
 import struct
+import subprocess
 import sys
 import time
 from contextlib import nullcontext
@@ -707,3 +709,45 @@ def test_something_else_in_the_place_of_a_map_is_refused(
     with pytest.raises(InputError, match=rf"{path} cannot be read \(it is not a regular file\)"):
         exported(workspace, tmp_path / "out", kind)
     assert not (tmp_path / "out").exists()
+
+
+_KILLED = """
+import os, sys
+from contextlib import nullcontext
+from pathlib import Path
+import colmap_sph.products.publishing as publishing
+from colmap_sph.products.export import Exporter, ExportOptions, export
+from colmap_sph.products.georeference import Georeference
+from colmap_sph.project.workspace import Workspace
+root, folder, left = sys.argv[1], sys.argv[2], int(sys.argv[3])
+def watched(event, arguments):
+    global left
+    if event == "os.rename" or event == "shutil.rmtree" or event == "os.rmdir":
+        if any("mvsnet" in str(each) for each in arguments):
+            left -= 1
+            if left < 0:
+                os.kill(os.getpid(), 9)
+sys.addaudithook(watched)
+made = Exporter(Workspace(Path(root)), ExportOptions(formats=("mvsnet",)), Georeference(), Path(folder))
+export(made, lambda _: nullcontext(), overwrite=True)
+"""
+
+
+def test_a_kill_loses_no_earlier_export_and_leaves_nothing_for_ever(workspace: Workspace, tmp_path: Path) -> None:
+    """Wherever it comes while folders are moved and removed; the next export, of any format, clears up."""
+    folder = tmp_path / "out"
+    (path,) = exported(workspace, folder, "mvsnet")
+    killed = 0
+    for moment in range(100):
+        (path / "pair.txt").write_text("old")
+        command = [sys.executable, "-P", "-c", _KILLED, str(workspace.root), str(folder), str(moment)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        if not done.returncode:
+            break
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        killed += 1
+        (laz,) = exported(workspace, folder, "laz")
+        laz.unlink()
+        assert (path / "pair.txt").is_file() and sorted(each.name for each in folder.iterdir()) == ["mvsnet"]
+    assert killed >= 3
+    assert (path / "pair.txt").read_text() != "old"
