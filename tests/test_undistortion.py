@@ -86,6 +86,18 @@ def test_negative_focal_lengths_are_told_before_anything_is_made(tmp_path: Path)
     assert f"camera 1: {FOCAL:g} and -{FOCAL:g} pixels" in str(told.value)
 
 
+def test_cameras_without_pixels_are_told_before_anything_is_made(tmp_path: Path) -> None:
+    """The sentence spoke of images of another size; these are as they were."""
+    sparse = make_project(tmp_path, "PINHOLE")
+    model = pycolmap.Reconstruction(sparse)
+    model.camera(1).width = model.camera(1).height = 0
+    model.write(sparse)
+    with pytest.raises(InputError) as told:
+        prepare(sparse, tmp_path / "dense")
+    assert f"{sparse} has a camera" in str(told.value) and "camera 1: 0 x 0 pixels" in str(told.value)
+    assert not (tmp_path / "dense").exists()
+
+
 def test_points_behind_all_images_are_told_before_anything_is_made(tmp_path: Path) -> None:
     """Of the model as it was given, and not of the one in the workspace."""
     sparse = make_project(tmp_path)
