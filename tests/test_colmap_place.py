@@ -238,6 +238,16 @@ def test_maps_that_are_not_there(finished, tmp_path, capsys):
     assert "has no geometric maps; make them by" in capsys.readouterr().err
 
 
+def test_a_pipe_in_the_place_of_a_map_is_told(finished, tmp_path, capsys):
+    """It counted as none, and its image had no part in the cloud."""
+    dense = with_maps_of_others(finished, tmp_path / "dense")
+    path = dense / "stereo/normal_maps/N_0_0.jpg.geometric.bin"
+    path.unlink()
+    os.mkfifo(path)
+    assert command("stereo_fusion", "--workspace_path", dense, "--output_path", tmp_path / "cloud.ply") == 2
+    assert f"{path} cannot be read (it is not a regular file)" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_list_of_pairs_that_is_missing(finished, tmp_path, capsys):
     dense = undistorted(finished, tmp_path / "dense")
     assert command("patch_match_stereo", "--workspace_path", dense, "--config_path", tmp_path / "no.cfg") == 1

@@ -1,6 +1,7 @@
 """`colmap_sph evaluate` on planes: distances and shares that arithmetic gives, and every kind of bad input."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -388,3 +389,14 @@ def test_refuses_models_and_workspaces_that_do_not_fit(folder, capsys):
     assert "another size" in sentence(capsys)
     assert evaluate(*reference, "--workspace", workspace.root, "--map-kind", "photometric") == 2
     assert "has no photometric depth map" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("what", ["depth_map_path", "normal_map_path"])
+def test_a_pipe_in_the_place_of_a_map_is_told(what: str, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It counted as none: an image was left out, or its normals were not measured."""
+    workspace = write_workspace(folder / "dense")
+    path = getattr(workspace, what)(NAMES[-1], "geometric")
+    path.unlink()
+    os.mkfifo(path)
+    assert evaluate("--reference", folder / "depth", "--depth-scale", 0.0005, "--workspace", workspace.root) == 2
+    assert f"{path} cannot be read (it is not a regular file)" in sentence(capsys)

@@ -1,8 +1,12 @@
 """What `colmap_sph export` writes is what is in the workspace, in the formats' own conventions."""
 
 import json
+import os
 import shlex
+import signal
+import socket
 import struct
+import subprocess
 import sys
 import time
 from contextlib import nullcontext
@@ -663,3 +667,87 @@ def test_a_link_out_of_the_workspace_is_not_followed(workspace: Workspace, tmp_p
 
 def test_zones() -> None:
     assert utm_zone_of(0.0, 179.99) == "EPSG:32660" and utm_zone_of(-1e-9, -180.0) == "EPSG:32701"
+
+
+@pytest.mark.parametrize("kind", ["mvsnet", "nerfstudio", "splats"])
+@pytest.mark.parametrize("ending", [".png", ".jpg"])
+def test_images_that_are_not_whole_are_refused(
+    tmp_path: Path, kind: ExportFormat, ending: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Half of one was handed on; OpenCV shows the rest in grey, without a word."""
+    monkeypatch.setattr(spread, "_LEAST_SHOWN", 0.0)
+    names = [f"{number}{ending}" for number in range(4)]
+    workspace = ground_workspace(tmp_path / "dense", names)
+    write_far_cloud(workspace.fused_path, *make_cloud(50))
+    path = workspace.image_path(names[2])
+    assert cv2.imwrite(str(path), np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8))
+    exported(workspace, tmp_path / "whole", kind)
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    with pytest.raises(InputError, match=rf"The image {path} is damaged or no image"):
+        exported(workspace, tmp_path / "out", kind)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("what", ["pipe", "folder", "socket", "link to nowhere"])
+@pytest.mark.parametrize("kind", ["png", "nerfstudio", "laz"])
+def test_something_else_in_the_place_of_a_map_is_refused(
+    workspace: Workspace, tmp_path: Path, kind: ExportFormat, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It counted as no map, and its image was left out."""
+    path = workspace.depth_map_path(NAMES[2], "geometric")
+    path.unlink()
+    if what == "pipe":
+        os.mkfifo(path)
+    elif what == "folder":
+        path.mkdir()
+    elif what == "socket":
+        with socket.socket(socket.AF_UNIX) as end:
+            monkeypatch.chdir(path.parent)  # names of sockets are short
+            end.bind(path.name)
+    else:
+        path.symlink_to("nowhere")
+    with pytest.raises(InputError, match=rf"{path} cannot be read \(it is not a regular file\)"):
+        exported(workspace, tmp_path / "out", kind)
+    assert not (tmp_path / "out").exists()
+
+
+_KILLED = """
+import os, sys
+from contextlib import nullcontext
+from pathlib import Path
+import colmap_sph.products.publishing as publishing
+from colmap_sph.products.export import Exporter, ExportOptions, export
+from colmap_sph.products.georeference import Georeference
+from colmap_sph.project.workspace import Workspace
+root, folder, left = sys.argv[1], sys.argv[2], int(sys.argv[3])
+def watched(event, arguments):
+    global left
+    if event == "os.rename" or event == "shutil.rmtree" or event == "os.rmdir":
+        if any("mvsnet" in str(each) for each in arguments):
+            left -= 1
+            if left < 0:
+                os.kill(os.getpid(), 9)
+sys.addaudithook(watched)
+made = Exporter(Workspace(Path(root)), ExportOptions(formats=("mvsnet",)), Georeference(), Path(folder))
+export(made, lambda _: nullcontext(), overwrite=True)
+"""
+
+
+def test_a_kill_loses_no_earlier_export_and_leaves_nothing_for_ever(workspace: Workspace, tmp_path: Path) -> None:
+    """Wherever it comes while folders are moved and removed; the next export, of any format, clears up."""
+    folder = tmp_path / "out"
+    (path,) = exported(workspace, folder, "mvsnet")
+    killed = 0
+    for moment in range(100):
+        (path / "pair.txt").write_text("old")
+        command = [sys.executable, "-P", "-c", _KILLED, str(workspace.root), str(folder), str(moment)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100)
+        if not done.returncode:
+            break
+        assert done.returncode == -signal.SIGKILL, done.stderr
+        killed += 1
+        (laz,) = exported(workspace, folder, "laz")
+        laz.unlink()
+        assert (path / "pair.txt").is_file() and sorted(each.name for each in folder.iterdir()) == ["mvsnet"]
+    assert killed >= 3
+    assert (path / "pair.txt").read_text() != "old"

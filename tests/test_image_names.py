@@ -323,15 +323,35 @@ def test_many_of_one_wrong_size_are_told_together(
     ]
 
 
-def test_size_of_undistorted_images(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("width", "height", "words", "remedy"),
+    [
+        (WIDTH // 2, HEIGHT // 2, "have exactly half the size of", "--model and --max-image-size 48"),
+        # So COLMAP 3.8 leaves the images of pinhole cameras with --max_image_size 60, and 70: rounded.
+        (60, 40, "are smaller than", "--model and --max-image-size 60"),
+        (70, 47, "are smaller than", "--model and --max-image-size 70"),
+        (WIDTH * 2, HEIGHT * 2, "have exactly 2 times the size of", "--model to have"),
+    ],
+)
+def test_size_of_undistorted_images(tmp_path: Path, width: int, height: int, words: str, remedy: str) -> None:
     sparse = make_project(tmp_path)
     workspace = prepare(sparse, tmp_path / "dense")
     shutil.rmtree(workspace.images_dir)
-    resized(tmp_path, WIDTH // 2, HEIGHT // 2).rename(workspace.images_dir)
+    resized(tmp_path, width, height).rename(workspace.images_dir)
     workspace = open_workspace(Project(workspace=workspace.root))
-    with pytest.raises(
-        InputError, match=r"exactly half the size of their cameras.*give the sparse model with --model"
-    ):
+    with pytest.raises(InputError, match=rf"{words} their cameras.*give the sparse model with {remedy}"):
+        with_good_images(make_context(workspace), execute)
+
+
+@pytest.mark.parametrize(("width", "height"), [(60, 42), (WIDTH - 1, HEIGHT - 9)])
+def test_undistorted_images_that_were_cropped_are_not_told_as_reduced(
+    tmp_path: Path, width: int, height: int
+) -> None:
+    sparse = make_project(tmp_path)
+    workspace = prepare(sparse, tmp_path / "dense")
+    shutil.rmtree(workspace.images_dir)
+    resized(tmp_path, width, height).rename(workspace.images_dir)
+    with pytest.raises(InputError, match=r"None of the model's 4 images in .* is usable; give the sparse model"):
         with_good_images(make_context(workspace), execute)
 
 

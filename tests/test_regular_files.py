@@ -1,6 +1,7 @@
 """Pipes in place of files: nobody writes into them, and no run waits for that."""
 
 import os
+import shutil
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from corruption import make_cases
 from test_undistortion import NAMES, make_project
@@ -102,6 +104,63 @@ def test_pipes_in_a_workspace(
         elif path.exists():
             path.unlink()
             path.parent.rmdir()
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "fused.ply",
+        "fused.ply.vis",
+        "stereo/fusion.cfg",
+        f"stereo/depth_maps/{NAMES[0]}.geometric.bin",
+        f"stereo/normal_maps/{NAMES[2]}.geometric.bin",
+        f"colmap_sph/photometric/{NAMES[2]}.sph",
+        "colmap_sph/pairs/000/000001-000002.sph",
+        f"colmap_sph/state/{NAMES[2]}.geometric.json",
+        "colmap_sph/cloud.json",
+        "colmap_sph/images.json",
+        "colmap_sph/report.json",
+        *(f"colmap_sph/known/{name}.json" for name in ("selection", "pairs", "photometric", "geometric", "page")),
+    ],
+)
+@pytest.mark.parametrize("start", ["dense", "finished"])
+def test_folders_in_the_places_of_files_are_told_before_anything_is_made(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], start: str, place: str
+) -> None:
+    """Some were noticed after hours: where the file was written, and others were set aside for it before."""
+    workspace = shutil.copytree(finished / start, tmp_path / "dense", ignore=shutil.ignore_patterns("*.backup*"))
+    path = workspace / place
+    assert (finished / "finished" / place).is_file()  # where a run does write a file
+    path.unlink(missing_ok=True)
+    path.mkdir(parents=True)
+    (path / "mine.txt").write_text("mine")
+    before = {each: each.read_bytes() for each in workspace.rglob("*") if each.is_file()}
+    assert run("--workspace", workspace, "--sampling", 0.9) == 3
+    told = "".join(capsys.readouterr().err.split())
+    assert "".join(f"error: {path} is a folder, and a file goes there; remove it".split()) in told
+    log = workspace / "colmap_sph/log.txt"
+    after = {each: each.read_bytes() for each in workspace.rglob("*") if each.is_file()}
+    assert {each: content for each, content in after.items() if each != log} == {
+        each: content for each, content in before.items() if each != log
+    }
+
+
+def test_folders_of_images_may_be_called_like_files(finished: Path, tmp_path: Path) -> None:
+    """Such as an image `cloud.json/c.png`, whose maps and records lie in folders of that name."""
+    workspace = shutil.copytree(finished / "dense", tmp_path / "dense")
+    model = pycolmap.Reconstruction(workspace / "sparse")
+    for number, name in enumerate(("cloud.json/c.png", "a.geometric.bin/d.png"), start=3):
+        image = model.image(number)
+        target = workspace / "images" / name
+        target.parent.mkdir()
+        (workspace / "images" / image.name).rename(target)
+        image.name = name
+    model.write(workspace / "sparse")
+    shutil.rmtree(workspace / "stereo")
+    shutil.copytree(finished / "dense/stereo/consistency_graphs", workspace / "stereo/consistency_graphs")
+    assert run("--workspace", workspace) == 0
+    assert run("--workspace", workspace, "--sampling", 0.9) == 0  # where the folders are by now
+    assert (workspace / "stereo/depth_maps/cloud.json/c.png.geometric.bin").is_file()
 
 
 @pytest.mark.parametrize(

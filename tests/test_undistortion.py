@@ -27,6 +27,7 @@ from colmap_sph.pipeline.options import RunOptions
 from colmap_sph.pipeline.preparation import Preparation
 from colmap_sph.pipeline.reconstruct import check_input
 from colmap_sph.pipeline.stages.photo import PhotoFile
+from colmap_sph.project.given.binary_arrays import read_observations
 from colmap_sph.project.given.image_places import find_images
 from colmap_sph.project.given.poses import check_points_in_front
 from colmap_sph.project.images.reading import image_problem
@@ -86,6 +87,18 @@ def test_negative_focal_lengths_are_told_before_anything_is_made(tmp_path: Path)
     assert f"camera 1: {FOCAL:g} and -{FOCAL:g} pixels" in str(told.value)
 
 
+def test_cameras_without_pixels_are_told_before_anything_is_made(tmp_path: Path) -> None:
+    """The sentence spoke of images of another size; these are as they were."""
+    sparse = make_project(tmp_path, "PINHOLE")
+    model = pycolmap.Reconstruction(sparse)
+    model.camera(1).width = model.camera(1).height = 0
+    model.write(sparse)
+    with pytest.raises(InputError) as told:
+        prepare(sparse, tmp_path / "dense")
+    assert f"{sparse} has a camera" in str(told.value) and "camera 1: 0 x 0 pixels" in str(told.value)
+    assert not (tmp_path / "dense").exists()
+
+
 def test_points_behind_all_images_are_told_before_anything_is_made(tmp_path: Path) -> None:
     """Of the model as it was given, and not of the one in the workspace."""
     sparse = make_project(tmp_path)
@@ -112,6 +125,41 @@ def test_workspace_of_undistorted_images(tmp_path: Path, text: bool) -> None:
     assert sorted(path.name for path in workspace.root.iterdir()) == ["colmap_sph", "images", "sparse", "stereo"]
     state = sorted(path.name for path in workspace.state_dir.iterdir())
     assert state == ["fusion_cfg.json", "originals.json", "state", "undistortion.json"]
+
+
+@pytest.mark.parametrize("missing", [None, "left/1.png"])
+def test_images_of_rigs_come_in_the_file_as_colmap_lists_them(tmp_path: Path, missing: str | None) -> None:
+    """OpenMVS takes the images of fused.ply.vis by the first of these, COLMAP 4 by the second."""
+    model = pycolmap.Reconstruction()
+    sensors = [pycolmap.sensor_t(type=pycolmap.SensorType.CAMERA, id=number) for number in (1, 2)]
+    for number in (1, 2):
+        model.add_camera(pycolmap.Camera.create_from_model_name(number, "PINHOLE", FOCAL, WIDTH, HEIGHT))
+    rig = pycolmap.Rig(rig_id=1)
+    rig.add_ref_sensor(sensors[0])
+    rig.add_sensor(sensors[1], pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.1, 0.0, 0.0])))
+    model.add_rig(rig)
+    for number in (1, 2, 3):
+        frame = pycolmap.Frame(frame_id=number, rig_id=1)
+        ids = (number, number + 3)
+        for sensor, image_id in zip(sensors, ids, strict=True):
+            frame.add_data_id(pycolmap.data_t(sensor, image_id))
+        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.3 * number, 0.0, 0.0]))
+        model.add_frame(frame)
+        for camera_id, (side, image_id) in enumerate(zip(("left", "right"), ids, strict=True), start=1):
+            image = pycolmap.Image(f"{side}/{number}.png", np.zeros((0, 2)), camera_id, image_id)
+            image.frame_id = number
+            model.add_image(image)
+            path = tmp_path / "images" / image.name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if image.name != missing:
+                assert cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), image_id, np.uint8))
+        model.register_frame(number)
+    (tmp_path / "sparse").mkdir()
+    model.write_binary(tmp_path / "sparse")
+    workspace = prepare(tmp_path / "sparse", tmp_path / "dense")
+    in_file = [image_id for image_id, _ in read_observations(workspace.sparse_dir / "images.bin")]
+    assert in_file == pycolmap.Reconstruction(workspace.sparse_dir).reg_image_ids()
+    assert len(in_file) == (6 if missing is None else 5)
 
 
 def test_max_image_size(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from colmap_sph.evaluation import (
 )
 from colmap_sph.evaluation.depth_files import DEPTH_ENDINGS, read_exact_depth
 from colmap_sph.project.cameras import is_pinhole
-from colmap_sph.project.map_files import read_depth_map, read_normal_map
+from colmap_sph.project.map_files import is_map_there, read_depth_map, read_normal_map
 from colmap_sph.project.sparse_model import load_model
 from colmap_sph.project.workspace import MapKind, Workspace
 
@@ -323,7 +323,7 @@ def score_depth_maps(
     scores = {}
     for view in views:
         path = workspace.depth_map_path(view.name, kind)
-        if view.name not in cameras or not path.is_file():
+        if view.name not in cameras or not is_map_there(path):
             logger.warning("%s has no %s depth map in %s; left out", view.name, kind, workspace.root)
             continue
         if not np.allclose(cameras[view.name].calibration_matrix(), view.K, rtol=_SAME_CAMERA):
@@ -349,7 +349,7 @@ def _score_depth_map(workspace: Workspace, view: DepthView, kind: MapKind, gsd: 
     depth = read_depth_map(path)
     if depth.shape != truth.shape:
         raise InputError(f"{path} has another size than its image; delete it and compute it again.")
-    has_normals = normal_path.is_file()
+    has_normals = is_map_there(normal_path)
     return compare_depth_map(
         depth,
         truth,

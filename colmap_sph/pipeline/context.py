@@ -21,7 +21,7 @@ from colmap_sph.pipeline.report import Progress, RunReport, Silent
 from colmap_sph.pipeline.stages.maps import MapFiles
 from colmap_sph.project.region_file import AUTO, as_given, read_region
 from colmap_sph.project.state.array_file import SUFFIX
-from colmap_sph.project.state.ownership import Place, cloud_place, estimate_path, map_place
+from colmap_sph.project.state.ownership import Place, cloud_place, estimate_path, map_place, range_place
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Region, Scene
 from colmap_sph.stereo.agreement import SparseTracks
@@ -216,6 +216,15 @@ class Context:
         kinds += ["geometric"] if until != "photometric" else []
         maps = [map_place(self.workspace, view.name, kind) for view in self.scene.views for kind in kinds]
         return [*maps, self.cloud_place] if until == "cloud" else maps
+
+    def written_files(self) -> Iterator[Path]:
+        """All files that the run writes for single images, and those of the cloud."""
+        originals = {view.original for view in self.scene.views if view.original}
+        for place in (*self.places, *(range_place(self.workspace, name) for name in originals)):
+            yield from (place.record, *place.files)
+        yield from (self.estimate_path(view.name) for view in self.scene.views)
+        if self.report.until == "cloud":
+            yield self.workspace.fusion_cfg_path
 
     @property
     def wants_photometric(self) -> bool:

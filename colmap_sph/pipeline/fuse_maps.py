@@ -22,7 +22,7 @@ from colmap_sph.pipeline.stages.view_maps import MapSources, views_beside
 from colmap_sph.pipeline.workers import room_for_workers
 from colmap_sph.project.claim import check_links, claimed
 from colmap_sph.project.cloud_output import CloudOutput
-from colmap_sph.project.map_files import depth_if_readable, has_depth, map_size
+from colmap_sph.project.map_files import depth_if_readable, has_depth, is_map_there, map_size
 from colmap_sph.project.pair_lists import read_lines
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.state.ownership import map_place, named
@@ -137,7 +137,7 @@ def _with_maps(workspace: Workspace, scene: Scene, views: Sequence[View], kind: 
     empty = 0
     for view in views:
         depth, normals = map_place(workspace, view.name, kind).files
-        if not (depth.is_file() and normals.is_file()):
+        if not (is_map_there(depth) and is_map_there(normals)):
             missing.append(depth)
         elif not has_depth(depth):
             empty += 1

@@ -41,6 +41,7 @@ from colmap_sph.pipeline.stages.wide.range_maps import RangeStage
 from colmap_sph.pipeline.workers import room_for_workers
 from colmap_sph.project.claim import check_folder, check_links, claimed
 from colmap_sph.project.project import Project, open_workspace
+from colmap_sph.project.state.obstacles import check_no_folders
 from colmap_sph.project.undistortion import UndistortionOptions
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.stereo.partners.pairing import Pair
@@ -152,6 +153,7 @@ def check_input(project: Project, options: RunOptions, limit: TimeLimit | None =
     project.check()
     check_folder(project.root)
     check_links(Workspace(project.root), is_given=project.workspace is not None)
+    check_no_folders(Workspace(project.root))
     if project.model is None and options.undistortion.max_image_size != UndistortionOptions().max_image_size:
         raise OptionError("--workspace holds undistorted images; leave out --max-image-size.")
     if project.model is None and options.polish.is_wanted:

@@ -16,7 +16,7 @@ from colmap_sph.products.georeference import Georeference
 from colmap_sph.products.maps.files import write_exr, write_npz, write_png
 from colmap_sph.products.maps.reading import MappedScene, mapped_scene
 from colmap_sph.products.places import check_no_input
-from colmap_sph.products.publishing import alone_in
+from colmap_sph.products.publishing import alone_in, clear_leftovers
 from colmap_sph.products.scenes.mvsnet import write_mvsnet
 from colmap_sph.products.scenes.nerfstudio import write_nerfstudio
 from colmap_sph.products.scenes.splats import write_splats
@@ -167,10 +167,12 @@ def export(exporter: Exporter, status: Status, *, overwrite: bool = False) -> Se
     check_no_input(exporter.workspace, exporter.folder)
     if exporter.folder.is_relative_to(exporter.workspace.root):
         check_ways_out(exporter.workspace.root, [exporter.folder], unlinked={exporter.folder})
-    for path in paths:
-        if os.path.lexists(path) and not overwrite:
-            raise OutputError(f"{path} is there already; give --overwrite, or another --output.")
     with alone_in(exporter.folder):
+        for name, _ in _MAKERS.values():
+            clear_leftovers(exporter.folder / name)
+        for path in paths:
+            if os.path.lexists(path) and not overwrite:
+                raise OutputError(f"{path} is there already; give --overwrite, or another --output.")
         for each, path in zip(formats, paths, strict=True):
             with status(path):
                 _MAKERS[each][1](exporter, path)

@@ -18,6 +18,7 @@ from colmap_sph.project.files import atomic_file, make_dir
 
 MARK = "made_by_colmap_sph.txt"
 """A file in each folder that an export made, and may replace."""
+_EARLIER = "earlier"
 
 
 @contextmanager
@@ -104,25 +105,48 @@ def scratch_beside(path: Path) -> Iterator[Path]:
 def published_folder(path: Path) -> Iterator[Path]:
     """An empty folder under a temporary name, which becomes `path` when all went well.
 
-    A folder of an earlier export in its place is removed.
+    A folder of an earlier export in its place is kept until another is there; a kill before loses neither.
 
     Raises
     ------
     OutputError
         It cannot be written, or something else is in its place.
     """
+    clear_leftovers(path)
     check_replaceable(path)
     make_dir(path.parent)
-    with scratch_beside(path.parent / f".{path.name}") as scratch:
+    with scratch_beside(path.with_name(f".{path.name}")) as scratch:
         made = scratch / "made"
+        try:
+            with told(path):
+                made.mkdir()
+                yield made
+                mark = f"Made by colmap_sph {version('colmap_sph')}, which replaces this folder.\n"
+                write_text(made / MARK, mark)
+                if path.exists():
+                    move_into_place(path, scratch / _EARLIER)
+                move_into_place(made, path)
+                sync_folder(path.parent)
+        finally:
+            _put_back(path)
+
+
+def clear_leftovers(path: Path) -> None:
+    """Remove what is left of a product half-made, where a process was killed; one that it replaced is put back."""
+    _put_back(path)
+    part = path.with_name(f".{path.name}.part")
+    for folder in (path.with_name(f".{path.name}.parts"), part.with_name(f"{part.name}.parts")):
+        shutil.rmtree(folder, ignore_errors=True)
+    with suppress(OSError):
+        part.unlink(missing_ok=True)
+
+
+def _put_back(path: Path) -> None:
+    """Give the folder of an earlier export its place, where none has come into it."""
+    earlier = path.with_name(f".{path.name}.parts") / _EARLIER
+    if os.path.lexists(earlier) and not os.path.lexists(path):
         with told(path):
-            made.mkdir()
-            yield made
-            write_text(made / MARK, f"Made by colmap_sph {version('colmap_sph')}, which replaces this folder.\n")
-            if path.exists():
-                shutil.rmtree(path)
-            move_into_place(made, path)
-            sync_folder(path.parent)
+            move_into_place(earlier, path)
 
 
 def check_replaceable(path: Path) -> None:

@@ -20,7 +20,7 @@ from colmap_sph.project.colmap_library import quiet_colmap
 from colmap_sph.project.files import make_dir, scratch_folder
 from colmap_sph.project.images.reading import image_problem
 from colmap_sph.project.map_coordinates import local_origin
-from colmap_sph.project.map_files import check_map
+from colmap_sph.project.map_files import check_map, is_map_there
 from colmap_sph.project.masks import read_mask
 from colmap_sph.project.pair_lists import read_lines
 from colmap_sph.project.sparse_model import cameras_of_images, is_text, load_model, model_files
@@ -145,7 +145,7 @@ def _check_maps(workspace: Workspace, kind: MapKind) -> pycolmap.Reconstruction:
         if name not in cameras:
             raise InputError(f"{workspace.fusion_cfg_path} names {name!r}, which is not in the model; remove it.")
         for path in (workspace.depth_map_path(name, kind), workspace.normal_map_path(name, kind)):
-            if not path.is_file():
+            if not is_map_there(path):
                 raise InputError(f"The map {path} is missing; compute it, or remove {name!r} from fusion.cfg.")
         shape = (cameras[name].height, cameras[name].width)
         # COLMAP leaves out an image that it cannot find, without a word to its caller.

@@ -4,6 +4,7 @@ ASCII ``width&height&channels&`` followed by little-endian float32, plane after 
 ``pycolmap.NormalMap`` (4.2.1) writes interleaved memory as if it were planar.
 """
 
+import os
 import re
 from collections.abc import Iterable
 from contextlib import suppress
@@ -70,6 +71,17 @@ def read_depth_map(path: Path, digest: str | None = None) -> NDArray[np.float32]
         It is missing, cannot be read, or is no depth map.
     """
     return np.asarray(_read_planes(path, 1, digest)[0])
+
+
+def is_map_there(path: Path) -> bool:
+    """Whether there is a map file; `InputError` where something else is there, which would count as none."""
+    if path.is_file():
+        return True
+    if os.path.lexists(path):
+        raise InputError(
+            f"The map {path} cannot be read (it is not a regular file); delete it and compute it again."
+        )
+    return False
 
 
 def depth_if_readable(path: Path) -> NDArray[np.float32] | None:

@@ -194,7 +194,8 @@ def submodel(model: pycolmap.Reconstruction, names: set[str]) -> pycolmap.Recons
     Points that nobody observes, as of imported models, stay.
     """
     part = pycolmap.Reconstruction()
-    images = [model.image(i) for i in model.reg_image_ids() if model.image(i).name in names]
+    # In this order COLMAP reads frames again; those of rigs are registered in another, which the file would have.
+    images = [model.image(i) for i in sorted(model.reg_image_ids()) if model.image(i).name in names]
     for camera_id in sorted({image.camera_id for image in images}):
         part.add_camera_with_trivial_rig(model.camera(camera_id))
     for image in images:

@@ -182,6 +182,25 @@ class Workspace:
         """All of these; need not exist."""
         return [self.known_path(of) for of in get_args(KnownFile)]
 
+    def images_known_path(self, what: Literal["originals", "images"]) -> Path:
+        """What is known of the contents of the original or the undistorted images."""
+        return self.state_dir / f"{what}.json"
+
+    @property
+    def state_files(self) -> list[Path]:
+        """Files of our state that are of all images together; need not exist."""
+        return [
+            *self.known_paths,
+            self.images_known_path("originals"),
+            self.images_known_path("images"),
+            self.marker_path,
+            self.report_path,
+            self.within_path,
+            self.cloud_record_path,
+            self.tiles_record_path,
+            self.fusion_cfg_record_path,
+        ]
+
     @cached_property
     def pairs_dir(self) -> Path:
         """Disparity maps of the pairs."""

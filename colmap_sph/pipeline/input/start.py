@@ -19,6 +19,7 @@ from colmap_sph.pipeline.stages.selection import choose_pairs, wanted_scene
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.polishing.polished import starting_model
 from colmap_sph.project.scene_reader import read_scene
+from colmap_sph.project.state.obstacles import check_no_folders
 from colmap_sph.project.state.ownership import damaged_files, named, results_of, take_places
 from colmap_sph.project.workspace import MapKind, Workspace
 from colmap_sph.scene import Scene
@@ -94,6 +95,7 @@ def start(
     report.views = _views_of_photographs(scene)
     context = Context(workspace, scene, options, Keys(workspace, options), request.progress, report)
     check_fusion_masks(context)
+    check_no_folders(workspace, context.written_files())
     context = context.in_region()
     _report_missing(context, request.expected)
     context = with_good_images(context, executor, verify=request.verify)

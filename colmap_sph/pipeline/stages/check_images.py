@@ -123,7 +123,7 @@ class ImagePlaces:
 
     def known_file(self, context: "Context") -> Path:
         """File of what is known of them from run to run."""
-        return context.workspace.state_dir / f"{self.what}.json"
+        return context.workspace.images_known_path(self.what)
 
 
 class CheckStage(Stage[str, ImageFile]):

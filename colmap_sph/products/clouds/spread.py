@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from colmap_sph.errors import InputError, percent
 from colmap_sph.products.clouds.source import UNKNOWN, Cloud, CloudPiece, open_cloud
 from colmap_sph.products.maps.reading import at_map_size
-from colmap_sph.project.map_files import depth_on_disk
+from colmap_sph.project.map_files import depth_on_disk, is_map_there
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import View
@@ -120,7 +120,7 @@ class DepthSpread:
         """An image's view and depth map, where it has both."""
         view = self._views[index] if index < len(self._views) else None
         path = None if view is None else self._workspace.depth_map_path(view.name, "geometric")
-        if view is None or path is None or not path.is_file():
+        if view is None or path is None or not is_map_there(path):
             return None
         return at_map_size(view, path), depth_on_disk(path)
 

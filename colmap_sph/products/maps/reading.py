@@ -1,7 +1,6 @@
 """The geometric maps of a workspace → depth at the centres of pixels, with the camera that has these."""
 
 import logging
-import os
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from colmap_sph.project.map_files import (
     depth_if_readable,
     has_depth,
     is_depth,
+    is_map_there,
     map_size,
     read_depth_map,
     read_normal_planes,
@@ -65,7 +65,7 @@ class MappedScene:
         """The maps of a view; `InputError` where they are damaged."""
         depth = read_depth_map(self.workspace.depth_map_path(view.name, "geometric"))
         path = self.workspace.normal_map_path(view.name, "geometric")
-        if os.path.lexists(path):
+        if is_map_there(path):
             if map_size(path, 3) != (view.width, view.height):
                 raise InputError(f"{path} is not of its depth map's size; delete it and compute it again.")
             normals = read_normal_planes(path)
@@ -109,7 +109,7 @@ def views_with_maps(workspace: Workspace) -> tuple[Scene, list[_Mapped]]:
     scene = read_scene(workspace.sparse_dir)
     paths = (workspace.depth_map_path(view.name, "geometric") for view in scene.views)
     numbered = zip(range(len(scene.views)), scene.views, paths, strict=True)
-    mapped = [each for each in numbered if each[2].is_file()]
+    mapped = [each for each in numbered if is_map_there(each[2])]
     if not mapped:
         raise InputError(f"{workspace.root} has no geometric depth map; run {_command(workspace)} first.")
     if missing := len(scene.views) - len(mapped):
@@ -168,7 +168,7 @@ def check_maps(workspace: Workspace) -> None:
     paths = {view.name: workspace.depth_map_path(view.name, "geometric") for view in scene.views}
     check_some_maps(
         scene,
-        [name for name, path in paths.items() if path.is_file()],
+        [name for name, path in paths.items() if is_map_there(path)],
         lambda name: depth_if_readable(paths[name]),
         maps=str(workspace.stereo_dir),
         model=str(workspace.sparse_dir),

@@ -18,6 +18,7 @@ from colmap_sph.errors import InputError, printable
 from colmap_sph.platforms.files import write_text
 from colmap_sph.platforms.links import link
 from colmap_sph.products.publishing import published_folder
+from colmap_sph.products.scenes.links import check_images
 from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.workspace import Workspace
 from colmap_sph.scene import Scene, View
@@ -38,7 +39,7 @@ def write_mvsnet(workspace: Workspace, folder: Path) -> None:
     Raises
     ------
     InputError
-        An image cannot be read, or the model has no points.
+        An image is not whole, or the model has no points.
     NoResultError
         No image has a partner.
     OutputError
@@ -47,6 +48,7 @@ def write_mvsnet(workspace: Workspace, folder: Path) -> None:
     scene = read_scene(workspace.sparse_dir)
     selection = select_pairs(scene, PairOptions())
     points, seen, _ = points_in_view(scene)
+    check_images(workspace, scene.views)
     with published_folder(folder) as made:
         (made / "cams").mkdir()
         (made / "images").mkdir()

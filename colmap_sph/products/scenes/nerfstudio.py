@@ -19,7 +19,7 @@ from colmap_sph.products.clouds.ply import write_ply
 from colmap_sph.products.clouds.thinning import ThinCloud
 from colmap_sph.products.maps.reading import MappedScene
 from colmap_sph.products.publishing import published_folder
-from colmap_sph.products.scenes.links import link_images
+from colmap_sph.products.scenes.links import check_images, link_images
 from colmap_sph.project.files import make_dir
 from colmap_sph.project.workspace import checked_name
 from colmap_sph.scene import View
@@ -42,11 +42,12 @@ def write_nerfstudio(scene: MappedScene, cloud: ThinCloud, folder: Path) -> None
     Raises
     ------
     InputError
-        A map is damaged.
+        A map or an image is damaged.
     OutputError
         The folder cannot be written.
     """
     origin = scene.scene.origin
+    check_images(scene.workspace, scene.scene.views)
     with published_folder(folder) as made:
         link_images(scene.workspace, made, folder)
         frames = []

@@ -17,9 +17,10 @@ from colmap_sph.platforms.files import write_text
 from colmap_sph.products.clouds.ply import write_points
 from colmap_sph.products.clouds.thinning import ThinCloud
 from colmap_sph.products.publishing import published_folder, scratch_beside
-from colmap_sph.products.scenes.links import link_images
+from colmap_sph.products.scenes.links import check_images, link_images
 from colmap_sph.project.cloud_output import cloud_as_model
 from colmap_sph.project.map_coordinates import local_origin, move_model
+from colmap_sph.project.scene_reader import read_scene
 from colmap_sph.project.sparse_model import load_model, write_model
 from colmap_sph.project.workspace import Workspace
 
@@ -45,7 +46,7 @@ def write_splats(workspace: Workspace, cloud: ThinCloud, folder: Path) -> None:
     Raises
     ------
     InputError
-        It is not known which images see the points.
+        It is not known which images see the points, or an image is not whole.
     OutputError
         The folder cannot be written.
     """
@@ -59,6 +60,7 @@ def write_splats(workspace: Workspace, cloud: ThinCloud, folder: Path) -> None:
             f"The images that see the points of {workspace.fused_path} are more than {workspace.sparse_dir} has; "
             "fuse again."
         )
+    check_images(workspace, read_scene(workspace.sparse_dir).views)
     with published_folder(folder) as made:
         link_images(workspace, made, folder)
         with scratch_beside(made / "cloud") as scratch:

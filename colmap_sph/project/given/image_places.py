@@ -23,6 +23,11 @@ _MAX_FACTOR = 16
 # Of images with the same problem so many are told one by one; of more the first in one sentence.
 _MOST_TOLD = 4
 _UNDISTORT = "give the sparse model with --model to have them undistorted anew"
+_REDUCED_ALONE = (
+    "some versions of COLMAP's image_undistorter, given --max_image_size, reduce images of pinhole cameras and "
+    "not the cameras; give the sparse model with --model and --max-image-size {longest} to have them undistorted "
+    "anew"
+)
 _REMEDIES: dict[type[Problem], str] = {
     WrongSize: "give the images that the model was made from as --images",
     Damaged: "copy them again from where they came from",
@@ -253,12 +258,16 @@ def _common_size(folder: Path, problems: Mapping[str, Problem], undistorted: boo
         return None
     name, example = min(wrong.items())
     sizes = [(each.found, each.wanted) for each in wrong.values()]
-    way, remedy = _way_and_remedy(sizes, longest=max(example.found))
+    longest = max(example.found)
+    way, remedy = _way_and_remedy(sizes, longest)
+    if undistorted:
+        remedy = _UNDISTORT
+        if all(_is_reduced_to(longest, wanted, found) for found, wanted in sizes):
+            way, remedy = way or "are smaller than", _REDUCED_ALONE.format(longest=longest)
     if not way:
         return None
     return (
-        f"All {len(wrong)} images in {folder} {way} their cameras (such as {name!r}, which {example}); "
-        f"{_UNDISTORT if undistorted else remedy}."
+        f"All {len(wrong)} images in {folder} {way} their cameras (such as {name!r}, which {example}); {remedy}."
     )
 
 
@@ -282,6 +291,13 @@ def _way_and_remedy(sizes: list[tuple[_Size, _Size]], longest: int) -> tuple[str
                 "give the folder of the reduced images, from which the model was made, as --images",
             )
     return "", ""
+
+
+def _is_reduced_to(longest: int, full: _Size, reduced: _Size) -> bool:
+    """Whether a size is another one in the same proportions, with so many pixels on its longer side."""
+    return max(full) > longest and all(
+        abs(f * longest / max(full) - r) <= 1 for f, r in zip(full, reduced, strict=True)
+    )
 
 
 def _is_reduced(full: _Size, reduced: _Size, factor: int) -> bool:

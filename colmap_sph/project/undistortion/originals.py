@@ -121,14 +121,14 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
     Raises
     ------
     InputError
-        No readable model, one in an impossible unit, points behind its images, no camera with possible focal
-        lengths, one that is no lens, damaged lens fields, or no images.
+        No readable model, one in an impossible unit, points behind its images, no camera with pixels and possible
+        focal lengths, one that is no lens, damaged lens fields, or no images.
     """
     assert project.model is not None
     model = load_model(project.model)
     check_size(model, project.model)
     check_points_in_front(model, project.model)
-    _check_focal_lengths(model, project.model)
+    _check_cameras(model, project.model)
     _tell_newer_text(project.model)
     images = project.images
     if images is None:
@@ -142,17 +142,21 @@ def read_originals(project: Project, options: UndistortionOptions) -> Originals:
     return Originals(project.model, images, project.masks, model, fields, options.cuts(model, project.model))
 
 
-def _check_focal_lengths(model: pycolmap.Reconstruction, model_dir: Path) -> None:
-    """Raise `InputError` where no image has a camera with focal lengths above 0; of some, it is told later."""
+def _check_cameras(model: pycolmap.Reconstruction, model_dir: Path) -> None:
+    """Raise `InputError` where no image has a camera with pixels and focal lengths above 0; of some, it is told
+    later."""
     fault = ""
     for camera in cameras_of_images(model).values():
         focal = np.array(camera.params)[list(camera.focal_length_idxs())]
-        if (focal > 0).all():
+        has_pixels = min(camera.width, camera.height) > 0
+        if has_pixels and (focal > 0).all():
             return
-        words = " and ".join(f"{length:g}" for length in focal)
+        words = (
+            " and ".join(f"{length:g}" for length in focal) if has_pixels else f"{camera.width} x {camera.height}"
+        )
         fault = fault or f"camera {camera.camera_id}: {words} pixels"
     raise InputError(
-        f"No image of the model in {model_dir} has a camera with possible focal lengths ({fault}); run "
+        f"No image of the model in {model_dir} has a camera with a possible size and focal lengths ({fault}); run "
         "COLMAP's mapper again, or give the model as it was made."
     )
 
