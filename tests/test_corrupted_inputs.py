@@ -31,7 +31,7 @@ def run_cases(project: Path, first: int, last: int) -> tuple[dict[int, str], lis
             [sys.executable, Path(__file__).with_name("corruption.py"), project, str(first), str(last)],
             capture_output=True,
             text=True,
-            timeout=300,
+            timeout=3600,  # against commands that never end; no measure of speed
         )
         begun = ""
         for line in done.stdout.splitlines():
