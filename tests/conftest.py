@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pycolmap
 import pytest
+from hypothesis import HealthCheck, settings
 
 import colmap_sph
 from colmap_sph.project.undistortion.process import ChildProcess
@@ -23,6 +24,10 @@ IMAGES = ["N_0_0.jpg", "N_0_1.jpg", "N_0_2.jpg"]
 _CALL = ChildProcess.call
 _START_FOR = ChildProcess.start_for
 SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+
+# On a busy machine nothing fails for being slow.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 
 @pytest.hookimpl(wrapper=True)

@@ -158,7 +158,7 @@ def test_results_do_not_depend_on_the_number_of_threads():
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 60), st.integers(1, 60))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 def test_nearest_distances_are_those_of_brute_force(seed, cloud_count, query_count):
     random = np.random.default_rng(seed)
     points = random.normal(size=(cloud_count, 3)) * 10.0 ** random.integers(-3, 4) + random.normal(size=3) * 1e5

@@ -260,7 +260,7 @@ JSON = st.recursive(
 )
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow])
 @given(
     st.dictionaries(st.sampled_from(["key", "stamps", "digests", "facts", "state", "more"]), JSON)
     | st.fixed_dictionaries({"facts": st.fixed_dictionaries({"coverage": JSON, "advice": JSON})})
